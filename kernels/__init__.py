@@ -1,0 +1,1 @@
+"""Device code of warpfea: wp.func and wp.kernel only. Imports nothing from the host side."""

@@ -1,0 +1,367 @@
+"""Element kernels: internal force Eq. (32), energy, tangent product and diagonal blocks, for any table element.
+
+One thread does one element of one world. The family of the element is only its numbers of slots and points and the
+tables; straight tetrahedra share one table of parent gradients and keep J0^-1, others keep h per element and point.
+Displacements are taken relative to the element's first position slot: a rigid translation then has exactly zero strain.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from . import materials
+from .types import kernel_module, precision
+
+__all__ = ["block_struct", "element_kernels"]
+
+
+@functools.cache
+def block_struct(dtype: str):
+    """The constant data of one element block, in one precision."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+
+    @wp.struct
+    class ElementBlock:
+        conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
+        is_position: wp.array(dtype=T)  # [local] 1 for a position slot, 0 for a gradient slot
+        gradient: wp.array3d(dtype=vec3)  # [point, local, elem] h_i; affine: [point, local, 0] parent gradient
+        vertex_gradient: wp.array3d(dtype=vec3)  # the same at the vertices, for laws that need J > 0
+        shape: wp.array3d(dtype=T)  # [point, local, elem or 0] s_i at the points of the mass rule (field loads)
+        field_weight: wp.array2d(dtype=T)  # [point, elem] rho w at those points
+        J0_inv: wp.array(dtype=mat33)  # [elem], affine only
+        vertex_J0_inv: wp.array2d(dtype=mat33)
+        weight: wp.array2d(dtype=T)  # [point, elem] W det J0; affine: [point, 0] W
+        det_J0: wp.array(dtype=T)  # [elem], affine only
+        material: wp.array(dtype=wp.int32)  # [elem]
+        coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]
+        contribution_offset: wp.int32
+        element_offset: wp.int32
+        history_offset: wp.int32
+        count: wp.int32
+
+    return ElementBlock
+
+
+@functools.cache
+def element_kernels(
+    dtype: str, law: str, slots: int, points: int, affine: bool, damping: str | None
+) -> _types.SimpleNamespace:
+    """Kernels of one kind of element block.
+
+    Args:
+        dtype: precision.
+        law: name in `materials.LAWS`.
+        slots, points: slots and quadrature points per element.
+        affine: parent gradients and one J0 per element, or a table of h.
+        damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
+    """
+    p = precision(dtype)
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    t = materials.tensors(dtype)
+    m = materials.law(law, dtype)
+    viscous = materials.svk(dtype)
+    Block = block_struct(dtype)
+    NCOEF = materials.NCOEF
+    coef = wp.types.vector(length=NCOEF, dtype=T)
+    Local = wp.types.matrix(shape=(slots, 3), dtype=T)
+    NS, NQ = slots, points
+    needs_J = law != "svk"
+    vertices = 4
+    name = f"element_{dtype}_{law}_{slots}_{points}_{'affine' if affine else 'table'}_{damping}"
+    module = kernel_module(name)
+
+    @wp.func
+    def coefficients(block: Block, world: int, elem: int) -> coef:
+        c = coef()
+        row = world % block.coefficients.shape[0]
+        mat = block.material[elem]
+        for k in range(NCOEF):
+            c[k] = block.coefficients[row, mat, k]
+        return c
+
+    @wp.func
+    def damping_coefficients(c: coef, scale: T) -> coef:
+        d = coef()
+        d[0] = c[4] * scale
+        d[1] = c[3] * scale
+        return d
+
+    @wp.func
+    def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+        """Slot values of an element, translations taken relative to the first slot."""
+        U = Local()
+        first = field[world, block.conn[0, elem]]
+        for i in range(NS):
+            U[i] = field[world, block.conn[i, elem]] - block.is_position[i] * first
+        return U
+
+    @wp.func
+    def gradient_of(block: Block, U: Local, point: int, elem: int) -> mat33:
+        """sum_i u_i h_i^T at a point."""
+        D = mat33()
+        for i in range(NS):
+            if wp.static(affine):
+                D += wp.outer(U[i], block.gradient[point, i, 0])
+            else:
+                D += wp.outer(U[i], block.gradient[point, i, elem])
+        if wp.static(affine):
+            D = D * block.J0_inv[elem]
+        return D
+
+    @wp.func
+    def weight_of(block: Block, point: int, elem: int) -> T:
+        if wp.static(affine):
+            return block.weight[point, 0] * block.det_J0[elem]
+        else:
+            return block.weight[point, elem]
+
+    @wp.func
+    def scatter(block: Block, f: Local, P: mat33, point: int, elem: int) -> Local:
+        """f_i += w P h_i."""
+        Q = weight_of(block, point, elem) * P
+        if wp.static(affine):
+            Q = Q * wp.transpose(block.J0_inv[elem])
+        out = f
+        for i in range(NS):
+            if wp.static(affine):
+                out[i] = out[i] + Q * block.gradient[point, i, 0]
+            else:
+                out[i] = out[i] + Q * block.gradient[point, i, elem]
+        return out
+
+    @wp.func
+    def pack(A: mat33) -> sym6:
+        return sym6(A[0, 0], A[1, 1], A[2, 2], A[1, 2], A[0, 2], A[0, 1])
+
+    @wp.func
+    def unpack(a: sym6) -> mat33:
+        return mat33(a[0], a[5], a[4], a[5], a[1], a[3], a[4], a[3], a[2])
+
+    @wp.func
+    def history_index(block: Block, point: int, elem: int) -> int:
+        return block.history_offset + point * block.count + elem
+
+    @wp.func
+    def strain_rate(
+        block: Block, G: mat33, V: Local, history: wp.array2d(dtype=sym6), dq: T, world: int, point: int, elem: int
+    ) -> mat33:
+        """Edot at a point: (E - history)/dq (incremental), or Eq. (58) with F and Fdot at the new state (rate)."""
+        if wp.static(damping == "incremental"):
+            past = unpack(history[world, history_index(block, point, elem)])
+            return (T(1.0) / dq) * (t.green(G) - past)
+        else:
+            Fdot = gradient_of(block, V, point, elem)
+            return t.sym(wp.transpose(t.identity() + G) * Fdot)
+
+    @wp.func
+    def vertex_jacobian(block: Block, U: Local, elem: int) -> T:
+        """Smallest J at the element's vertices, where a quadratic field is outside the hull of the points."""
+        J = T(1.0e30)
+        for q in range(vertices):
+            D = mat33()
+            for i in range(NS):
+                if wp.static(affine):
+                    D += wp.outer(U[i], block.vertex_gradient[q, i, 0])
+                else:
+                    D += wp.outer(U[i], block.vertex_gradient[q, i, elem])
+            if wp.static(affine):
+                D = D * block.J0_inv[elem]
+            J = wp.min(J, T(1.0) + t.volume_change(D))
+        return J
+
+    @wp.kernel(module=module)
+    def internal_force(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=vec3),
+        energy: wp.array3d(dtype=wp.float64),
+        min_J: wp.array(dtype=wp.float64),
+    ):
+        """Internal force contributions, Eqs. (32) and (70), strain energy and viscous potential of each element."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        c = coefficients(block, world, elem)
+        U = load(block, u, world, elem)
+        f = Local()
+        psi = T(0.0)
+        psi_v = T(0.0)
+        J_low = T(1.0e30)
+        if wp.static(needs_J):
+            J_low = vertex_jacobian(block, U, elem)
+        V = Local()
+        if wp.static(damping == "rate"):
+            V = load(block, v, world, elem)
+        dq = T(dq_dv[world])
+        for q in range(NQ):
+            G = gradient_of(block, U, q, elem)
+            w = weight_of(block, q, elem)
+            J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
+            P = m.stress(G, c)
+            psi += w * m.energy(G, c)
+            if wp.static(damping == "incremental" or damping == "rate"):
+                rate = strain_rate(block, G, V, history, dq, world, q, elem)
+                S = t.isotropic(rate, c[4], c[3])
+                P = P + S + G * S
+                psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
+            f = scatter(block, f, P, q, elem)
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        energy[0, world, block.element_offset + elem] = wp.float64(psi)
+        energy[1, world, block.element_offset + elem] = wp.float64(psi_v)
+        low = wp.float64(J_low)
+        if low < min_J[world]:
+            wp.atomic_min(min_J, world, low)
+
+    @wp.kernel(module=module)
+    def tangent_product(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """K p, with K = df_int/dq at u (of the rate form only its symmetric part)."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        c = coefficients(block, world, elem)
+        U = load(block, u, world, elem)
+        dU = load(block, direction, world, elem)
+        f = Local()
+        V = Local()
+        if wp.static(damping == "rate"):
+            V = load(block, v, world, elem)
+        dq = T(dq_dv[world])
+        for q in range(NQ):
+            G = gradient_of(block, U, q, elem)
+            dG = gradient_of(block, dU, q, elem)
+            dP = m.increment(G, dG, c)
+            if wp.static(damping == "incremental" or damping == "rate"):
+                F = t.identity() + G
+                S = t.isotropic(strain_rate(block, G, V, history, dq, world, q, elem), c[4], c[3])
+                dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[4] / dq, c[3] / dq)
+                dP = dP + dG * S + F * dS
+            f = scatter(block, f, dP, q, elem)
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+
+    @wp.kernel(module=module)
+    def diagonal_blocks(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=sym6),
+    ):
+        """The 3x3 diagonal blocks of K, made positive at each point, in Voigt order."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        c = coefficients(block, world, elem)
+        cv = damping_coefficients(c, T(1.0) / T(dq_dv[world]))
+        U = load(block, u, world, elem)
+        for i in range(NS):
+            B = sym6()
+            contribution[world, block.contribution_offset + i * block.count + elem] = B
+        for q in range(NQ):
+            G = gradient_of(block, U, q, elem)
+            w = weight_of(block, q, elem)
+            for i in range(NS):
+                a = vec3()
+                if wp.static(affine):
+                    a = wp.transpose(block.J0_inv[elem]) * block.gradient[q, i, 0]
+                else:
+                    a = block.gradient[q, i, elem]
+                K = m.block(G, a, c)
+                if wp.static(damping == "incremental" or damping == "rate"):
+                    K = K + viscous.block(mat33() + G, a, cv)
+                entry = block.contribution_offset + i * block.count + elem
+                contribution[world, entry] = contribution[world, entry] + w * pack(K)
+
+    @wp.kernel(module=module)
+    def strain_history(
+        block: Block,
+        u0: wp.array2d(dtype=vec3),
+        u1: wp.array2d(dtype=vec3),
+        a0: wp.array(dtype=wp.float64),
+        a1: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        history: wp.array2d(dtype=sym6),
+    ):
+        """a0 E(u0) - a1 E(u1) per point: what the incremental strain rate is measured from."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U0 = load(block, u0, world, elem)
+        U1 = load(block, u1, world, elem)
+        for q in range(NQ):
+            E = T(a0[world]) * t.green(gradient_of(block, U0, q, elem))
+            E = E - T(a1[world]) * t.green(gradient_of(block, U1, q, elem))
+            history[world, history_index(block, q, elem)] = pack(E)
+
+    @wp.kernel(module=module)
+    def viscous_force(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=vec3),
+        power: wp.array2d(dtype=wp.float64),
+    ):
+        """Kelvin-Voigt force, Eqs. (58)-(70), at a given state, and its dissipation rate S_vis : Edot (W)."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        c = coefficients(block, world, elem)
+        U = load(block, u, world, elem)
+        V = load(block, v, world, elem)
+        f = Local()
+        rate_of_work = T(0.0)
+        for q in range(NQ):
+            G = gradient_of(block, U, q, elem)
+            F = t.identity() + G
+            rate = t.sym(wp.transpose(F) * gradient_of(block, V, q, elem))
+            S = t.isotropic(rate, c[4], c[3])
+            rate_of_work += weight_of(block, q, elem) * wp.ddot(S, rate)
+            f = scatter(block, f, F * S, q, elem)
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        power[world, block.element_offset + elem] = wp.float64(rate_of_work)
+
+    @wp.kernel(module=module)
+    def point_stress(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        stress: wp.array3d(dtype=sym6),
+        jacobian: wp.array3d(dtype=T),
+    ):
+        """Cauchy stress P F^T / J (elastic part) and J at the quadrature points, [world, point, elem]."""
+        world, elem = wp.tid()
+        c = coefficients(block, world, elem)
+        U = load(block, u, world, elem)
+        for q in range(NQ):
+            G = gradient_of(block, U, q, elem)
+            J = T(1.0) + t.volume_change(G)
+            P = m.stress(G, c)
+            stress[world, q, elem] = pack((T(1.0) / J) * (P + P * wp.transpose(G)))
+            jacobian[world, q, elem] = J
+
+    return _types.SimpleNamespace(
+        module=module,
+        internal_force=internal_force,
+        tangent_product=tangent_product,
+        diagonal_blocks=diagonal_blocks,
+        strain_history=strain_history,
+        viscous_force=viscous_force,
+        point_stress=point_stress,
+    )

@@ -1,0 +1,240 @@
+"""From element contributions to slots: the residual of a step Eq. (17), the product H p, the diagonal blocks.
+
+Contributions are gathered per slot in a fixed order instead of added atomically: reproducible, and faster.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .types import kernel_module, precision
+
+__all__ = ["RESIDUAL_ROWS", "gather_kernels", "topology_struct"]
+
+RESIDUAL_ROWS = 9
+"""Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
+part of Phi and its magnitude; g.p with non-potential forces held; what Phi changes by when they are refreshed; the
+squared norm of the rounding of the positions."""
+
+
+@functools.cache
+def topology_struct(dtype: str):
+    """Who contributes to a slot, the scalar mass matrix in CSR, and which components are free."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+
+    @wp.struct
+    class Topology:
+        start: wp.array(dtype=wp.int32)  # [slot + 1]
+        entry: wp.array(dtype=wp.int32)  # indices into the contributions
+        mass_start: wp.array(dtype=wp.int32)  # [slot + 1]
+        mass_column: wp.array(dtype=wp.int32)
+        mass_value: wp.array(dtype=T)  # kg
+        free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
+
+    return Topology
+
+
+@functools.cache
+def gather_kernels(dtype: str, nonpotential: bool) -> _types.SimpleNamespace:
+    """Kernels over slots; `nonpotential` adds the forces that are held inside a line search."""
+    p = precision(dtype)
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    Topology = topology_struct(dtype)
+    f64 = wp.float64
+    module = kernel_module(f"gather_{dtype}_{nonpotential}")
+
+    @wp.func
+    def weighted(a: vec3, D: vec3) -> f64:
+        s = f64(0.0)
+        for k in range(3):
+            x = f64(a[k])
+            if x != f64(0.0):
+                s += x * x / f64(D[k])
+        return s
+
+    @wp.kernel(module=module)
+    def gather_force(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        out: wp.array2d(dtype=vec3),
+    ):
+        """out = sum of contributions."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        f = vec3()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            f += contribution[world, topo.entry[k]]
+        out[world, slot] = f
+
+    @wp.kernel(module=module)
+    def residual(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        v_tilde: wp.array2d(dtype=vec3),
+        dead: wp.array2d(dtype=vec3),
+        dead_magnitude: wp.array2d(dtype=vec3),
+        pushed: wp.array2d(dtype=vec3),
+        pushed_held: wp.array2d(dtype=vec3),
+        direction: wp.array2d(dtype=vec3),
+        diagonal: wp.array2d(dtype=vec3),
+        u: wp.array2d(dtype=vec3),
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        inertia: wp.array2d(dtype=vec3),
+        internal: wp.array2d(dtype=vec3),
+        g: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """Eq. (17): g = M (v - v~) c_M + f_int - f_dead - f_pushed, and the rows of `RESIDUAL_ROWS`."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        f = vec3()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            f += contribution[world, topo.entry[k]]
+        a = vec3()
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            j = topo.mass_column[k]
+            a += topo.mass_value[k] * (v[world, j] - v_tilde[world, j])
+        a = T(mass_factor[world]) * a
+        load = dead[world, slot]
+        magnitude = dead_magnitude[world, slot]
+        held = load
+        if wp.static(nonpotential):
+            new = pushed[world, slot]
+            held = load + pushed_held[world, slot]
+            load = load + new
+            for k in range(3):
+                magnitude[k] = magnitude[k] + wp.abs(new[k])
+        residual_force = a + f - load
+        inertia[world, slot] = a
+        internal[world, slot] = f
+        g[world, slot] = residual_force
+        free = topo.free[slot]
+        D = diagonal[world, slot]
+        vs = v[world, slot]
+        kinetic = T(0.5) * wp.dot(vs - v_tilde[world, slot], a)
+        work = wp.dot(held, vs)
+        rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
+        rows[1, world, slot] = weighted(wp.cw_mul(f, free), D)
+        rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
+        rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
+        rows[4, world, slot] = f64(kinetic - work)
+        rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
+        rows[6, world, slot] = f64(wp.dot(wp.cw_mul(a + f - held, free), direction[world, slot]))
+        refreshed = T(0.0)
+        if wp.static(nonpotential):
+            refreshed = wp.dot(pushed_held[world, slot] - pushed[world, slot], vs)
+        rows[7, world, slot] = f64(refreshed)
+        spread = f64(0.0)
+        for k in range(3):
+            x = f64(u[world, slot][k]) / dq_dv[world]
+            spread += f64(free[k]) * f64(D[k]) * x * x
+        rows[8, world, slot] = spread
+
+    @wp.kernel(module=module)
+    def product(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        p_in: wp.array2d(dtype=vec3),
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        out: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """H p = c_M M p + (dq/dv) K p on the free components, and p.Hp per slot."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        f = vec3()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            f += contribution[world, topo.entry[k]]
+        a = vec3()
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
+        h = wp.cw_mul(T(mass_factor[world]) * a + T(dq_dv[world]) * f, topo.free[slot])
+        out[world, slot] = h
+        rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
+
+    @wp.func
+    def positive_inverse(A: mat33, mass: T) -> mat33:
+        """Inverse of a symmetric block; where it is not safely positive, of its diagonal."""
+        d1 = A[0, 0]
+        d2 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+        d3 = wp.determinant(A)
+        tol = T(1.0e-6)
+        size = wp.trace(A)
+        if d1 > tol * size and d2 > tol * size * size and d3 > tol * size * size * size * T(0.01):
+            return wp.inverse(A)
+        B = mat33()
+        for k in range(3):
+            B[k, k] = T(1.0) / wp.max(wp.abs(A[k, k]), wp.max(mass, tol * wp.abs(size)))
+        return B
+
+    @wp.kernel(module=module)
+    def gather_blocks(
+        topo: Topology,
+        contribution: wp.array2d(dtype=sym6),
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array2d(dtype=vec3),
+        inverse: wp.array2d(dtype=mat33),
+    ):
+        """Diagonal blocks of H: their diagonal D and their inverse on the free components."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        k6 = sym6()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            k6 += contribution[world, topo.entry[k]]
+        mass = T(0.0)
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            if topo.mass_column[k] == slot:
+                mass = T(mass_factor[world]) * topo.mass_value[k]
+        k6 = T(dq_dv[world]) * k6
+        A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
+        free = topo.free[slot]
+        D = vec3()
+        for i in range(3):
+            A[i, i] = A[i, i] + mass
+            D[i] = wp.max(wp.abs(A[i, i]), T(1.0e-30))
+            for j in range(3):
+                A[i, j] = A[i, j] * free[i] * free[j]
+            if free[i] == T(0.0):
+                A[i, i] = D[i]
+        diagonal[world, slot] = D
+        B = positive_inverse(A, mass)
+        for i in range(3):
+            for j in range(3):
+                B[i, j] = B[i, j] * free[i] * free[j]
+        inverse[world, slot] = B
+
+    @wp.kernel(module=module)
+    def mass_product(
+        topo: Topology,
+        a: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """a.M a / 2 per slot, for every world."""
+        world, slot = wp.tid()
+        s = vec3()
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            s += topo.mass_value[k] * a[world, topo.mass_column[k]]
+        rows[0, world, slot] = f64(0.5) * f64(wp.dot(s, a[world, slot]))
+
+    return _types.SimpleNamespace(
+        module=module,
+        gather_force=gather_force,
+        residual=residual,
+        product=product,
+        gather_blocks=gather_blocks,
+        mass_product=mass_product,
+    )

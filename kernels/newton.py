@@ -1,0 +1,270 @@
+"""Per-world logic of Newton's method: convergence, forcing terms, line search, acceptance. One thread per world."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .types import kernel_module, precision
+
+__all__ = [
+    "FAIL_CURVATURE",
+    "FAIL_ITERATIONS",
+    "FAIL_JACOBIAN",
+    "FAIL_LINE_SEARCH",
+    "FAIL_NAN",
+    "control_struct",
+    "newton_kernels",
+]
+
+FAIL_ITERATIONS = 1
+FAIL_LINE_SEARCH = 2
+FAIL_JACOBIAN = 3
+FAIL_NAN = 4
+FAIL_CURVATURE = 5
+
+ARMIJO = 1.0e-4
+WOLFE = 0.8
+NOISE = 100.0  # Phi is blind below this many roundings of its parts
+FLOOR = 16.0
+MAX_SEARCH = 20
+
+
+@functools.cache
+def control_struct():
+    """What Newton's method knows of each world."""
+
+    @wp.struct
+    class NewtonControl:
+        active: wp.array(dtype=wp.int32)  # iterating
+        searching: wp.array(dtype=wp.int32)  # in a line search
+        failed: wp.array(dtype=wp.int32)  # 0 or a FAIL_ code
+        iterations: wp.array(dtype=wp.int32)  # of this attempt
+        searches: wp.array(dtype=wp.int32)
+        total_iterations: wp.array(dtype=wp.int32)  # of this step
+        alpha: wp.array(dtype=wp.float64)
+        phi: wp.array(dtype=wp.float64)
+        phi_magnitude: wp.array(dtype=wp.float64)
+        slope: wp.array(dtype=wp.float64)  # g.p at the iterate
+        norm: wp.array(dtype=wp.float64)  # |g| in the D^-1 norm
+        scale: wp.array(dtype=wp.float64)  # what it is compared with
+        accept: wp.array(dtype=wp.float64)  # norm at which the iteration ends
+        forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
+        min_J: wp.array(dtype=wp.float64)
+        history: wp.array2d(dtype=wp.float64)  # [world, iteration] norm / scale
+        slot_sums: wp.array2d(dtype=wp.float64)  # gather.RESIDUAL_ROWS
+        elem_sums: wp.array2d(dtype=wp.float64)  # strain energy, viscous potential
+        slope_sum: wp.array2d(dtype=wp.float64)
+        dq_dv: wp.array(dtype=wp.float64)
+        tol: wp.float64
+        eps: wp.float64
+        max_iterations: wp.int32
+        need_positive_J: wp.int32
+        nonpotential: wp.int32
+
+    return NewtonControl
+
+
+@functools.cache
+def newton_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels of the Newton iteration in one precision of the vectors; scalars are float64."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Control = control_struct()
+    module = kernel_module(f"newton_{dtype}")
+
+    @wp.func
+    def objective(ctl: Control, world: int) -> f64:
+        stored = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
+        return ctl.slot_sums[4, world] + stored / ctl.dq_dv[world]
+
+    @wp.func
+    def magnitude(ctl: Control, world: int) -> f64:
+        stored = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
+        return ctl.slot_sums[5, world] + stored / ctl.dq_dv[world]
+
+    @wp.func
+    def measure(ctl: Control, world: int):
+        """Norm, scale and acceptance threshold of the residual just evaluated."""
+        biggest = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
+        scale = wp.sqrt(biggest)
+        ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
+        ctl.scale[world] = scale
+        rounding = ctl.eps * (f64(FLOOR) * scale + f64(2.0) * wp.sqrt(ctl.slot_sums[8, world]))
+        ctl.accept[world] = ctl.tol * scale + rounding
+
+    @wp.func
+    def record(ctl: Control, world: int):
+        k = ctl.iterations[world]
+        if k < ctl.history.shape[1]:
+            ctl.history[world, k] = ctl.norm[world] / wp.max(ctl.scale[world], f64(1.0e-300))
+
+    @wp.func
+    def settle(ctl: Control, world: int):
+        """End the iteration where it has converged or used up its iterations."""
+        record(ctl, world)
+        if ctl.norm[world] <= ctl.accept[world]:
+            ctl.active[world] = 0
+        elif ctl.iterations[world] >= ctl.max_iterations:
+            ctl.active[world] = 0
+            ctl.failed[world] = FAIL_ITERATIONS
+
+    @wp.func
+    def fail(ctl: Control, world: int, why: int):
+        ctl.active[world] = 0
+        ctl.searching[world] = 0
+        ctl.failed[world] = why
+
+    @wp.kernel(module=module)
+    def reset_min_J(ctl: Control, active: wp.array(dtype=wp.int32)):
+        """Before an evaluation: forget the smallest J."""
+        world = wp.tid()
+        if active[world] != 0:
+            ctl.min_J[world] = f64(1.0e30)
+
+    @wp.kernel(module=module)
+    def begin(ctl: Control):
+        """Judge the first iterate."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        measure(ctl, world)
+        phi = objective(ctl, world) + ctl.slot_sums[7, world]
+        ctl.phi[world] = phi
+        ctl.phi_magnitude[world] = magnitude(ctl, world)
+        ctl.forcing[world] = f64(0.1)
+        if not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
+            fail(ctl, world, FAIL_NAN)
+        elif ctl.need_positive_J != 0 and ctl.min_J[world] <= f64(0.0):
+            fail(ctl, world, FAIL_JACOBIAN)
+        else:
+            settle(ctl, world)
+
+    @wp.kernel(module=module)
+    def begin_search(ctl: Control):
+        """Take the slope along the new direction; try the full step first."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            ctl.searching[world] = 0
+            return
+        slope = ctl.slope_sum[0, world]
+        ctl.slope[world] = slope
+        ctl.alpha[world] = f64(1.0)
+        ctl.searches[world] = 0
+        ctl.searching[world] = 1
+        if not wp.isfinite(slope):
+            fail(ctl, world, FAIL_NAN)
+        elif slope >= f64(0.0):
+            fail(ctl, world, FAIL_CURVATURE)
+
+    @wp.kernel(module=module)
+    def judge_trial(ctl: Control):
+        """Armijo on Phi while it is not blind, else the sign of the slope; then convergence."""
+        world = wp.tid()
+        if ctl.searching[world] == 0:
+            return
+        alpha = ctl.alpha[world]
+        old_norm = ctl.norm[world]
+        phi = objective(ctl, world)
+        norm = wp.sqrt(ctl.slot_sums[0, world])
+        change = phi - ctl.phi[world]
+        noise = f64(NOISE) * ctl.eps * (ctl.phi_magnitude[world] + magnitude(ctl, world))
+        good = wp.isfinite(phi) and wp.isfinite(norm)
+        if good:
+            if wp.abs(change) > noise:
+                good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
+            else:
+                good = ctl.slot_sums[6, world] <= f64(WOLFE) * wp.abs(ctl.slope[world])
+            if ctl.nonpotential != 0 and norm <= f64(0.5) * old_norm:
+                good = True
+        if ctl.need_positive_J != 0 and ctl.min_J[world] <= f64(0.0):
+            good = False
+        if good:
+            ctl.searching[world] = 0
+            measure(ctl, world)
+            ctl.phi[world] = phi + ctl.slot_sums[7, world]
+            ctl.phi_magnitude[world] = magnitude(ctl, world)
+            ctl.iterations[world] = ctl.iterations[world] + 1
+            ctl.total_iterations[world] = ctl.total_iterations[world] + 1
+            ratio = norm / wp.max(old_norm, f64(1.0e-300))
+            eta = f64(0.9) * ratio * ratio
+            guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
+            if guard > f64(0.1):
+                eta = wp.max(eta, guard)
+            ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
+            settle(ctl, world)
+        else:
+            ctl.searches[world] = ctl.searches[world] + 1
+            ctl.alpha[world] = f64(0.5) * alpha
+            if ctl.searches[world] > MAX_SEARCH:
+                why = FAIL_LINE_SEARCH
+                if ctl.need_positive_J != 0 and ctl.min_J[world] <= f64(0.0):
+                    why = FAIL_JACOBIAN
+                fail(ctl, world, why)
+
+    @wp.kernel(module=module)
+    def any_set(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+        """out[0] = 1 where any world's flag is set; out must be 0 before."""
+        world = wp.tid()
+        if flags[world] != 0:
+            wp.atomic_max(out, 0, 1)
+
+    @wp.kernel(module=module)
+    def update_position(
+        q_tilde: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        u: wp.array2d(dtype=vec3),
+    ):
+        """q = q~ + (dq/dv) v."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            u[world, slot] = q_tilde[world, slot] + T(dq_dv[world]) * v[world, slot]
+
+    @wp.kernel(module=module)
+    def trial_velocity(
+        ctl: Control,
+        base: wp.array2d(dtype=vec3),
+        direction: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+    ):
+        """v = base + alpha p."""
+        world, slot = wp.tid()
+        if ctl.searching[world] != 0:
+            v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
+
+    @wp.kernel(module=module)
+    def copy_active(
+        source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)
+    ):
+        """target = source in the active worlds."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            target[world, slot] = source[world, slot]
+
+    @wp.kernel(module=module)
+    def dot_rows(
+        a: wp.array2d(dtype=vec3),
+        b: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """a.b per slot."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            rows[0, world, slot] = f64(wp.dot(a[world, slot], b[world, slot]))
+
+    return _types.SimpleNamespace(
+        module=module,
+        reset_min_J=reset_min_J,
+        begin=begin,
+        begin_search=begin_search,
+        judge_trial=judge_trial,
+        any_set=any_set,
+        update_position=update_position,
+        trial_velocity=trial_velocity,
+        copy_active=copy_active,
+        dot_rows=dot_rows,
+    )

@@ -1,0 +1,242 @@
+"""Preconditioned conjugate gradients on H p = -g, per world, with the translations of free groups deflated.
+
+Vector kernels run over [world, slot]; scalar logic runs with one thread per world.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .newton import control_struct
+from .types import kernel_module, precision
+
+__all__ = ["LANES", "groups_struct", "pcg_kernels", "pcg_struct"]
+
+LANES = 128
+"""Partial sums per group of bodies: fixed, so that results don't depend on the number of worlds."""
+
+
+@functools.cache
+def pcg_struct():
+    """What the conjugate gradients know of each world."""
+
+    @wp.struct
+    class PCGControl:
+        active: wp.array(dtype=wp.int32)
+        iterations: wp.array(dtype=wp.int32)  # of this solve
+        total: wp.array(dtype=wp.int32)  # of this step
+        rz: wp.array(dtype=wp.float64)
+        alpha: wp.array(dtype=wp.float64)
+        beta: wp.array(dtype=wp.float64)
+        target: wp.array(dtype=wp.float64)  # of sqrt(r.z)
+        sums: wp.array2d(dtype=wp.float64)
+        any_active: wp.array(dtype=wp.int32)
+        max_iterations: wp.int32
+
+    return PCGControl
+
+
+@functools.cache
+def groups_struct(dtype: str):
+    """Bodies that may translate freely together: Z, their position slots."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+
+    @wp.struct
+    class FreeGroups:
+        start: wp.array(dtype=wp.int32)  # [group + 1]
+        slot: wp.array(dtype=wp.int32)  # position slots, by group
+        of_slot: wp.array(dtype=wp.int32)  # [slot] group or -1
+        is_position: wp.array(dtype=T)  # [slot]
+        lumped: wp.array(dtype=T)  # [slot] (M Z)_slot, kg
+        mass: wp.array(dtype=T)  # [group] kg
+        free: wp.array(dtype=vec3)  # [group] directions in which it is free
+
+    return FreeGroups
+
+
+@functools.cache
+def pcg_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels of the linear solver in one precision."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64 = wp.float64
+    Newton = control_struct()
+    Control = pcg_struct()
+    Groups = groups_struct(dtype)
+    module = kernel_module(f"pcg_{dtype}")
+
+    @wp.kernel(module=module)
+    def start(
+        g: wp.array2d(dtype=vec3),
+        free: wp.array(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        x: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """x = 0, r = -g on the free components."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            x[world, slot] = vec3()
+            r[world, slot] = -wp.cw_mul(g[world, slot], free[slot])
+
+    @wp.kernel(module=module)
+    def block_jacobi(
+        inverse: wp.array2d(dtype=mat33),
+        r: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        z: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """z = D^-1 r with 3x3 blocks, and r.z per slot."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        a = r[world, slot]
+        b = inverse[world, slot] * a
+        z[world, slot] = b
+        rows[0, world, slot] = f64(wp.dot(a, b))
+
+    @wp.kernel(module=module)
+    def begin(newton: Newton, ctl: Control):
+        """Set the target of the solve: Eisenstat-Walker, but no tighter than Newton needs."""
+        world = wp.tid()
+        ctl.active[world] = 0
+        if newton.active[world] == 0:
+            return
+        rz = ctl.sums[0, world]
+        ctl.rz[world] = rz
+        ctl.iterations[world] = 0
+        ctl.target[world] = wp.max(newton.forcing[world] * newton.norm[world], f64(0.1) * newton.accept[world])
+        if rz > ctl.target[world] * ctl.target[world] and ctl.max_iterations > 0:
+            ctl.active[world] = 1
+            wp.atomic_max(ctl.any_active, 0, 1)
+
+    @wp.kernel(module=module)
+    def step_length(ctl: Control):
+        """alpha = r.z / p.Hp; a direction of no positive curvature ends the solve."""
+        world = wp.tid()
+        if world == 0:
+            ctl.any_active[0] = 0
+        if ctl.active[world] == 0:
+            return
+        pHp = ctl.sums[0, world]
+        ctl.total[world] = ctl.total[world] + 1
+        if pHp > f64(0.0) and wp.isfinite(pHp):
+            ctl.alpha[world] = ctl.rz[world] / pHp
+        else:
+            ctl.alpha[world] = f64(0.0)
+            if ctl.iterations[world] == 0:
+                ctl.alpha[world] = f64(1.0)
+            ctl.iterations[world] = ctl.max_iterations
+        ctl.iterations[world] = ctl.iterations[world] + 1
+
+    @wp.kernel(module=module)
+    def update(
+        ctl: Control,
+        p_in: wp.array2d(dtype=vec3),
+        Hp: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """x += alpha p, r -= alpha Hp."""
+        world, slot = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        alpha = T(ctl.alpha[world])
+        x[world, slot] = x[world, slot] + alpha * p_in[world, slot]
+        r[world, slot] = r[world, slot] - alpha * Hp[world, slot]
+
+    @wp.kernel(module=module)
+    def direction_factor(ctl: Control):
+        """beta = (r.z)_new / (r.z)_old, and the end of the solve."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        rz = ctl.sums[0, world]
+        ctl.beta[world] = rz / ctl.rz[world]
+        ctl.rz[world] = rz
+        target = ctl.target[world]
+        if rz > target * target and ctl.iterations[world] < ctl.max_iterations and wp.isfinite(rz):
+            wp.atomic_max(ctl.any_active, 0, 1)
+        else:
+            ctl.active[world] = 0
+
+    @wp.kernel(module=module)
+    def new_direction(
+        ctl: Control, active: wp.array(dtype=wp.int32), z: wp.array2d(dtype=vec3), p_out: wp.array2d(dtype=vec3)
+    ):
+        """p = z + beta p."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            p_out[world, slot] = z[world, slot] + T(ctl.beta[world]) * p_out[world, slot]
+
+    @wp.kernel(module=module)
+    def group_partial(
+        groups: Groups,
+        r: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        partial: wp.array3d(dtype=vec3),
+    ):
+        """Z^T r, in LANES strided partial sums per group."""
+        world, group, lane = wp.tid()
+        if active[world] == 0:
+            return
+        s = vec3()
+        for k in range(groups.start[group] + lane, groups.start[group + 1], LANES):
+            s += r[world, groups.slot[k]]
+        partial[world, group, lane] = s
+
+    @wp.kernel(module=module)
+    def group_velocity(
+        groups: Groups,
+        partial: wp.array3d(dtype=vec3),
+        mass_factor: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        velocity: wp.array2d(dtype=vec3),
+    ):
+        """(Z^T H Z)^-1 Z^T r: stiffness does not feel a translation, so this is the mass alone."""
+        world, group = wp.tid()
+        if active[world] == 0:
+            return
+        s = vec3()
+        for lane in range(LANES):
+            s += partial[world, group, lane]
+        scale = T(1.0) / (T(mass_factor[world]) * groups.mass[group])
+        velocity[world, group] = scale * wp.cw_mul(s, groups.free[group])
+
+    @wp.kernel(module=module)
+    def translate_groups(
+        groups: Groups,
+        velocity: wp.array2d(dtype=vec3),
+        free: wp.array(dtype=vec3),
+        mass_factor: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        x: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """x += Z c, r -= H Z c."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        group = groups.of_slot[slot]
+        if group < 0:
+            return
+        c = velocity[world, group]
+        x[world, slot] = x[world, slot] + groups.is_position[slot] * c
+        r[world, slot] = r[world, slot] - T(mass_factor[world]) * groups.lumped[slot] * wp.cw_mul(c, free[slot])
+
+    return _types.SimpleNamespace(
+        module=module,
+        start=start,
+        block_jacobi=block_jacobi,
+        begin=begin,
+        step_length=step_length,
+        update=update,
+        direction_factor=direction_factor,
+        new_direction=new_direction,
+        group_partial=group_partial,
+        group_velocity=group_velocity,
+        translate_groups=translate_groups,
+    )

@@ -1,0 +1,151 @@
+"""Ray casting of a triangle mesh over a ground plane: one thread per sample of the picture.
+
+Everything is scaled by the host so that the scene has size one, with z up; colours are linear light.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})
+
+
+@wp.struct
+class Scene:
+    mesh: wp.uint64
+    corner_normals: wp.array(dtype=wp.vec3)  # [3 * face + corner]
+    colors: wp.array(dtype=wp.vec3)  # [vertex]
+    eye: wp.vec3
+    forward: wp.vec3
+    right: wp.vec3  # half the picture's width at distance one
+    up: wp.vec3  # half its height
+    center: wp.vec2  # where the axis `forward` meets the picture, in [-1, 1]
+    width: float  # pixels
+    height: float
+    light: wp.vec3  # towards the light
+    ground: float  # height of the ground plane
+    has_ground: int
+    grid: float  # distance of its fine lines; every fifth is strong
+    fade: float  # radius at which it has faded
+    focus: wp.vec2  # its middle
+    shadow: wp.array2d(dtype=float)  # light (0 .. 1) that reaches the ground
+    shadow_low: wp.vec2
+    shadow_cell: float
+
+
+@wp.func
+def mix(a: wp.vec3, b: wp.vec3, t: float):
+    return a * (1.0 - t) + b * t
+
+
+@wp.func
+def backdrop(height: float):
+    """Background at a height in the picture, 0 at the bottom."""
+    return mix(wp.vec3(0.90, 0.91, 0.92), wp.vec3(0.60, 0.68, 0.78), wp.clamp(height, 0.0, 1.0))
+
+
+@wp.func
+def line(x: float, step: float, half_width: float, footprint: float):
+    """How much of a pixel of size `footprint` at x the lines at multiples of `step` cover."""
+    d = wp.abs(x / step - wp.round(x / step)) * step
+    w = wp.max(half_width, 0.5 * footprint)
+    strength = half_width / w
+    return strength * (1.0 - wp.smoothstep(w - 0.5 * footprint, w + 0.5 * footprint, d))
+
+
+@wp.func
+def ground_light(scene: Scene, x: float, y: float):
+    """Bilinear value of the shadow map; 1 outside."""
+    fx = (x - scene.shadow_low[0]) / scene.shadow_cell - 0.5
+    fy = (y - scene.shadow_low[1]) / scene.shadow_cell - 0.5
+    i = int(wp.floor(fx))
+    j = int(wp.floor(fy))
+    if i < 0 or j < 0 or i + 1 >= scene.shadow.shape[0] or j + 1 >= scene.shadow.shape[1]:
+        return 1.0
+    u = fx - float(i)
+    v = fy - float(j)
+    low = scene.shadow[i, j] * (1.0 - u) + scene.shadow[i + 1, j] * u
+    high = scene.shadow[i, j + 1] * (1.0 - u) + scene.shadow[i + 1, j + 1] * u
+    return low * (1.0 - v) + high * v
+
+
+@wp.func
+def shade_ground(scene: Scene, p: wp.vec3, distance: float, slope: float, behind: wp.vec3):
+    """A light plane with a grid, its shadow, and a soft border."""
+    base = wp.vec3(0.80, 0.81, 0.83)
+    pixel = distance * wp.length(scene.up) * 2.0 / scene.height
+    footprint = pixel / wp.max(slope, 0.05)
+    fine = wp.max(
+        line(p[0], scene.grid, 0.4 * pixel, footprint), line(p[1], scene.grid, 0.4 * pixel, footprint)
+    )
+    big = 5.0 * scene.grid
+    strong = wp.max(line(p[0], big, 0.7 * pixel, footprint), line(p[1], big, 0.7 * pixel, footprint))
+    base = mix(base, wp.vec3(0.50, 0.53, 0.58), wp.max(0.45 * fine, 0.70 * strong))
+    base = base * (0.48 + 0.52 * ground_light(scene, p[0], p[1]))
+    r = wp.length(wp.vec2(p[0], p[1]) - scene.focus) / scene.fade
+    return mix(behind, base, wp.exp(-r * r * r))
+
+
+@wp.func
+def shade_surface(scene: Scene, p: wp.vec3, n: wp.vec3, flat: wp.vec3, albedo: wp.vec3, ray: wp.vec3):
+    """Sky and ground light, a key light with shadow, a head light, a small highlight."""
+    key = wp.max(wp.dot(n, scene.light), 0.0)
+    if key > 0.0:
+        if wp.mesh_query_ray_anyhit(scene.mesh, p + flat * 1.0e-3, scene.light, 10.0):
+            key = 0.15 * key
+    head = wp.max(-wp.dot(n, ray), 0.0)
+    sky = 0.5 + 0.5 * n[2]
+    half = wp.normalize(scene.light - ray)
+    shine = 0.07 * wp.pow(wp.max(wp.dot(n, half), 0.0), 40.0) * wp.min(key * 4.0, 1.0)
+    light = 0.24 + 0.18 * sky + 0.46 * key + 0.26 * head
+    return albedo * light + wp.vec3(shine, shine, shine)
+
+
+@wp.kernel
+def cast(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.vec3)):
+    """Colour (linear light) of each picture position (pixels, y down)."""
+    sample = wp.tid()
+    x = 2.0 * samples[sample][0] / scene.width - 1.0 - scene.center[0]
+    y = 1.0 - 2.0 * samples[sample][1] / scene.height - scene.center[1]
+    ray = wp.normalize(scene.forward + scene.right * x + scene.up * y)
+    color = backdrop(1.0 - samples[sample][1] / scene.height)
+    reach = float(1.0e4)
+    if scene.has_ground == 1 and ray[2] < -1.0e-4:
+        reach = (scene.ground - scene.eye[2]) / ray[2]
+        p = scene.eye + ray * reach
+        color = shade_ground(scene, p, reach, -ray[2], color)
+    hit = wp.mesh_query_ray(scene.mesh, scene.eye, ray, reach)
+    if hit.result:
+        p = scene.eye + ray * hit.t
+        w = 1.0 - hit.u - hit.v
+        k = 3 * hit.face
+        n = (
+            scene.corner_normals[k] * hit.u
+            + scene.corner_normals[k + 1] * hit.v
+            + scene.corner_normals[k + 2] * w
+        )
+        albedo = (
+            scene.colors[wp.mesh_get_index(scene.mesh, k)] * hit.u
+            + scene.colors[wp.mesh_get_index(scene.mesh, k + 1)] * hit.v
+            + scene.colors[wp.mesh_get_index(scene.mesh, k + 2)] * w
+        )
+        n = wp.normalize(n)
+        flat = wp.normalize(hit.normal)
+        if wp.dot(flat, ray) > 0.0:
+            flat = -flat
+        if wp.dot(n, flat) < 0.0:
+            n = -n
+        color = shade_surface(scene, p, n, flat, albedo, ray)
+    out[sample] = color
+
+
+@wp.kernel
+def cast_shadow(scene: Scene, lights: wp.array(dtype=wp.vec3), shadow: wp.array2d(dtype=float)):
+    """Share of the directions `lights` in which a cell of the ground sees no surface."""
+    i, j = wp.tid()
+    x = scene.shadow_low[0] + (float(i) + 0.5) * scene.shadow_cell
+    y = scene.shadow_low[1] + (float(j) + 0.5) * scene.shadow_cell
+    start = wp.vec3(x, y, scene.ground)
+    seen = float(0.0)
+    for k in range(lights.shape[0]):
+        if not wp.mesh_query_ray_anyhit(scene.mesh, start, lights[k], 20.0):
+            seen += 1.0
+    shadow[i, j] = seen / float(lights.shape[0])

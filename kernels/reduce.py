@@ -1,0 +1,49 @@
+"""Sums per world in an order that depends on the length of a row alone, not on the number of worlds."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .types import kernel_module
+
+__all__ = ["CHUNK", "reduce_kernels"]
+
+TILE = 256
+CHUNK = 4096
+"""Rows up to this length are summed by one block; longer ones in chunks of this length first."""
+
+
+@functools.cache
+def reduce_kernels() -> _types.SimpleNamespace:
+    """Kernels that sum rows [row, world, item] of float64."""
+    f64 = wp.float64
+    module = kernel_module("reduce")
+
+    @wp.kernel(module=module)
+    def partial_sums(
+        rows: wp.array3d(dtype=f64), active: wp.array(dtype=wp.int32), partial: wp.array3d(dtype=f64)
+    ):
+        """One block sums one chunk of one row of one world."""
+        row, world, chunk = wp.tid()
+        if active[world] == 0:
+            return
+        acc = wp.tile_zeros(shape=(1, 1, TILE), dtype=f64)
+        for k in range(CHUNK // TILE):
+            acc += wp.tile_load(rows, shape=(1, 1, TILE), offset=(row, world, chunk * CHUNK + k * TILE))
+        partial[row, world, chunk] = wp.tile_extract(wp.tile_sum(acc), 0)
+
+    @wp.kernel(module=module)
+    def final_sums(
+        rows: wp.array3d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=f64)
+    ):
+        """One block sums one row of one world."""
+        row, world = wp.tid()
+        if active[world] == 0:
+            return
+        acc = wp.tile_zeros(shape=(1, 1, TILE), dtype=f64)
+        for k in range((rows.shape[2] + TILE - 1) // TILE):
+            acc += wp.tile_load(rows, shape=(1, 1, TILE), offset=(row, world, k * TILE))
+        out[row, world] = wp.tile_extract(wp.tile_sum(acc), 0)
+
+    return _types.SimpleNamespace(module=module, partial_sums=partial_sums, final_sums=final_sums)

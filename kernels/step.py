@@ -1,0 +1,371 @@
+"""The step itself: time levels, predictor, acceptance, energy ledger, report.
+
+A step of dt is walked in substeps of dt / 2^level. A refused substep raises the level by one; after an accepted one
+the level falls again as soon as the position is even, so that time stays an exact binary fraction of dt.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .newton import control_struct
+from .pcg import pcg_struct
+from .types import kernel_module, precision
+
+__all__ = ["LEDGER", "LEDGER_ROWS", "REPORT", "STATUS", "step_kernels", "step_struct"]
+
+STATUS = {"running": 0, "failed": 1, "frozen": 2}
+
+REPORT = ("status", "newton", "pcg", "residual", "halvings", "min_J", "time", "failure", "attempt_time")
+"""Columns of the report of a step, [world, column] in float64; probes follow."""
+
+LEDGER = (
+    "kinetic",
+    "strain",
+    "potential",
+    "work_loads",
+    "work_supports",
+    "work_fields",
+    "viscous",
+    "integrator",
+    "ledger_residual",
+    "unbalanced",
+)
+"""Columns of the energy ledger, J, accumulated since the start (the first three: current values)."""
+
+LEDGER_ROWS = 9
+
+
+@functools.cache
+def step_struct():
+    """What the step loop knows of each world."""
+
+    @wp.struct
+    class StepControl:
+        status: wp.array(dtype=wp.int32)  # STATUS
+        running: wp.array(dtype=wp.int32)  # this step is not finished
+        level: wp.array(dtype=wp.int32)
+        part: wp.array(dtype=wp.int32)  # substeps of the level that are done
+        halvings: wp.array(dtype=wp.int32)
+        refused: wp.array(dtype=wp.int32)  # in this attempt
+        accepted: wp.array(dtype=wp.int32)
+        first_refusal: wp.array(dtype=wp.int32)
+        time: wp.array(dtype=wp.float64)  # s, state
+        new_time: wp.array(dtype=wp.float64)  # end of the attempt
+        step_start: wp.array(dtype=wp.float64)
+        h: wp.array(dtype=wp.float64)
+        previous_h: wp.array(dtype=wp.float64)  # state of multistep schemes; 0 before the first step
+        dt: wp.array(dtype=wp.float64)
+        a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1}
+        a1: wp.array(dtype=wp.float64)
+        dq_dv: wp.array(dtype=wp.float64)  # beta h
+        mass_factor: wp.array(dtype=wp.float64)  # 1/(beta h), 0 in statics
+        ramp: wp.array(dtype=wp.float64)  # factor of constant loads
+        gravity: wp.array(dtype=wp.vec3d)
+        any_running: wp.array(dtype=wp.int32)
+        max_halvings: wp.int32
+        total_J: wp.array(dtype=wp.float64)
+
+    return StepControl
+
+
+@functools.cache
+def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep: bool) -> _types.SimpleNamespace:
+    """Kernels of the step loop.
+
+    Args:
+        dtype: precision of the vectors.
+        coefficients: wp.func (h, previous h) -> vec3d(a0, a1, beta) of the time discretisation.
+        static: no inertia, v is the displacement increment.
+        multistep: the scheme uses the step before the last.
+    """
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Step = step_struct()
+    Newton = control_struct()
+    PCG = pcg_struct()
+    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}")
+
+    @wp.kernel(module=module)
+    def begin_step(step: Step, newton: Newton, pcg: PCG):
+        """Open a step of every world that has not failed."""
+        world = wp.tid()
+        alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
+        step.running[world] = alive
+        if alive == 0:
+            return
+        wp.atomic_max(step.any_running, 0, 1)
+        step.level[world] = 0
+        step.part[world] = 0
+        step.halvings[world] = 0
+        step.step_start[world] = step.time[world]
+        step.total_J[world] = f64(1.0e30)
+        newton.total_iterations[world] = 0
+        pcg.total[world] = 0
+
+    @wp.kernel(module=module)
+    def begin_attempt(step: Step, newton: Newton):
+        """Time levels and coefficients of the next substep."""
+        world = wp.tid()
+        if world == 0:
+            step.any_running[0] = 0
+        step.accepted[world] = 0
+        step.refused[world] = 0
+        step.first_refusal[world] = 0
+        newton.active[world] = step.running[world]
+        newton.searching[world] = 0
+        if step.running[world] == 0:
+            return
+        newton.failed[world] = 0
+        newton.iterations[world] = 0
+        parts = f64(wp.lshift(1, step.level[world]))
+        h = step.dt[world] / parts
+        step.h[world] = h
+        step.new_time[world] = step.step_start[world] + step.dt[world] * (f64(step.part[world] + 1) / parts)
+        c = coefficients(h, step.previous_h[world])
+        step.a0[world] = c[0]
+        step.a1[world] = c[1]
+        if wp.static(static):
+            step.dq_dv[world] = f64(1.0)
+            step.mass_factor[world] = f64(0.0)
+            step.ramp[world] = step.new_time[world]
+        else:
+            step.dq_dv[world] = c[2] * h
+            step.mass_factor[world] = f64(1.0) / (c[2] * h)
+            step.ramp[world] = f64(1.0)
+
+    @wp.kernel(module=module)
+    def predict(
+        step: Step,
+        is_position: wp.array(dtype=T),
+        free: wp.array(dtype=vec3),
+        u_n: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        u_before: wp.array2d(dtype=vec3),
+        v_before: wp.array2d(dtype=vec3),
+        q_tilde: wp.array2d(dtype=vec3),
+        v_tilde: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+    ):
+        """q~, v~ and the first iterate, v~ + (dq/dv) g; a clamped component keeps its place."""
+        world, slot = wp.tid()
+        if step.running[world] == 0:
+            return
+        q = u_n[world, slot]
+        w = v_n[world, slot]
+        if wp.static(multistep):
+            a0 = T(step.a0[world])
+            a1 = T(step.a1[world])
+            q = a0 * q - a1 * u_before[world, slot]
+            w = a0 * w - a1 * v_before[world, slot]
+        q_tilde[world, slot] = q
+        v_tilde[world, slot] = w
+        guess = vec3()
+        dq = T(step.dq_dv[world])
+        if wp.static(not static):
+            guess = w + (dq * is_position[slot]) * vec3(step.gravity[world])
+        keep = (T(1.0) / dq) * (u_n[world, slot] - q)
+        f = free[slot]
+        for k in range(3):
+            if f[k] == T(0.0):
+                guess[k] = keep[k]
+        v[world, slot] = guess
+
+    @wp.kernel(module=module)
+    def end_attempt(step: Step, newton: Newton):
+        """Accept the substep, or refuse it and halve."""
+        world = wp.tid()
+        if step.running[world] == 0:
+            return
+        if newton.failed[world] == 0:
+            step.accepted[world] = 1
+            step.total_J[world] = wp.min(step.total_J[world], newton.min_J[world])
+            part = step.part[world] + 1
+            level = step.level[world]
+            while level > 0 and part % 2 == 0:
+                part = part / 2
+                level = level - 1
+            step.part[world] = part
+            step.level[world] = level
+            step.time[world] = step.new_time[world]
+            if level == 0:
+                step.running[world] = 0
+            else:
+                wp.atomic_max(step.any_running, 0, 1)
+            return
+        step.refused[world] = 1
+        if step.halvings[world] == 0:
+            step.first_refusal[world] = 1
+        step.halvings[world] = step.halvings[world] + 1
+        level = step.level[world] + 1
+        if level > step.max_halvings:
+            step.status[world] = wp.static(STATUS["failed"])
+            step.running[world] = 0
+        else:
+            step.level[world] = level
+            step.part[world] = step.part[world] * 2
+            wp.atomic_max(step.any_running, 0, 1)
+
+    @wp.kernel(module=module)
+    def failed_now(step: Step, flags: wp.array(dtype=wp.int32)):
+        """Flags of the worlds whose step failed for good after at least one accepted substep may have changed them."""
+        world = wp.tid()
+        flags[world] = 0
+        if step.status[world] == wp.static(STATUS["failed"]) and step.refused[world] == 1:
+            flags[world] = 1
+
+    @wp.kernel(module=module)
+    def commit(
+        step: Step,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        u_n: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        u_before: wp.array2d(dtype=vec3),
+        v_before: wp.array2d(dtype=vec3),
+    ):
+        """Make the accepted iterate the state."""
+        world, slot = wp.tid()
+        if step.accepted[world] == 0:
+            return
+        if wp.static(multistep):
+            u_before[world, slot] = u_n[world, slot]
+            v_before[world, slot] = v_n[world, slot]
+            if slot == 0:
+                step.previous_h[world] = step.h[world]
+        u_n[world, slot] = u[world, slot]
+        if wp.static(not static):
+            v_n[world, slot] = v[world, slot]
+
+    @wp.kernel(module=module)
+    def ledger_rows(
+        step: Step,
+        mass_start: wp.array(dtype=wp.int32),
+        mass_column: wp.array(dtype=wp.int32),
+        mass_value: wp.array(dtype=T),
+        free: wp.array(dtype=vec3),
+        lumped: wp.array(dtype=T),
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        u_n: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        inertia: wp.array2d(dtype=vec3),
+        internal: wp.array2d(dtype=vec3),
+        dead: wp.array2d(dtype=vec3),
+        g: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq, pushed.dq,
+        inertia.dq."""
+        world, slot = wp.tid()
+        if step.accepted[world] == 0:
+            return
+        Mv = vec3()
+        for k in range(mass_start[slot], mass_start[slot + 1]):
+            Mv += mass_value[k] * v[world, mass_column[k]]
+        dq = u[world, slot] - u_n[world, slot]
+        a = inertia[world, slot]
+        dv = v[world, slot] - v_n[world, slot]
+        total = a + internal[world, slot] - g[world, slot]
+        f = free[slot]
+        held = vec3(T(1.0) - f[0], T(1.0) - f[1], T(1.0) - f[2])
+        weight = lumped[slot] * vec3(step.gravity[world])
+        loads = dead[world, slot]
+        rows[0, world, slot] = f64(0.5) * step.dq_dv[world] * f64(wp.dot(dv, a))
+        rows[1, world, slot] = f64(wp.dot(internal[world, slot], dq))
+        rows[2, world, slot] = f64(wp.dot(loads, dq))
+        rows[3, world, slot] = f64(wp.dot(weight, dq))
+        rows[4, world, slot] = f64(wp.dot(wp.cw_mul(g[world, slot], held), dq))
+        rows[5, world, slot] = f64(0.5) * f64(wp.dot(v[world, slot], Mv))
+        rows[6, world, slot] = f64(wp.dot(wp.cw_mul(g[world, slot], f), dq))
+        rows[7, world, slot] = f64(wp.dot(total - loads, dq))
+        rows[8, world, slot] = f64(wp.dot(a, dq))
+
+    @wp.kernel(module=module)
+    def ledger_update(
+        step: Step,
+        newton: Newton,
+        sums: wp.array2d(dtype=f64),
+        explicit_viscous: wp.array(dtype=f64),
+        ledger: wp.array2d(dtype=f64),
+    ):
+        """Add a substep to the ledger; the integrator's part from its own formula, never as the remainder."""
+        world = wp.tid()
+        if step.accepted[world] == 0:
+            return
+        kinetic = sums[5, world]
+        strain = newton.elem_sums[0, world]
+        change_K = kinetic - ledger[world, 0]
+        change_W = strain - ledger[world, 1]
+        implicit = f64(2.0) * newton.elem_sums[1, world] * (step.h[world] / step.dq_dv[world])
+        viscous = implicit + explicit_viscous[world]
+        loads = sums[2, world] + explicit_viscous[world] - sums[3, world]
+        numerical = sums[1, world] - change_W - implicit
+        if wp.static(multistep):
+            numerical += sums[8, world] - change_K
+        else:
+            numerical += sums[0, world]
+        ledger[world, 0] = kinetic
+        ledger[world, 1] = strain
+        ledger[world, 2] = ledger[world, 2] - sums[3, world]
+        ledger[world, 3] = ledger[world, 3] + loads
+        ledger[world, 4] = ledger[world, 4] + sums[4, world]
+        ledger[world, 5] = ledger[world, 5] + sums[7, world]
+        ledger[world, 6] = ledger[world, 6] + viscous
+        ledger[world, 7] = ledger[world, 7] + numerical
+        balance = change_K + change_W - sums[3, world] + viscous + numerical
+        balance -= loads + sums[4, world] + sums[7, world]
+        ledger[world, 8] = ledger[world, 8] + balance
+        ledger[world, 9] = ledger[world, 9] + sums[6, world]
+
+    @wp.kernel(module=module)
+    def write_report(step: Step, newton: Newton, pcg: PCG, report: wp.array2d(dtype=f64)):
+        """The one array that the host reads after a step; columns as `REPORT`."""
+        world = wp.tid()
+        report[world, 0] = f64(step.status[world])
+        report[world, 1] = f64(newton.total_iterations[world])
+        report[world, 2] = f64(pcg.total[world])
+        report[world, 3] = newton.norm[world] / wp.max(newton.scale[world], f64(1.0e-300))
+        report[world, 4] = f64(step.halvings[world])
+        report[world, 5] = step.total_J[world]
+        report[world, 6] = step.time[world]
+        report[world, 7] = f64(newton.failed[world])
+        report[world, 8] = step.new_time[world]
+
+    @wp.kernel(module=module)
+    def probe_values(
+        start: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        weight: wp.array(dtype=T),
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        first_column: int,
+        report: wp.array2d(dtype=f64),
+    ):
+        """Displacement and velocity of each probe, sum of s_i u_i, into the report."""
+        world, probe = wp.tid()
+        d = wp.vec3d()
+        w = wp.vec3d()
+        for k in range(start[probe], start[probe + 1]):
+            s = f64(weight[k])
+            d += s * wp.vec3d(u[world, slot[k]])
+            w += s * wp.vec3d(v[world, slot[k]])
+        for c in range(3):
+            report[world, first_column + 6 * probe + c] = d[c]
+            report[world, first_column + 6 * probe + 3 + c] = w[c]
+
+    return _types.SimpleNamespace(
+        module=module,
+        begin_step=begin_step,
+        begin_attempt=begin_attempt,
+        predict=predict,
+        end_attempt=end_attempt,
+        failed_now=failed_now,
+        commit=commit,
+        ledger_rows=ledger_rows,
+        ledger_update=ledger_update,
+        write_report=write_report,
+        probe_values=probe_values,
+    )

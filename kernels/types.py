@@ -1,0 +1,32 @@
+"""Scalar, vector and matrix types per precision, and the modules that kernels are compiled in."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+__all__ = ["kernel_module", "precision"]
+
+
+@functools.cache
+def precision(dtype: str) -> _types.SimpleNamespace:
+    """Types of one precision, `"float64"` or `"float32"`: scalar T, vec3, sym (Voigt xx yy zz yz xz xy), mat33."""
+    scalar = {"float64": wp.float64, "float32": wp.float32}[dtype]
+    return _types.SimpleNamespace(
+        name=dtype,
+        T=scalar,
+        vec3=wp.types.vector(length=3, dtype=scalar),
+        sym=wp.types.vector(length=6, dtype=scalar),
+        mat33=wp.types.matrix(shape=(3, 3), dtype=scalar),
+    )
+
+
+def kernel_module(name: str, **options) -> wp.Module:
+    """The Warp module `name` with the options all our kernels share.
+
+    Loops are not unrolled: a T10 tangent kernel with the default unrolling compiles for minutes. No adjoint code is
+    generated: it triples compile time.
+    """
+    module = wp.get_module(f"warpfea.kernels.{name}")
+    wp.set_module_options({"enable_backward": False, "max_unroll": 1} | options, module=module)
+    return module

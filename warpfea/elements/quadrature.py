@@ -1,0 +1,113 @@
+"""Quadrature on the unit tetrahedron and triangle: points in parent coordinates, weights that sum to 1/6 or 1/2."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import roots_jacobi
+
+__all__ = ["TET_RULES", "Rule", "conical_tet", "conical_triangle", "tet_rule", "triangle_6"]
+
+
+@dataclass(frozen=True, eq=False)
+class Rule:
+    """A quadrature rule.
+
+    Attributes:
+        name: how users select it.
+        points: (Q, 3) or (Q, 2) parent coordinates.
+        weights: (Q,), with sum equal to the parent's volume or area.
+        degree: total degree of the polynomials integrated exactly.
+    """
+
+    name: str
+    points: np.ndarray
+    weights: np.ndarray
+    degree: int
+
+
+def _barycentric(name: str, degree: int, orbits: list[tuple[float, np.ndarray]]) -> Rule:
+    """Rule from (weight in units of the volume, barycentric points (n, 4))."""
+    points = np.concatenate([bary[:, 1:] for _, bary in orbits])
+    weights = np.concatenate([np.full(len(bary), w / 6.0) for w, bary in orbits])
+    return Rule(name, points, weights, degree)
+
+
+def _orbit4(a: float) -> np.ndarray:
+    """The four points with one barycentric coordinate 1 - 3a and three a."""
+    out = np.full((4, 4), a)
+    np.fill_diagonal(out, 1.0 - 3.0 * a)
+    return out
+
+
+def _orbit6(a: float) -> np.ndarray:
+    """The six points with two coordinates a and two 1/2 - a."""
+    out = np.full((6, 4), a)
+    for row, pair in enumerate([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
+        out[row, list(pair)] = 0.5 - a
+    return out
+
+
+def _tet14() -> Rule:
+    """Walkington's 14 points, degree 5, positive weights (J. N. Walkington, quadrature on simplices, 2000)."""
+    return _barycentric(
+        "tet14",
+        5,
+        [
+            (6 * 0.01878132095300264180, _orbit4(0.31088591926330060980)),
+            (6 * 0.01224884051939365826, _orbit4(0.092735250310891226402)),
+            (6 * 0.0070910034628469110730, _orbit6(0.045503704125649649492)),
+        ],
+    )
+
+
+TET_RULES: dict[str, Rule] = {
+    "tet1": Rule("tet1", np.full((1, 3), 0.25), np.array([1.0 / 6.0]), 1),
+    "tet4": _barycentric("tet4", 2, [(0.25, _orbit4((5.0 - np.sqrt(5.0)) / 20.0))]),
+    # Paper I's rule, Eq. (11); its negative weight is why it must not integrate the mass
+    "tet5_paper": _barycentric("tet5_paper", 3, [(-0.8, np.full((1, 4), 0.25)), (0.45, _orbit4(1.0 / 6.0))]),
+    "tet14": _tet14(),
+}
+
+
+def tet_rule(name: str) -> Rule:
+    """The tetrahedron rule `name`; KeyError lists what there is."""
+    return TET_RULES[name]
+
+
+def _gauss(n: int, alpha: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Jacobi on [0, 1] with weight (1 - x)^alpha."""
+    x, w = roots_jacobi(n, alpha, 0)
+    return (1.0 + x) / 2.0, w / 2.0 ** (alpha + 1)
+
+
+@functools.cache
+def conical_tet(n: int) -> Rule:
+    """Conical product rule (Stroud 1971): n^3 points, positive weights, degree 2n - 1."""
+    (a, wa), (b, wb), (c, wc) = _gauss(n, 2), _gauss(n, 1), _gauss(n, 0)
+    A, B, C = np.meshgrid(a, b, c, indexing="ij")
+    points = np.stack([A, B * (1 - A), C * (1 - A) * (1 - B)], axis=-1).reshape(-1, 3)
+    weights = np.einsum("i,j,k->ijk", wa, wb, wc).ravel()
+    return Rule(f"conical{n}", points, weights, 2 * n - 1)
+
+
+@functools.cache
+def conical_triangle(n: int) -> Rule:
+    """Conical product rule on the triangle: n^2 points, positive weights, degree 2n - 1."""
+    (a, wa), (b, wb) = _gauss(n, 1), _gauss(n, 0)
+    A, B = np.meshgrid(a, b, indexing="ij")
+    points = np.stack([A, B * (1 - A)], axis=-1).reshape(-1, 2)
+    return Rule(f"conical_triangle{n}", points, np.einsum("i,j->ij", wa, wb).ravel(), 2 * n - 1)
+
+
+@functools.cache
+def triangle_6() -> Rule:
+    """Six points, degree 4, positive weights (Dunavant 1985): pressure on a quadratic face needs degree 4."""
+    rows = []
+    for a, w in ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)):
+        for p in ((a, a), (a, 1 - 2 * a), (1 - 2 * a, a)):
+            rows.append((*p, w / 2.0))
+    table = np.array(rows)
+    return Rule("triangle6", table[:, :2], table[:, 2], 4)

@@ -1,0 +1,168 @@
+"""Functions of a state for checking and for output: forces, energy, tangent, stresses. Not on the path of a step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from .kernels.gather import gather_kernels
+from .kernels.types import precision
+from .launch import Launcher
+from .state import State
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["Evaluation"]
+
+
+class Evaluation:
+    """Evaluates a model at a state; allocates what it needs at each call."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.launch = Launcher(model.device)
+
+    def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.model.device)
+
+    def _gather(self, contribution: wp.array) -> np.ndarray:
+        m = self.model
+        out = self._zeros((m.worlds, m.slots), m.types.vec3)
+        kernel = gather_kernels(m.dtype, False).gather_force
+        self.launch(kernel, (m.worlds, m.slots), [m.topology, contribution, self._all(), out])
+        return out.numpy()
+
+    def _all(self) -> wp.array:
+        return wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
+
+    def internal_force(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Elastic force [world, slot, 3], strain energy [world], smallest J [world]."""
+        m = self.model
+        contribution = self._zeros((m.worlds, m.contributions), m.types.vec3)
+        energy = self._zeros((2, m.worlds, m.element_count), wp.float64)
+        low = wp.full(m.worlds, 1e30, dtype=wp.float64, device=m.device)
+        one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
+        history = self._zeros((1, 1), m.types.sym)
+        for block in m.blocks:
+            kernel = block.kernels_for(m.dtype, None).internal_force
+            args = [block.data, state.displacement, state.velocity, history, one, self._all(), contribution, energy, low]
+            self.launch(kernel, (m.worlds, block.count), args)
+        return self._gather(contribution), energy.numpy()[0].sum(axis=1), low.numpy()
+
+    def viscous_force(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Viscous force [world, slot, 3] and dissipation rate [world]."""
+        m = self.model
+        contribution = self._zeros((m.worlds, m.contributions), m.types.vec3)
+        power = self._zeros((m.worlds, m.element_count), wp.float64)
+        for block in m.blocks:
+            if block.key.damping:
+                args = [block.data, state.displacement, state.velocity, self._all(), contribution, power]
+                self.launch(block.kernels.viscous_force, (m.worlds, block.count), args)
+        return self._gather(contribution), power.numpy().sum(axis=1)
+
+    def tangent_matrix(self, state: State, world: int) -> sp.csr_matrix:
+        """df_int/dq as CSR. Slots are coloured so that no element holds a colour twice: one product per colour and axis."""
+        m = self.model
+        one_world = State(1, m.device)
+        row = state.displacement.numpy()[world : world + 1]
+        u = one_world.register("displacement", m.types.vec3, (m.slots,), row)
+        contribution = self._zeros((1, m.contributions), m.types.vec3)
+        direction = self._zeros((1, m.slots), m.types.vec3)
+        flag = wp.ones(1, dtype=wp.int32, device=m.device)
+        dq = wp.ones(1, dtype=wp.float64, device=m.device)
+        history = self._zeros((1, 1), m.types.sym)
+        colour = _colours(m._mass)
+        conns = [np.concatenate([p.conn + p.body.slot_offset for p in b.parts]) for b in m.blocks]
+        rows, cols, values = [], [], []
+        for c in range(int(colour.max()) + 1):
+            for axis in range(3):
+                host = np.zeros((1, m.slots, 3), dtype=precision(m.dtype).T._type_)
+                host[0, colour == c, axis] = 1.0
+                direction.assign(host)
+                for block, conn in zip(m.blocks, conns):
+                    kernel = block.kernels_for(m.dtype, None).tangent_product
+                    args = [block.data, u, u, history, dq, flag, direction, contribution]
+                    self.launch(kernel, (1, block.count), args)
+                out = contribution.numpy()[0]
+                for block, conn in zip(m.blocks, conns):
+                    part = out[block.contribution_offset :][: block.count * block.slots]
+                    part = part.reshape(block.slots, block.count, 3)
+                    elem, local = np.nonzero(colour[conn] == c)
+                    column = 3 * conn[elem, local] + axis
+                    f = part[:, elem, :]
+                    index = 3 * conn[elem].T[:, :, None] + np.arange(3)
+                    rows.append(index.ravel())
+                    cols.append(np.broadcast_to(column[None, :, None], f.shape).ravel())
+                    values.append(f.astype(float).ravel())
+        n = 3 * m.slots
+        data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
+        return sp.csr_matrix(data, shape=(n, n))
+
+    def stresses(self, state: State) -> list[tuple[Any, np.ndarray]]:
+        """Per block: Cauchy stress at the points, [world, point, elem, 6] in Voigt order xx yy zz yz xz xy, Pa."""
+        m = self.model
+        out = []
+        for block in m.blocks:
+            stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
+            J = self._zeros((m.worlds, block.points, block.count), m.types.T)
+            kernel = block.kernels_for(m.dtype, None).point_stress
+            self.launch(kernel, (m.worlds, block.count), [block.data, state.displacement, stress, J])
+            out.append((block, stress.numpy()))
+        return out
+
+    def nodal_stress(self, state: State, body: Any) -> np.ndarray:
+        """Cauchy stress at mesh nodes, [world, node, 6], Pa: linear fit per element, volume-weighted mean over elements."""
+        m = self.model
+        family = body.family
+        rule = family.rules[body.rule]
+        nodes = len(body.mesh.points)
+        total = np.zeros((m.worlds, nodes, 6))
+        weight = np.zeros(nodes)
+        to_nodes = _extrapolation(rule.points, family.node_points)
+        volumes = body.mesh.volumes()
+        for block, stress in self.stresses(state):
+            first = 0
+            for part in block.parts:
+                members = slice(first, first + len(part.elements))
+                first += len(part.elements)
+                if part.body is not body:
+                    continue
+                at_nodes = np.einsum("nq,bqek->benk", to_nodes, stress[:, :, members].astype(float))
+                cells = body.mesh.cells[part.elements]
+                v = volumes[part.elements]
+                np.add.at(weight, cells, v[:, None])
+                for b in range(m.worlds):
+                    np.add.at(total[b], cells, at_nodes[b] * v[:, None, None])
+        return total / np.where(weight > 0.0, weight, 1.0)[None, :, None]
+
+
+def _extrapolation(points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """(nodes, points) least-squares fit of a linear field, a constant where the points can't carry one."""
+    if len(points) < 4:
+        return np.full((len(nodes), len(points)), 1.0 / len(points))
+    A = np.column_stack([np.ones(len(points)), points])
+    return np.column_stack([np.ones(len(nodes)), nodes]) @ np.linalg.pinv(A)
+
+
+def von_mises(s: np.ndarray) -> np.ndarray:
+    """Von Mises stress of Voigt stresses [..., 6]."""
+    xx, yy, zz, yz, xz, xy = np.moveaxis(s, -1, 0)
+    normal = 0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2)
+    return np.sqrt(normal + 3.0 * (yz**2 + xz**2 + xy**2))
+
+
+def _colours(graph: sp.csr_matrix) -> np.ndarray:
+    """Greedy colouring: slots that share an element differ."""
+    n = graph.shape[0]
+    colour = np.full(n, -1)
+    for s in range(n):
+        taken = set(colour[graph.indices[graph.indptr[s] : graph.indptr[s + 1]]].tolist())
+        c = 0
+        while c in taken:
+            c += 1
+        colour[s] = c
+    return colour

@@ -1,0 +1,312 @@
+"""Loads and prescribed motion of a model on the device: time laws, dead loads, fields, pressure, driven slots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from . import assembly
+from .elements import Rule
+from .errors import ModelError
+from .kernels.loads import body_force_kernel, law_function_kernel, law_struct, load_kernels
+from .laws import TimeLaw
+
+if TYPE_CHECKING:
+    from .builder import BodyForce, Pressure, Support
+    from .model import Model
+
+__all__ = ["FieldPart", "Loads", "PressurePart"]
+
+
+@dataclass(eq=False)
+class FieldPart:
+    """A body force on the elements of one block that belong to one body."""
+
+    kernel: Any
+    block: Any
+    members: Any
+    origin: Any
+    offset: int
+    count: int
+
+
+@dataclass(eq=False)
+class PressurePart:
+    """Follower pressure on faces with one number of nodes."""
+
+    conn: Any
+    law: Any
+    shape: Any
+    d_xi: Any
+    d_eta: Any
+    weight: Any
+    offset: int
+    count: int
+
+
+@dataclass(eq=False)
+class Drives:
+    """Driven slots on the device; `arm` and `axis` for rotations."""
+
+    slot: Any
+    law: Any
+    components: Any
+    count: int
+    arm: Any = None
+    axis: Any = None
+
+
+@dataclass(eq=False)
+class _Laws:
+    laws: list[TimeLaw] = field(default_factory=list)
+
+    def add(self, law: TimeLaw) -> int:
+        self.laws.append(law)
+        return len(self.laws) - 1
+
+
+class Loads:
+    """Device side of the loads of a model; absent kinds have no arrays.
+
+    Attributes:
+        law_count: number of time laws.
+        has_dead: gravity or dead loads are there.
+        pushed_entries: number of contributions of non-potential forces.
+    """
+
+    def __init__(self, model: Model, gravity: np.ndarray) -> None:
+        self.model = model
+        self.kernels = load_kernels(model.dtype)
+        self.gravity_host = np.tile(gravity, (model.worlds, 1))
+        self.gravity = model.array("loads", self.gravity_host, wp.vec3d)
+        self._laws = _Laws()
+        self._build_dead()
+        self._build_drives()
+        self._pushed: list[np.ndarray] = []
+        self._offset = 0
+        self.pressures = self._build_pressures(model.description.pressures)
+        self.fields = [p for f in model.description.body_forces for p in self._build_field(f)]
+        self._build_pushed()
+        self._upload_laws()
+
+    # construction
+
+    def _build_dead(self) -> None:
+        m = self.model
+        slots, laws, weights = [], [], []
+        for load in m.description.dead_loads:
+            index = self._laws.add(load.law)
+            slots.append(load.body.slot_offset + load.slots)
+            laws.append(np.full(len(load.slots), index))
+            weights.append(load.weights)
+        slot = np.concatenate(slots) if slots else np.zeros(0, dtype=np.int64)
+        order = np.argsort(slot, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
+        law = np.concatenate(laws) if laws else np.zeros(0)
+        weight = np.concatenate(weights) if weights else np.zeros(0)
+        self.has_dead = bool(len(slots)) or bool(np.any(self.gravity_host))
+        self.dead_start = m.array("loads", start, wp.int32)
+        self.dead_law = m.array("loads", law[order] if len(order) else np.zeros(1), wp.int32)
+        table = np.repeat(weight[order][:, None], 3, axis=1) if len(order) else np.zeros((1, 3))
+        self.dead_weight = m.array("loads", table, m.types.vec3)
+        self._dead_hash = (slot, law, weight)
+
+    def _build_drives(self) -> None:
+        moved: list[tuple[int, int, np.ndarray]] = []
+        turned: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
+        for support in self.model.description.supports:
+            slots = support.body.slot_offset + support.slots
+            if support.rotation is not None:
+                assert support.law is not None
+                index = self._laws.add(support.law)
+                anchor, axis = support.rotation
+                moved_arm = self._arms(support, anchor)
+                turned += [(s, index, support.components, a, axis) for s, a in zip(slots, moved_arm)]
+            elif support.node_laws is not None:
+                moved += [(s, self._laws.add(w), support.components) for s, w in zip(slots, support.node_laws)]
+            elif support.law is not None:
+                index = self._laws.add(support.law)
+                moved += [(s, index, support.components) for s in slots]
+        self.moved = self._upload_drives(moved)
+        self.turned = self._upload_drives(turned)
+        self.has_drives = bool(moved or turned)
+
+    def _arms(self, support: Support, anchor: np.ndarray) -> np.ndarray:
+        body = support.body
+        arms = body.reference[support.slots].copy()
+        position = body.slot_kind[support.slots] == 0
+        arms[position] += body.origin - anchor
+        return arms
+
+    def _upload_drives(self, rows: list[Any]) -> Drives | None:
+        if not rows:
+            return None
+        m = self.model
+        columns = list(zip(*rows))
+        out = Drives(
+            slot=m.array("drives", np.array(columns[0]), wp.int32),
+            law=m.array("drives", np.array(columns[1]), wp.int32),
+            components=m.array("drives", np.array(columns[2]), wp.vec3d),
+            count=len(rows),
+        )
+        if len(columns) > 3:
+            out.arm = m.array("drives", np.array(columns[3]), wp.vec3d)
+            out.axis = m.array("drives", np.array(columns[4]), wp.vec3d)
+        return out
+
+    def _build_pressures(self, pressures: list[Pressure]) -> list[PressurePart]:
+        m = self.model
+        parts = []
+        for pressure in pressures:
+            index = self._laws.add(pressure.law)
+            conn, s, a, b, w = assembly.facet_tables(pressure.surface)
+            conn = conn + pressure.surface.body.slot_offset
+            T = m.types.T
+            parts.append(
+                PressurePart(
+                    conn=m.array("loads", conn.T, wp.int32),
+                    law=m.array("loads", np.full(len(conn), index), wp.int32),
+                    shape=m.array("loads", s, T),
+                    d_xi=m.array("loads", a, T),
+                    d_eta=m.array("loads", b, T),
+                    weight=m.array("loads", w, T),
+                    offset=self._offset,
+                    count=len(conn),
+                )
+            )
+            self._push(conn)
+        return parts
+
+    def _build_field(self, force: BodyForce) -> list[FieldPart]:
+        m = self.model
+        parts = []
+        for block in m.blocks:
+            first = 0
+            for part in block.parts:
+                members = np.arange(first, first + len(part.elements))
+                first += len(part.elements)
+                if part.body not in force.bodies:
+                    continue
+                rule = self._field_tables(block)
+                take = _argument_precision(force.function, m.dtype)
+                parts.append(
+                    FieldPart(
+                        kernel=body_force_kernel(force.function, m.dtype, block.slots, len(rule.weights), take),
+                        block=block,
+                        members=m.array("loads", members, wp.int32),
+                        origin=wp.vec3d(*part.body.origin),
+                        offset=self._offset,
+                        count=len(members),
+                    )
+                )
+                self._push(part.conn + part.body.slot_offset)
+        return parts
+
+    def _field_tables(self, block: Any) -> Rule:
+        """Shape functions and rho w at the points of the mass rule, made once per block."""
+        m = self.model
+        rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.parts]
+        rule = max(rules, key=lambda r: r.degree)
+        if getattr(block, "field_rule", None) is None:
+            weights, shapes = [], []
+            for part in block.parts:
+                for first in range(0, len(part.elements), assembly.CHUNK):
+                    elems = part.elements[first : first + assembly.CHUNK]
+                    s, _, _, det = assembly.geometry(part.body, elems, rule.points)
+                    rho = assembly.density_at(part.body, elems, s, part.body.connectivity[elems])
+                    weights.append(rho * det * rule.weights)
+                    shapes.append(s)
+            shape = shapes[0] if len(shapes[0]) == 1 else np.concatenate(shapes)
+            block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
+            block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
+            block.field_rule = rule
+        return block.field_rule
+
+    def _push(self, conn: np.ndarray) -> None:
+        self._pushed.append(conn)
+        self._offset += conn.size
+
+    def _build_pushed(self) -> None:
+        """Gather table of the non-potential forces."""
+        m = self.model
+        self.pushed_entries = self._offset
+        self.pushed_topology = None
+        if not self._offset:
+            return
+        # each launch lays its entries out as [local, item]
+        flat = np.concatenate([c.T.ravel() for c in self._pushed])
+        order = np.argsort(flat, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=m.slots))])
+        topo = type(m.topology)() if hasattr(m, "topology") else None
+        if topo is None:
+            from .kernels.gather import topology_struct
+
+            topo = topology_struct(m.dtype)()
+        topo.start = m.array("loads", start, wp.int32)
+        topo.entry = m.array("loads", order, wp.int32)
+        self.pushed_topology = topo
+
+    def _upload_laws(self) -> None:
+        m = self.model
+        laws = self._laws.laws
+        self.law_count = len(laws)
+        self.laws = law_struct()()
+        self.function_laws: list[tuple[Any, int]] = []
+        if not laws:
+            return
+        start = np.concatenate([[0], np.cumsum([len(w.times) for w in laws])])
+        self.laws.start = m.array("laws", start, wp.int32)
+        self.laws.times = m.array("laws", np.concatenate([w.times for w in laws] + [[0.0]]), wp.float64)
+        self.laws.values = m.array("laws", np.concatenate([w.values for w in laws] + [np.zeros((1, 3))]), wp.vec3d)
+        for k, law in enumerate(laws):
+            if law.function is not None:
+                take = _argument_precision(law.function, m.dtype)
+                self.function_laws.append((law_function_kernel(law.function, law.scalar, take), k))
+
+    # use
+
+    @property
+    def nonpotential(self) -> bool:
+        """Whether forces without a potential act."""
+        return self._offset > 0
+
+    def set_gravity(self, gravity: Any) -> None:
+        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2.
+
+        Raises:
+            ModelError: wrong shape, a value that is not finite, or a model built without gravity.
+        """
+        values = np.asarray(gravity, dtype=float)
+        shape = (self.model.worlds, 3)
+        if values.shape == (3,):
+            values = np.broadcast_to(values, shape)
+        if values.shape != shape or not np.all(np.isfinite(values)):
+            raise ModelError(f"gravity has shape {values.shape}, expected finite values of shape (3,) or {shape}")
+        if not self.has_dead and np.any(values):
+            raise ModelError(
+                "the model was built without gravity or dead loads, so their kernels were left out: build it with a "
+                "gravity that is not zero"
+            )
+        self.gravity_host = values.copy()
+        self.gravity.assign(values)
+
+    def hash(self, h: Any) -> None:
+        """Feed what defines the loads into a hash."""
+        for values in self._dead_hash:
+            h.update(np.ascontiguousarray(values).tobytes())
+        for law in self._laws.laws:
+            h.update(law.times.tobytes() + law.values.tobytes())
+        h.update(f"{len(self.pressures)} {len(self.fields)}".encode())
+
+
+def _argument_precision(function: wp.Function, default: str) -> str:
+    """Precision that a user's function takes, from its annotations."""
+    text = " ".join(str(t) for t in getattr(function, "input_types", {}).values())
+    if any(word in text for word in ("float64", "vec3d", "vec_t[float64")):
+        return "float64"
+    if any(word in text for word in ("float32", "vec3f", "<class 'float'>")):
+        return "float32"
+    return default

@@ -1,0 +1,219 @@
+"""Constitutive laws and damping as immutable values (DESIGN 4; device side in kernels/materials.py)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from .errors import ModelError
+
+__all__ = ["SVK", "KelvinVoigt", "Material", "MooneyRivlin", "NeoHookean"]
+
+Density = float | np.ndarray | Callable[[np.ndarray], np.ndarray]
+
+
+def _positive(owner: str, **values: float) -> None:
+    for name, value in values.items():
+        if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
+            raise ModelError(f"{owner}: {name} = {value!r} must be a positive finite number")
+
+
+def _non_negative(owner: str, **values: float) -> None:
+    for name, value in values.items():
+        if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value >= 0.0):
+            raise ModelError(f"{owner}: {name} = {value!r} must be a finite number that is not negative")
+
+
+def _check_density(owner: str, density: Density) -> None:
+    if callable(density):
+        return
+    values = np.asarray(density, dtype=float)
+    if values.ndim > 1 or not np.all(np.isfinite(values)) or not np.all(values > 0.0):
+        raise ModelError(f"{owner}: density = {density!r} must be positive (kg/m^3): a number, one per element, or f(X)")
+
+
+def _check_nu(owner: str, nu: float) -> None:
+    if not (isinstance(nu, (int, float, np.floating)) and -1.0 < nu < 0.5):
+        raise ModelError(f"{owner}: nu = {nu!r} must lie between -1 and 0.5, both excluded")
+
+
+@dataclass(frozen=True)
+class KelvinVoigt:
+    """Finite-strain Kelvin-Voigt damping, S_vis = 2 eta Edot + lambda_v tr(Edot) I (Eq. 62).
+
+    Args:
+        eta: shear viscosity, Pa s.
+        lambda_v: bulk-like viscosity, Pa s.
+        form: how Edot is taken in a step. "incremental" (default): the difference of E over the step; vanishes for any
+            rigid rotation and has a potential. "rate": Eq. (58) with F and Fdot at the end of the step, as Paper I; a
+            spinning body expands. "explicit": Eq. (58) at the start of the step, a force held during it.
+
+    Raises:
+        ModelError: a negative or non-finite viscosity, or an unknown form.
+    """
+
+    eta: float
+    lambda_v: float = 0.0
+    form: str = "incremental"
+
+    def __post_init__(self) -> None:
+        _non_negative("KelvinVoigt", eta=self.eta, lambda_v=self.lambda_v)
+        if self.form not in ("incremental", "rate", "explicit"):
+            raise ModelError(f"KelvinVoigt: form = {self.form!r} is none of 'incremental', 'rate', 'explicit'")
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Base of the laws: a density and optional damping."""
+
+    law: ClassVar[str]
+
+    def coefficients(self) -> tuple[float, float, float]:
+        """Device coefficients of the law."""
+        raise NotImplementedError
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        """Lame constants (lambda, mu) at rest, Pa."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class SVK(Material):
+    """St. Venant-Kirchhoff: Psi = lambda/2 tr(E)^2 + mu tr(E^2), Eqs. (25)-(28).
+
+    For large rotations and small to moderate strains. In compression it softens: the uniaxial stress falls again
+    below a stretch of 1/sqrt(3) = 0.577 of the length and vanishes under full compression; a mirrored element
+    (F = diag(-1, 1, 1)) has no strain at all. Use a neo-Hookean law where that can happen; a step reports the smallest J.
+
+    Args:
+        E: Young's modulus, Pa.
+        nu: Poisson's ratio, -1 < nu < 0.5.
+        density: kg/m^3 of the reference configuration; a number, one per element, or f(X (n, 3)) -> (n,).
+        damping: KelvinVoigt or None.
+
+    Raises:
+        ModelError: a parameter out of range.
+    """
+
+    E: float
+    nu: float
+    density: Any = 1000.0
+    damping: KelvinVoigt | None = None
+    law: ClassVar[str] = "svk"
+
+    def __post_init__(self) -> None:
+        _positive("SVK", E=self.E)
+        _check_nu("SVK", self.nu)
+        _check_density("SVK", self.density)
+
+    @classmethod
+    def from_E_nu(cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None) -> SVK:
+        """The same as the constructor; every law has it."""
+        return cls(E=E, nu=nu, density=density, damping=damping)
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        return lame(self.E, self.nu)
+
+    def coefficients(self) -> tuple[float, float, float]:
+        lam, mu = self.lame
+        return lam, mu, 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class MooneyRivlin(Material):
+    """Mooney-Rivlin: Psi = mu10 (I1bar - 3) + mu01 (I2bar - 3) + k/2 (J - 1)^2, Eqs. (36)-(52).
+
+    Defined for J > 0 only: a step that reaches J <= 0 at a quadrature point or vertex is refused.
+
+    Args:
+        mu10, mu01: shear coefficients, Pa; mu01 = 0 is neo-Hookean. Their sum must be positive.
+        k: bulk modulus, Pa.
+        density, damping: as for SVK.
+
+    Raises:
+        ModelError: a parameter out of range.
+    """
+
+    mu10: float
+    mu01: float
+    k: float
+    density: Any = 1000.0
+    damping: KelvinVoigt | None = None
+    law: ClassVar[str] = "mooney_rivlin"
+
+    def __post_init__(self) -> None:
+        _positive("MooneyRivlin", k=self.k, mu10=self.mu10)
+        _non_negative("MooneyRivlin", mu01=self.mu01)
+        _check_density("MooneyRivlin", self.density)
+
+    @classmethod
+    def from_E_nu(
+        cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None, ratio: float = 0.25
+    ) -> MooneyRivlin:
+        """From Young's modulus and Poisson's ratio at rest; `ratio` = mu01 / (mu10 + mu01)."""
+        _positive("MooneyRivlin", E=E)
+        _check_nu("MooneyRivlin", nu)
+        if not 0.0 <= ratio < 1.0:
+            raise ModelError(f"MooneyRivlin: ratio = {ratio!r} must lie in [0, 1)")
+        half = E / (4.0 * (1.0 + nu))
+        k = E / (3.0 * (1.0 - 2.0 * nu))
+        return cls(mu10=half * (1 - ratio), mu01=half * ratio, k=k, density=density, damping=damping)
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        mu = 2.0 * (self.mu10 + self.mu01)
+        return self.k - 2.0 * mu / 3.0, mu
+
+    def coefficients(self) -> tuple[float, float, float]:
+        return self.mu10, self.k, self.mu01
+
+
+@dataclass(frozen=True, eq=False)
+class NeoHookean(Material):
+    """Neo-Hookean: Psi = mu/2 (I1bar - 3) + k/2 (J - 1)^2, which is Mooney-Rivlin with mu01 = 0.
+
+    Args:
+        mu: shear modulus, Pa.
+        k: bulk modulus, Pa.
+        density, damping: as for SVK.
+
+    Raises:
+        ModelError: a parameter out of range.
+    """
+
+    mu: float
+    k: float
+    density: Any = 1000.0
+    damping: KelvinVoigt | None = None
+    law: ClassVar[str] = "neo_hookean"
+
+    def __post_init__(self) -> None:
+        _positive("NeoHookean", mu=self.mu, k=self.k)
+        _check_density("NeoHookean", self.density)
+
+    @classmethod
+    def from_E_nu(
+        cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None
+    ) -> NeoHookean:
+        """From Young's modulus and Poisson's ratio at rest."""
+        _positive("NeoHookean", E=E)
+        _check_nu("NeoHookean", nu)
+        return cls(mu=E / (2.0 * (1.0 + nu)), k=E / (3.0 * (1.0 - 2.0 * nu)), density=density, damping=damping)
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        return self.k - 2.0 * self.mu / 3.0, self.mu
+
+    def coefficients(self) -> tuple[float, float, float]:
+        return 0.5 * self.mu, self.k, 0.0
+
+
+def lame(E: float, nu: float) -> tuple[float, float]:
+    """Lame constants (lambda, mu), Pa."""
+    return E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)), E / (2.0 * (1.0 + nu))

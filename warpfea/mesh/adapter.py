@@ -1,0 +1,256 @@
+"""Reading mesh files: the one place that touches meshio.
+
+What meshio 5.3.5 gets wrong is handled here. Gmsh: sets are built from the tags, keyed by (dimension, tag),
+because its `cell_sets` are empty for MSH 2.2, lack unnamed groups, keep one of two groups that share a name,
+and 4.1 files with ungrouped entities fail; `$PhysicalNames` and `$Entities` are parsed here and meshio reads
+nodes and elements. Missing end markers (a truncated file) are only a warning there. VTU: cell types it skips
+and files of several pieces, of which it keeps the last, are refused. Its printing and `sys.exit` on errors
+become :class:`MeshError`. Abaqus files are read by :mod:`warpfea.mesh.abaqus`: meshio loses all but the last
+*NODE block and attaches sets to the wrong *ELEMENT block.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import struct
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import MeshError
+from . import abaqus
+from .assemble import RawMesh, assemble
+from .cells import CELL_TYPES, cell_dimension
+from .checks import check
+from .mesh import Mesh, transformation
+
+__all__ = ["read"]
+
+
+def read(
+    path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None, cell_type: str | None = None
+) -> Mesh:
+    """Read and check a tetrahedral mesh.
+
+    Parameters
+    ----------
+    path : Gmsh .msh (2.2, 4.1; ASCII, binary), VTK .vtu or Abaqus .inp
+    scale : metres per unit of the file
+    transform : 4x4 matrix or (3x3, 3): X' = A (scale X) + t, in metres; no reflection
+    cell_type : "tetra" or "tetra10" to insist on one
+
+    Sets
+    ----
+    Gmsh: a physical group of dimension 3 becomes an element and a node set, of dimension 2 a surface and a
+    node set, lower ones a node set; unnamed groups are called "physical_<dim>_<tag>". Abaqus: *NSET, *ELSET,
+    and *SURFACE of type ELEMENT. VTU: an integer cell or point array with values 0 and 1 only is the set of
+    its ones under its own name; another one gives a set "<name>_<value>" per positive value
+    ("physical_<dim>_<value>" for "gmsh:physical"); float arrays, vectors, and arrays with more than 256
+    values are left out. A boundary cell has to be the face of a tetrahedron; one between two tetrahedra
+    belongs to the one out of which the boundary cell's own normal points.
+
+    Raises
+    ------
+    MeshError
+        The file is missing or can't be read, holds cells other than tetrahedra (points, lines and surfaces
+        are boundary cells), or fails a check of :func:`warpfea.mesh.check`.
+
+    Warns
+    -----
+    MeshWarning
+        Nodes without elements; they keep their place in the numbering.
+    """
+    file = Path(path)
+    label = str(file)
+    matrix, shift = transformation(scale, transform, label)
+    if cell_type is not None and cell_type not in CELL_TYPES:
+        raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(CELL_TYPES)}")
+    if not file.exists():
+        raise MeshError(f"{label}: no such mesh file")
+    readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}
+    suffix = file.suffix.lower()
+    if suffix not in readers or not file.is_file():
+        raise MeshError(f"{label}: unknown mesh format {suffix!r}, known are {', '.join(readers)}")
+    try:
+        with _quiet(label):
+            raw = readers[suffix](file)
+    except OSError as error:
+        raise MeshError(f"{label}: can't be read: {error}") from error
+    mesh = assemble(raw, file, cell_type)
+    return check(mesh.transformed(transform=(matrix, shift)))
+
+
+@contextlib.contextmanager
+def _quiet(label: str) -> Iterator[io.StringIO]:
+    """Keep meshio from printing, warning and exiting; what it raises becomes a MeshError naming the file."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield said
+    except MeshError as error:
+        raise error if str(error).startswith(label) else MeshError(f"{label}: {error}") from None
+    except OSError:
+        raise
+    except (Exception, SystemExit) as error:
+        reason = " ".join(said.getvalue().split()) or (
+            f"{type(error).__name__}: {error}"
+            if str(error) and not isinstance(error, SystemExit)
+            else "bad content"
+        )
+        raise MeshError(
+            f"{label}: can't be read, the file is damaged or of another format ({reason})"
+        ) from error
+
+
+# Gmsh
+
+
+def _read_gmsh(file: Path) -> RawMesh:
+    data = file.read_bytes()
+    header = re.match(
+        rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+([\d.]+)\s+([01])\s+(\d+)", data, re.DOTALL
+    )
+    if header is None:
+        raise MeshError("not a Gmsh file: it does not begin with $MeshFormat")
+    version, is_ascii, size = header[1].decode(), header[2] == b"0", int(header[3])
+    new = version in ("4", "4.1")
+    if not new and not version.startswith("2"):
+        raise MeshError(f"Gmsh format {version} is not supported: save as 4.1 or 2.2")
+    if b"$PartitionedEntities" in data:
+        raise MeshError("partitioned Gmsh meshes are not supported: save without partitions")
+    start = data.find(b"$Nodes")
+    for section in (b"Nodes", b"Elements"):
+        if data.find(b"$" + section) < 0 or data.find(b"$End" + section, start) < 0:
+            raise MeshError(f"damaged or truncated: section ${section.decode()} is missing or not closed")
+    names = _section(data[:start], b"PhysicalNames")
+    entities = _section(data[:start], b"Entities")
+    named = {
+        (int(d), abs(int(t))): name.decode(errors="replace")
+        for d, t, name in re.findall(rb'^\s*(\d)\s+(-?\d+)\s+"(.*)"', names, re.MULTILINE)
+    }
+    from meshio.gmsh import _gmsh22, _gmsh41
+
+    with open(file, "rb") as stream:
+        stream.seek(start)
+        try:
+            mesh = (_gmsh41 if new else _gmsh22).read_buffer(stream, is_ascii, size)
+        except IndexError as error:
+            number = re.search(r"index (\d+) is out of bounds for axis 0 with size", str(error))
+            if number is None:
+                raise
+            raise MeshError(
+                f"an element refers to node {int(number[1]) + 1}, which $Nodes does not define"
+            ) from None
+        except KeyError as error:
+            raise MeshError(f"unknown Gmsh element type {error}") from None
+    physical = mesh.cell_data.get("gmsh:physical")
+    entity = mesh.cell_data.get("gmsh:geometrical")
+    tags_of = _entity_groups(entities, is_ascii, size) if new and entities else {}
+    raw = RawMesh(
+        mesh.points, [(c.type, np.asarray(c.data, dtype=np.int64)) for c in mesh.cells], duplicates=not new
+    )
+    for k, (kind, cells) in enumerate(raw.blocks):
+        dim, every = cell_dimension(kind), np.arange(len(cells))
+        if new:
+            of_group = (
+                {}
+                if entity is None or not len(cells)
+                else dict.fromkeys(tags_of.get((dim, entity[k][0]), ()), every)
+            )
+        else:
+            tags = np.zeros(0) if physical is None else np.abs(physical[k])
+            if len(tags) not in (0, len(cells)):
+                raise MeshError(f"{len(tags)} physical tags for {len(cells)} cells of type {kind}")
+            of_group = {int(t): np.flatnonzero(tags == t) for t in np.unique(tags) if t}
+        for tag, numbers in of_group.items():
+            raw.groups.append((named.get((dim, tag), f"physical_{dim}_{tag}"), k, numbers))
+    return raw
+
+
+def _section(data: bytes, name: bytes) -> bytes:
+    """The body of a section, or nothing."""
+    at = data.find(b"$" + name)
+    if at < 0:
+        return b""
+    end = data.find(b"$End" + name, at)
+    if end < 0:
+        raise MeshError(f"damaged or truncated: section ${name.decode()} is not closed")
+    return data[data.index(b"\n", at) + 1 : end]
+
+
+def _entity_groups(body: bytes, is_ascii: bool, size: int) -> dict[tuple[int, int], list[int]]:
+    """(dimension, entity) -> physical tags, from the $Entities section of MSH 4.1."""
+    words = iter(body.split()) if is_ascii else iter(())
+    at = 0
+
+    def take(code: str, count: int) -> list[float]:
+        nonlocal at
+        if is_ascii:
+            return [float(next(words)) for _ in range(count)]
+        values = struct.unpack_from(f"={count}{code}", body, at)
+        at += struct.calcsize(f"={count}{code}")
+        return list(values)
+
+    unsigned = {4: "I", 8: "Q"}[size]
+    groups: dict[tuple[int, int], list[int]] = {}
+    try:
+        for dim, count in enumerate(take(unsigned, 4)):
+            for _ in range(int(count)):
+                tag = int(take("i", 1)[0])
+                take("d", 3 if dim == 0 else 6)
+                groups[dim, tag] = [abs(int(t)) for t in take("i", int(take(unsigned, 1)[0]))]
+                if dim:
+                    take("i", int(take(unsigned, 1)[0]))
+    except (StopIteration, struct.error):
+        raise MeshError("damaged or truncated: section $Entities ends early") from None
+    return groups
+
+
+# VTU
+
+
+def _read_vtu(file: Path) -> RawMesh:
+    import meshio
+
+    if file.read_bytes().count(b"<Piece") > 1:
+        raise MeshError("a VTU file of several pieces is not supported: merge them")
+    with _quiet(str(file)) as said:
+        mesh = meshio.read(file, file_format="vtu")
+    skipped = re.search(r"cannot handle \(type (\d+)\)", " ".join(said.getvalue().split()))
+    if skipped:
+        raise MeshError(f"unknown VTK cell type {skipped[1]}")
+    points = np.asarray(mesh.points, dtype=float)
+    raw = RawMesh(points, [(c.type, np.asarray(c.data).astype(np.int64)) for c in mesh.cells])
+    for name, arrays in mesh.cell_data.items():
+        flat = [np.asarray(a).reshape(len(a), -1) for a in arrays]
+        if all(a.shape[1] == 1 for a in flat) and name != "gmsh:geometrical":
+            joined = np.concatenate([a[:, 0] for a in flat])
+            for value, suffix in _set_values(joined):
+                for k, column in enumerate(flat):
+                    numbers = np.flatnonzero(column[:, 0] == value)
+                    if numbers.size:
+                        group = f"physical_{cell_dimension(raw.blocks[k][0])}_{value}"
+                        raw.groups.append((group if name == "gmsh:physical" else name + suffix, k, numbers))
+    for name, array in (mesh.point_data or {}).items():
+        column = np.asarray(array).reshape(len(points), -1)
+        if column.shape[1] == 1:
+            for value, suffix in _set_values(column[:, 0]):
+                raw.node_groups[name + suffix] = np.flatnonzero(column[:, 0] == value)
+    return raw
+
+
+def _set_values(array: np.ndarray) -> list[tuple[int, str]]:
+    """Positive values of an integer array with the suffix of their sets' names; none if too many."""
+    if array.dtype.kind not in "iub" or not array.size:
+        return []
+    values = np.unique(array)
+    if values[0] >= 0 and values[-1] <= 1:
+        return [(1, "")] if values[-1] == 1 else []
+    return [(int(v), f"_{v}") for v in values if v > 0] if len(values) <= 256 else []

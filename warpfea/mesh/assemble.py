@@ -1,0 +1,159 @@
+"""From the cell blocks and groups of a file to a :class:`Mesh` with its sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import MeshError
+from .cells import CELL_TYPES, Floats, Ints, cell_dimension, row_keys
+from .checks import check_topology
+from .mesh import Mesh, check_range
+
+__all__ = ["RawMesh", "assemble"]
+
+
+@dataclass
+class RawMesh:
+    """What a file holds, before it is checked.
+
+    ``points`` (N, 3); ``blocks``: (meshio cell type, (K, n) node numbers); ``groups``: (name, block, numbers
+    of the block's cells); ``node_groups``, ``faces``: sets that the file names itself, ``faces`` as (block,
+    cell, local face). ``duplicates``: equal cells stand for membership in several groups.
+    """
+
+    points: Floats
+    blocks: list[tuple[str, Ints]]
+    groups: list[tuple[str, int, Ints]] = field(default_factory=list)
+    node_groups: dict[str, Ints] = field(default_factory=dict)
+    faces: dict[str, Ints] = field(default_factory=dict)
+    duplicates: bool = False
+
+
+def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
+    """The mesh, its topology checked, with the sets that the file's groups make.
+
+    Raises
+    ------
+    MeshError
+        Cells that are not tetrahedra or of two types, boundary cells that are no face, and
+        :func:`check_topology`'s.
+    """
+    label = str(file)
+    counts: dict[str, int] = {}
+    for kind, cells in raw.blocks:
+        counts[kind] = counts.get(kind, 0) + len(cells)
+    counts = {kind: n for kind, n in counts.items() if n}
+    held = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "no cells"
+    for kind, n in counts.items():
+        if kind not in CELL_TYPES and cell_dimension(kind) == 3:
+            raise MeshError(
+                f"{label}: unknown cell type {kind!r} ({n} cells); known are {', '.join(CELL_TYPES)}"
+            )
+    solid = [kind for kind in counts if kind in CELL_TYPES]
+    if len(solid) > 1:
+        raise MeshError(f"{label}: holds {held}; all tetrahedra must be of one type")
+    if not solid:
+        flat = any(cell_dimension(kind) == 2 for kind in counts)
+        raise MeshError(
+            f"{label}: no tetrahedra, the file holds {held}" + (": is this a 2D mesh?" if flat else "")
+        )
+    if cell_type is not None and solid[0] != cell_type:
+        raise MeshError(f"{label}: holds {held}, but cell_type={cell_type!r} was asked for")
+
+    where = [k for k, (kind, _) in enumerate(raw.blocks) if kind == solid[0]]
+    cells = np.concatenate([raw.blocks[k][1] for k in where])
+    offsets = dict(zip(where, np.cumsum([0] + [len(raw.blocks[k][1]) for k in where])))
+    number = np.arange(len(cells))
+    if raw.duplicates and cells.min() >= 0:  # equal cells: keep the first of each, and all their memberships
+        _, first, inverse = np.unique(
+            row_keys(cells, int(cells.max()) + 1), return_index=True, return_inverse=True
+        )
+        rank = np.empty(len(first), dtype=np.int64)
+        rank[np.argsort(first)] = np.arange(len(first))
+        number, cells = rank[inverse], cells[np.sort(first)]
+    check_topology(raw.points, cells, solid[0], label)
+    mesh = Mesh(raw.points, cells, solid[0], name=file.stem, path=label)
+
+    element_sets: dict[str, list[Ints]] = {}
+    surface_sets: dict[str, list[Ints]] = {}
+    node_sets: dict[str, list[Ints]] = {}
+    triangles = _FaceFinder(mesh)
+    for name, k, numbers in raw.groups:
+        kind, block = raw.blocks[k]
+        nodes = block[numbers]
+        if k in offsets:
+            element_sets.setdefault(name, []).append(number[offsets[k] + numbers])
+        elif cell_dimension(kind) == 2:
+            table = triangles.find(kind, nodes, name)
+            surface_sets.setdefault(name, []).append(table)
+            nodes = mesh.faces(table)
+        else:
+            check_range(nodes, len(raw.points), f"{label}: group {name!r}, node")
+        node_sets.setdefault(name, []).append(nodes.ravel())
+    for name, rows in raw.faces.items():
+        table = np.array([(number[offsets[b] + e], f) for b, e, f in rows if b in offsets], dtype=np.int64)
+        if len(table) != len(rows) or not len(rows):
+            raise MeshError(f"{label}: surface {name!r} holds faces of cells that are not tetrahedra")
+        surface_sets.setdefault(name, []).append(table)
+        node_sets.setdefault(name, []).append(mesh.faces(table).ravel())
+    node_sets.update({name: [nodes] for name, nodes in raw.node_groups.items()})
+    return Mesh(
+        mesh.points,
+        mesh.cells,
+        mesh.cell_type,
+        node_sets={name: np.unique(np.concatenate(parts)) for name, parts in node_sets.items()},
+        element_sets={name: np.unique(np.concatenate(parts)) for name, parts in element_sets.items()},
+        surface_sets={name: np.unique(np.concatenate(parts), axis=0) for name, parts in surface_sets.items()},
+        name=file.stem,
+        path=label,
+    )
+
+
+class _FaceFinder:
+    """Finds boundary cells among the faces of a mesh by their corners."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self.sorted: tuple[Ints, Ints] | None = None
+
+    def find(self, kind: str, nodes: Ints, name: str) -> Ints:
+        """Rows (element, local face) of boundary cells (K, n)."""
+        mesh, label = self.mesh, self.mesh.label
+        row = mesh.kind
+        if not kind.startswith("triangle"):
+            raise MeshError(
+                f"{label}: surface {name!r} holds {len(nodes)} cells of type {kind!r}, not faces of "
+                "tetrahedra"
+            )
+        corners = nodes[:, : row.face_corners]
+        check_range(corners, len(mesh.points), f"{label}: surface {name!r}, node")
+        # keys of faces and queries are numbered together: row_keys may compress
+        if self.sorted is None:
+            local = row.faces[:, : row.face_corners]
+            self.sorted = (np.sort(mesh.cells[:, local].reshape(-1, row.face_corners), axis=1), local)
+        table, local = self.sorted
+        keys = row_keys(np.concatenate([table, np.sort(corners, axis=1)]), len(mesh.points))
+        keys, wanted = keys[: len(table)], keys[len(table) :]
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+        low, high = np.searchsorted(ordered, wanted), np.searchsorted(ordered, wanted, side="right")
+        lost = np.flatnonzero(low == high)
+        if lost.size:
+            raise MeshError(
+                f"{label}: surface {name!r}: triangle {lost[0]} with nodes {corners[lost[0]].tolist()} is "
+                "not the face of a "
+                f"tetrahedron ({lost.size} such)"
+            )
+        face = order[low]
+        inside = np.flatnonzero(high - low == 2)  # between two elements: the one the triangle's normal leaves
+        for other in (order[low[inside]], order[high[inside] - 1]):
+            element, side = np.divmod(other, len(local))
+            own = mesh.cells[element[:, None], local[side]]
+            start = (own == corners[inside, :1]).argmax(axis=1)
+            following = np.take_along_axis(own, ((start + 1) % 3)[:, None], axis=1)[:, 0]
+            agrees = following == corners[inside, 1]
+            face[inside[agrees]] = other[agrees]
+        return np.column_stack(np.divmod(face, len(local)))

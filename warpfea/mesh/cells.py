@@ -1,0 +1,171 @@
+"""The table of cell types (nodes, corners, edges, faces) and the geometry of one cell.
+
+A new cell type (say "hexahedron") is one more row of :data:`CELL_TYPES`, with its shape functions. Node
+order is meshio's. A local face lists its corners so that their right-hand normal points out of a cell with
+det J0 > 0, then its mid-edge nodes in the order of its edges (01, 12, 20); face k holds the nodes of
+Abaqus's label S(k+1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+__all__ = [
+    "CELL_TYPES",
+    "ELEMENT_CELLS",
+    "CellType",
+    "cell_dimension",
+    "det_j0",
+    "element_volumes",
+    "row_keys",
+]
+
+
+@dataclass(frozen=True)
+class CellType:
+    """What the mesh code has to know of one cell type.
+
+    ``nodes``: nodes per cell; ``corners``: the first so many are corners; ``edges``: corner pairs, the
+    mid-edge node of edge k is ``corners + k`` if the type has any; ``faces``: local node numbers, outward;
+    ``face_corners``: how many of each face are corners; ``gradients(xi)``: (P, nodes, 3) shape derivatives
+    at xi (P, 3); ``rule``: points (P, 3) and weights (P,) exact for the volume of a curved cell;
+    ``checked``: points (P, 3) where det J0 has to be positive.
+    """
+
+    name: str
+    nodes: int
+    corners: int
+    edges: Ints
+    faces: Ints
+    face_corners: int
+    gradients: Callable[[Floats], Floats]
+    rule: tuple[Floats, Floats]
+    checked: Floats
+
+    @property
+    def has_mid_nodes(self) -> bool:
+        """True for second-order cells."""
+        return self.nodes > self.corners
+
+
+_TET_EDGES = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)], dtype=np.int64)
+_TET_FACES = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], dtype=np.int64)
+_TET10_FACES = np.array(
+    [(0, 2, 1, 6, 5, 4), (0, 1, 3, 4, 8, 7), (1, 2, 3, 5, 9, 8), (0, 3, 2, 7, 9, 6)], dtype=np.int64
+)
+_DL = np.array([(-1.0, -1.0, -1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])  # dL_i/dxi
+
+
+def _barycentric(xi: Floats) -> Floats:
+    """Barycentric coordinates (P, 4) of xi (P, 3)."""
+    return np.column_stack([1.0 - xi.sum(axis=1), xi])
+
+
+def _tet_gradients(xi: Floats) -> Floats:
+    """ds_i/dxi of T4: (P, 4, 3)."""
+    return np.broadcast_to(_DL, (len(xi), 4, 3))
+
+
+def _tet10_gradients(xi: Floats) -> Floats:
+    """ds_i/dxi of T10, (P, 10, 3): corners s = L (2 L - 1), mid-edges s = 4 L_a L_b."""
+    lam = _barycentric(xi)
+    a, b = _TET_EDGES.T
+    corner = (4.0 * lam - 1.0)[:, :, None] * _DL
+    mid = 4.0 * (lam[:, a, None] * _DL[b] + lam[:, b, None] * _DL[a])
+    return np.concatenate([corner, mid], axis=1)
+
+
+def _orbit(a: float) -> list[tuple[float, float, float]]:
+    """The four points with barycentric coordinates (a, a, a, 1 - 3 a) in any order."""
+    b = 1.0 - 3.0 * a
+    return [(a, a, a), (b, a, a), (a, b, a), (a, a, b)]
+
+
+def _edge_orbit(a: float) -> list[tuple[float, float, float]]:
+    """The six points with barycentric coordinates (a, a, 1/2 - a, 1/2 - a) in any order."""
+    c = 0.5 - a
+    return [(a, c, c), (c, a, c), (c, c, a), (c, a, a), (a, c, a), (a, a, c)]
+
+
+_CENTROID = [(0.25, 0.25, 0.25)]
+_RULE5 = (
+    np.array(_CENTROID + _orbit(1.0 / 6.0)),
+    np.array([-4.0 / 5.0, *(4 * [9.0 / 20.0])]) / 6.0,
+)  # degree 3: exact for det J0 of a T10, which is cubic; for volumes only, never for a mass matrix
+_RULE1 = (np.array(_CENTROID), np.array([1.0 / 6.0]))
+_CHECKED = np.array(
+    _orbit(0.0)  # corners
+    + _edge_orbit(0.0)  # mid-edges
+    + _CENTROID
+    + _orbit((5.0 - 5.0**0.5) / 20.0)  # tet4
+    + _orbit(1.0 / 6.0)  # tet5_paper
+    + _orbit(0.31088591926330060980)  # tet14, three orbits
+    + _orbit(0.092735250310891226402)
+    + _edge_orbit(0.045503704125649649492)
+)
+
+CELL_TYPES: dict[str, CellType] = {
+    "tetra": CellType("tetra", 4, 4, _TET_EDGES, _TET_FACES, 3, _tet_gradients, _RULE1, _RULE1[0]),
+    "tetra10": CellType("tetra10", 10, 4, _TET_EDGES, _TET10_FACES, 3, _tet10_gradients, _RULE5, _CHECKED),
+}
+ELEMENT_CELLS = {"T4": "tetra", "T10": "tetra10"}
+"""Element name in the API -> cell type."""
+
+_DIMENSION_PREFIXES = {
+    0: ("vertex", "empty"),
+    1: ("line", "VTK_LAGRANGE_CURVE", "VTK_BEZIER_CURVE"),
+    2: (
+        "triangle",
+        "quad",
+        "polygon",
+        "pixel",
+        "VTK_LAGRANGE_TRI",
+        "VTK_LAGRANGE_QUAD",
+        "VTK_BEZIER_TRI",
+        "VTK_BEZIER_QUAD",
+    ),
+}
+
+
+def cell_dimension(name: str) -> int:
+    """Dimension 0 .. 3 of a meshio cell type; anything but a point, line or surface counts as 3."""
+    for dim, prefixes in _DIMENSION_PREFIXES.items():
+        if name.startswith(prefixes):
+            return dim
+    return 3
+
+
+def det_j0(points: Floats, cells: Ints, kind: CellType, xi: Floats) -> Floats:
+    """det J0 (m^3) of every cell at every parent point: (M, P)."""
+    out = np.empty((len(cells), len(xi)))
+    coordinates = points[cells]
+    for p, gradient in enumerate(kind.gradients(xi)):
+        j = np.einsum("mik,il->mkl", coordinates, gradient)
+        out[:, p] = np.einsum("mk,mk->m", j[:, :, 0], np.cross(j[:, :, 1], j[:, :, 2]))
+    return out
+
+
+def element_volumes(points: Floats, cells: Ints, kind: CellType) -> Floats:
+    """Volume (m^3) of every cell, (M,), exact for curved sides too; negative for an inverted cell."""
+    xi, weights = kind.rule
+    return det_j0(points, cells, kind, xi) @ weights
+
+
+def row_keys(rows: Ints, bound: int) -> Ints:
+    """One integer per row of ``rows`` (K, n), 0 <= entries < ``bound``: equal keys mean equal rows."""
+    key = rows[:, 0].astype(np.int64)
+    top = int(bound)
+    for column in rows.T[1:]:
+        if top * int(bound) >= 2**62:  # too large to pack: number the different keys so far
+            unique, key = np.unique(key, return_inverse=True)
+            top = len(unique)
+        key = key * np.int64(bound) + column
+        top *= int(bound)
+    return key

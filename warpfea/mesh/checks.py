@@ -1,0 +1,188 @@
+"""Checks of a tetrahedral mesh. Each failure names the file, the element or node (0-based) and the value."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from ..errors import MeshError, MeshWarning
+from .cells import CELL_TYPES, CellType, Floats, Ints, det_j0, element_volumes, row_keys
+from .mesh import Mesh
+
+__all__ = ["check", "check_topology"]
+
+COINCIDENT = 1e-10
+"""Two used nodes closer than this part of the mesh's size are taken for one node that was not merged."""
+FLAT = 1e-12
+"""An element with a volume, or 6 det J0, below this part of its longest edge cubed has none."""
+
+
+def check(mesh: Mesh) -> Mesh:
+    """Check numbering and geometry; return the mesh.
+
+    Raises
+    ------
+    MeshError
+        No elements, NaN or infinite coordinates, a repeated node in an element, duplicate elements,
+        coincident nodes, mid-edge nodes out of order, zero-volume or inverted elements.
+
+    Warns
+    -----
+    MeshWarning
+        Nodes that no element uses.
+    """
+    check_topology(mesh.points, mesh.cells, mesh.cell_type, mesh.label)
+    orphans = mesh.orphan_nodes
+    if orphans.size:
+        warnings.warn(
+            f"{mesh.label}: {orphans.size} orphan node{_s(orphans)} belong to no element (first: "
+            f"{_first(orphans)}); "
+            "they keep their place in the numbering and stay where they are",
+            MeshWarning,
+            stacklevel=2,
+        )
+    _check_coincident(mesh)
+    curved = np.flatnonzero(~mesh.straight_sided(1e-12))
+    if mesh.kind.has_mid_nodes:
+        _check_mid_nodes(mesh, curved)
+    _check_volumes(mesh, curved)
+    return mesh
+
+
+def check_topology(points: Floats, cells: Ints, cell_type: str, label: str) -> None:
+    """Check what has to hold before any geometry is computed; arrays as in :class:`Mesh`.
+
+    Raises
+    ------
+    MeshError
+        Points not (N, 3), no elements, NaN or infinite coordinates, numbers out of range, repeated nodes,
+        duplicates.
+    """
+    kind = CELL_TYPES[cell_type]
+    if points.ndim != 2 or points.shape[1] != 3:
+        width = points.shape[-1] if points.size else 0
+        raise MeshError(f"{label}: the nodes have {width} coordinates, expected 3: is this a 2D mesh?")
+    if not len(cells):
+        raise MeshError(f"{label}: no tetrahedra (0 elements of type {cell_type})")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise MeshError(
+            f"{label}: node {bad[0]} has the coordinates {_vector(points[bad[0]])}, which are not finite "
+            f"({bad.size} such node{_s(bad)})"
+        )
+    outside = (cells < 0) | (cells >= len(points))
+    if outside.any():
+        e, k = np.argwhere(outside)[0]
+        raise MeshError(
+            f"{label}: element {e} refers to node {cells[e, k]}, out of range 0 .. {len(points) - 1} "
+            f"({int(outside.any(axis=1).sum())} such elements)"
+        )
+    ordered = np.sort(cells, axis=1)
+    repeated = np.argwhere(ordered[:, 1:] == ordered[:, :-1])
+    if repeated.size:
+        e, k = repeated[0]
+        raise MeshError(f"{label}: element {e} holds node {ordered[e, k]} twice: {cells[e].tolist()}")
+    keys = row_keys(np.sort(cells[:, : kind.corners], axis=1), len(points))
+    order = np.argsort(keys, kind="stable")
+    same = np.flatnonzero(keys[order][1:] == keys[order][:-1])
+    if same.size:
+        a, b = order[same[0]], order[same[0] + 1]
+        raise MeshError(
+            f"{label}: elements {a} and {b} have the same corners {cells[a, : kind.corners].tolist()} "
+            f"({same.size} duplicate element{_s(same)})"
+        )
+
+
+def _check_coincident(mesh: Mesh) -> None:
+    from scipy.spatial import cKDTree
+
+    low, high = mesh.bounding_box()
+    size = float(np.linalg.norm(high - low))
+    used = mesh.used_nodes
+    tree = cKDTree(mesh.points[used] - low, balanced_tree=False, compact_nodes=False)
+    pairs = tree.query_pairs(COINCIDENT * size, output_type="ndarray")
+    if len(pairs):
+        pairs = np.sort(used[pairs], axis=1)
+        a, b = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
+        gap = float(np.linalg.norm(mesh.points[a] - mesh.points[b]))
+        raise MeshError(
+            f"{mesh.label}: nodes {a} and {b} coincide at {_vector(mesh.points[a])}, {gap:.3g} m apart "
+            f"({len(pairs)} such pair{_s(pairs)}); merge them, or the body falls apart there"
+        )
+
+
+def _check_mid_nodes(mesh: Mesh, curved: Ints) -> None:
+    """Each mid-edge node must lie nearest to its own edge's mid-point, of the six of its element."""
+    if not curved.size:
+        return
+    kind = mesh.kind
+    x = mesh.points[mesh.cells[curved]]
+    middle = 0.5 * (x[:, kind.edges[:, 0]] + x[:, kind.edges[:, 1]])
+    distance2 = ((x[:, kind.corners :, None, :] - middle[:, None, :, :]) ** 2).sum(axis=3)
+    nearest = distance2.argmin(axis=2)
+    wrong = np.take_along_axis(distance2, nearest[:, :, None], axis=2)[:, :, 0] < np.einsum(
+        "mkk->mk", distance2
+    )
+    if not wrong.any():
+        return
+    i, k = np.argwhere(wrong)[0]
+    own, other = kind.edges[k], kind.edges[nearest[i, k]]
+    swapped = (nearest[wrong.any(axis=1)] == (0, 1, 2, 3, 5, 4)).all()
+    hint = "; edges 13 and 23 are swapped in all of them, which is Gmsh's own order" if swapped else ""
+    raise MeshError(
+        f"{mesh.label}: element {curved[i]}, mid-side nodes out of order: node "
+        f"{mesh.cells[curved[i], kind.corners + k]} "
+        f"stands for edge {own[0]}{own[1]} but lies nearer to edge {other[0]}{other[1]}, "
+        f"{np.sqrt(distance2[i, k, nearest[i, k]]):.6g} m against {np.sqrt(distance2[i, k, k]):.6g} m "
+        f"({int(wrong.any(axis=1).sum())} such elements{hint})"
+    )
+
+
+def _check_volumes(mesh: Mesh, curved: Ints) -> None:
+    kind: CellType = mesh.kind
+    edges = mesh.points[mesh.cells[:, kind.edges[:, 0]]] - mesh.points[mesh.cells[:, kind.edges[:, 1]]]
+    longest3 = (edges**2).sum(axis=2).max(axis=1) ** 1.5
+    volumes = element_volumes(mesh.points, mesh.cells, kind)
+    flat = np.flatnonzero(np.abs(volumes) <= FLAT * longest3)
+    if flat.size:
+        e = flat[0]
+        raise MeshError(
+            f"{mesh.label}: element {e} has zero volume ({volumes[e]:.3g} m^3, longest edge "
+            f"{np.cbrt(longest3[e]):.3g} m; {flat.size} such element{_s(flat)})"
+        )
+    lowest = 6.0 * volumes
+    if curved.size:
+        at = det_j0(mesh.points, mesh.cells[curved], kind, kind.checked)
+        lowest[curved] = np.minimum(lowest[curved], at.min(axis=1))
+    inverted = np.flatnonzero(lowest <= FLAT * longest3)
+    if not inverted.size:
+        return
+    e = inverted[np.argmin(lowest[inverted] / longest3[inverted])]
+    if len(inverted) == len(mesh.cells) and (volumes < 0.0).all():
+        raise MeshError(
+            f"{mesh.label}: all {len(inverted)} elements are inverted (element 0 has det J0 = "
+            f"{lowest[0]:.6g} m^3): "
+            "the file numbers its tetrahedra left-handed (swap two corners and their mid-edge nodes), or "
+            "is mirrored"
+        )
+    shape = (
+        "inverted" if volumes[e] < 0.0 else "inverted at a corner, mid-edge or quadrature point (too curved)"
+    )
+    raise MeshError(
+        f"{mesh.label}: element {e} is {shape}: smallest det J0 = {lowest[e]:.6g} m^3, volume "
+        f"{volumes[e]:.6g} m^3 "
+        f"({inverted.size} such element{_s(inverted)}, first: {_first(inverted)})"
+    )
+
+
+def _first(numbers: Ints, count: int = 5) -> str:
+    return ", ".join(str(int(n)) for n in numbers[:count]) + (", ..." if len(numbers) > count else "")
+
+
+def _vector(x: Floats) -> str:
+    return "(" + ", ".join(f"{v:.6g}" for v in x) + ")"
+
+
+def _s(items: np.ndarray) -> str:
+    return "" if len(items) == 1 else "s"

@@ -1,0 +1,251 @@
+"""Structured meshes of a box, a cylinder and a sphere, deterministic, with named sides.
+
+Each cell of a grid is cut into six tetrahedra around its diagonal (Kuhn), so that face diagonals match.
+Cylinder and sphere are the box of the parent square or cube, mapped shell by shell; their cells are mirrored
+about the centre, so that the diagonals run outward and no tetrahedron has two faces on the curved side (its
+corner would be flat).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import MeshError
+from .cells import CELL_TYPES, ELEMENT_CELLS, Floats, Ints
+from .mesh import Mesh
+
+__all__ = ["box", "cylinder", "sphere"]
+
+_SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
+
+
+def box(
+    size: Sequence[float],
+    *,
+    cells: Sequence[int],
+    element: str = "T10",
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    name: str = "box",
+) -> Mesh:
+    """A box of ``cells`` = (nx, ny, nz) cells, six tetrahedra each, from ``origin`` to ``origin + size`` (m).
+
+    Surface and node sets "x-", "x+", "y-", "y+", "z-", "z+". Nodes are numbered with x running fastest.
+
+    Raises
+    ------
+    MeshError
+        Non-positive size, fewer than one cell, unknown element.
+    """
+    lengths = _positive("box: size", size, 3)
+    counts = _counts("box: cells", cells, 3)
+    low = _finite("box: origin", origin, 3)
+    lattice, corners, kind = _kuhn(counts, element, (False, False, False), "box")
+    top = lattice[-1]
+    points = low + lengths * (lattice / top)
+    return _assemble(points, corners, kind, _grid_sides(lattice, corners, kind), name)
+
+
+def cylinder(
+    radius: float,
+    length: float,
+    *,
+    cells: Sequence[int],
+    element: str = "T10",
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    name: str = "cylinder",
+) -> Mesh:
+    """A cylinder about the z axis, from ``origin`` (centre of the bottom) to ``origin`` + (0, 0, length) (m).
+
+    Parameters
+    ----------
+    cells : (n, nz)
+        n cells across the diameter (even), nz along the axis; 6 n n nz elements.
+    element : {"T4", "T10"}
+        With T10 the side's mid-edge nodes lie on the circle; the other edges are straight.
+
+    Surface and node sets "bottom", "top", "side".
+
+    Raises
+    ------
+    MeshError
+        Non-positive radius or length, an odd n, unknown element.
+    """
+    (r,) = _positive("cylinder: radius", [radius], 1)
+    (height,) = _positive("cylinder: length", [length], 1)
+    n, nz = _counts("cylinder: cells", cells, 2)
+    _even("cylinder: cells across the diameter", n)
+    low = _finite("cylinder: origin", origin, 3)
+
+    def place(p: Floats) -> Floats:
+        x, y = _disk(p[:, 0], p[:, 1])
+        return np.column_stack([r * x, r * y, 0.5 * height * (p[:, 2] + 1.0)]) + low
+
+    lattice, corners, kind = _kuhn((n, n, nz), element, (True, True, False), "cylinder")
+    sides = _grid_sides(lattice, corners, kind)
+    named = {"bottom": sides["z-"], "top": sides["z+"], "side": _join(sides, ("x-", "x+", "y-", "y+"))}
+    return _assemble(_mapped(lattice, corners, kind, place, (0, 1)), corners, kind, named, name)
+
+
+def sphere(
+    radius: float,
+    *,
+    cells: int,
+    element: str = "T10",
+    center: Sequence[float] = (0.0, 0.0, 0.0),
+    name: str = "sphere",
+) -> Mesh:
+    """A ball of ``radius`` about ``center`` (m), made of ``cells`` (even) cells across the diameter; 6 n^3
+    elements.
+
+    With T10 the surface's mid-edge nodes lie on the sphere; the other edges are straight. Set "surface".
+
+    Raises
+    ------
+    MeshError
+        Non-positive radius, an odd number of cells, unknown element.
+    """
+    (r,) = _positive("sphere: radius", [radius], 1)
+    (n,) = _counts("sphere: cells", [cells], 1)
+    _even("sphere: cells", n)
+    middle = _finite("sphere: center", center, 3)
+    lattice, corners, kind = _kuhn((n, n, n), element, (True, True, True), "sphere")
+    points = _mapped(lattice, corners, kind, lambda p: middle + r * _ball(p), (0, 1, 2))
+    named = {"surface": _join(_grid_sides(lattice, corners, kind), _SIDES)}
+    return _assemble(points, corners, kind, named, name)
+
+
+def _kuhn(counts: Sequence[int], element: str, mirrored: Sequence[bool], what: str) -> tuple[Ints, Ints, str]:
+    """Lattice points (N, 3), x fastest, cells and cell type of a grid of ``counts`` cells.
+
+    The lattice has step 2 per cell with T10 (all its points are nodes), 1 with T4. In a mirrored axis the
+    cells below the middle are reflected.
+    """
+    if element not in ELEMENT_CELLS:
+        raise MeshError(f"{what}: unknown element {element!r}, known are {', '.join(ELEMENT_CELLS)}")
+    kind = ELEMENT_CELLS[element]
+    step = 2 if CELL_TYPES[kind].has_mid_nodes else 1
+    shape = step * np.asarray(counts) + 1
+    strides = np.array([1, shape[0], shape[0] * shape[1]])
+    # cell origins and reflections, x fastest
+    k, j, i = (a.ravel() for a in np.meshgrid(*(np.arange(c) for c in counts[::-1]), indexing="ij"))
+    base = np.column_stack([i, j, k])
+    flip = np.asarray(mirrored) & (2 * base < np.asarray(counts))
+    odd = flip.sum(axis=1) % 2 == 1
+    # the six tetrahedra 0, e_a, e_a + e_b, 1 of the unit cell, right-handed
+    unit = np.zeros((6, 4, 3), dtype=np.int64)
+    for row, axes in zip(unit, itertools.permutations(range(3))):
+        row[1, axes[0]] = 1
+        row[2, list(axes[:2])] = 1
+        row[3] = 1
+        if np.linalg.det(row[1:]) < 0:
+            row[[1, 2]] = row[[2, 1]]
+    local = np.where(flip[:, None, None, :], 1 - unit, unit)  # (cells, 6, 4, 3)
+    local[odd] = local[odd][:, :, [0, 2, 1, 3]]
+    corner = step * (base[:, None, None, :] + local).reshape(-1, 4, 3)
+    nodes = corner
+    if step == 2:
+        a, b = CELL_TYPES[kind].edges.T
+        nodes = np.concatenate([corner, (corner[:, a] + corner[:, b]) // 2], axis=1)
+    z, y, x = (a.ravel() for a in np.meshgrid(*(np.arange(s) for s in shape[::-1]), indexing="ij"))
+    return np.column_stack([x, y, z]), nodes @ strides, kind
+
+
+def _grid_sides(lattice: Ints, cells: Ints, kind: str) -> dict[str, Ints]:
+    """Surface tables of the six sides of the grid."""
+    row = CELL_TYPES[kind]
+    top = lattice[-1]
+    faces = row.faces[:, : row.face_corners]
+    sides = {}
+    for axis, name in enumerate("xyz"):
+        coordinate = lattice[:, axis]
+        for sign, value in (("-", 0), ("+", top[axis])):
+            at = (coordinate == value)[cells[:, : row.corners]]
+            sides[name + sign] = np.argwhere(at[:, faces].all(axis=2))
+    return sides
+
+
+def _join(sides: dict[str, Ints], names: Sequence[str]) -> Ints:
+    table = np.concatenate([sides[n] for n in names])
+    return table[np.lexsort((table[:, 1], table[:, 0]))]
+
+
+def _mapped(
+    lattice: Ints, cells: Ints, kind: str, place: Callable[[Floats], Floats], round_axes: tuple[int, ...]
+) -> Floats:
+    """Points of the mapped lattice, with the edges that don't lie on the round side made straight."""
+    parent = 2.0 * lattice / lattice[-1] - 1.0  # -1 .. 1, exact at both ends and in the middle
+    points = place(parent)
+    row = CELL_TYPES[kind]
+    if row.has_mid_nodes:
+        outside = np.abs(parent[:, round_axes]).max(axis=1) == 1.0
+        mids, a, b = (cells[:, index].ravel() for index in (slice(4, None), row.edges[:, 0], row.edges[:, 1]))
+        inner = ~outside[mids]
+        points[mids[inner]] = 0.5 * (points[a[inner]] + points[b[inner]])
+    return points
+
+
+def _disk(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """The square [-1, 1]^2 onto the unit disk: concentric squares onto circles, with equal angles."""
+    big = np.maximum(np.abs(x), np.abs(y))
+    first = np.abs(x) >= np.abs(y)
+    safe = np.where(big > 0.0, np.where(first, x, y), 1.0)
+    angle = 0.25 * np.pi * np.where(first, y, x) / safe
+    along, across = safe * np.cos(angle), safe * np.sin(angle)
+    zero = big == 0.0
+    return np.where(zero, 0.0, np.where(first, along, across)), np.where(
+        zero, 0.0, np.where(first, across, along)
+    )
+
+
+def _ball(p: Floats) -> Floats:
+    """The cube [-1, 1]^3 onto the unit ball: concentric cubes onto spheres, with equal angles."""
+    big = np.abs(p).max(axis=1, keepdims=True)
+    direction = np.tan(0.25 * np.pi * p / np.where(big > 0.0, big, 1.0))
+    norm = np.linalg.norm(direction, axis=1, keepdims=True)
+    return big * direction / np.where(norm > 0.0, norm, 1.0)
+
+
+def _assemble(points: Floats, cells: Ints, kind: str, surfaces: dict[str, Ints], name: str) -> Mesh:
+    faces = CELL_TYPES[kind].faces
+    nodes = {key: np.unique(cells[table[:, 0, None], faces[table[:, 1]]]) for key, table in surfaces.items()}
+    return Mesh(points, cells, kind, node_sets=nodes, surface_sets=surfaces, name=name)
+
+
+def _numbers(what: str, values: Any, count: int) -> Floats:
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != (count,):
+        raise MeshError(f"{what}: expected {count} number{'s' if count > 1 else ''}, got {values!r}")
+    return array
+
+
+def _finite(what: str, values: Any, count: int) -> Floats:
+    array = _numbers(what, values, count)
+    if not np.isfinite(array).all():
+        raise MeshError(f"{what} must be finite, got {values!r}")
+    return array
+
+
+def _positive(what: str, values: Any, count: int) -> Floats:
+    array = _finite(what, values, count)
+    if not (array > 0.0).all():
+        raise MeshError(f"{what} must be positive, got {array.tolist()}")
+    return array
+
+
+def _counts(what: str, values: Any, count: int) -> tuple[int, ...]:
+    array = _numbers(what, values, count)
+    if not ((array >= 1) & (array == np.round(array))).all():
+        raise MeshError(f"{what} must be integers of at least 1, got {values!r}")
+    return tuple(int(v) for v in array)
+
+
+def _even(what: str, value: int) -> None:
+    if value % 2:
+        raise MeshError(f"{what} must be an even number, got {value}")

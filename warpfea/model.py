@@ -1,0 +1,399 @@
+"""Model: the constant side of a scene on one device, and functions that evaluate it at a state."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from . import assembly, elements
+from .bodies import Body
+from .errors import ModelError
+from .evaluation import Evaluation
+from .kernels.element import block_struct, element_kernels
+from .kernels.gather import topology_struct
+from .kernels.materials import NCOEF
+from .kernels.pcg import groups_struct
+from .kernels.types import precision
+from .loads import Loads
+from .state import State
+
+if TYPE_CHECKING:
+    from .builder import ModelBuilder
+
+__all__ = ["Block", "Model"]
+
+
+@dataclass(eq=False)
+class Block:
+    """Elements that one kernel does: their kind, device data, and where they came from."""
+
+    key: assembly.BlockKey
+    data: Any
+    kernels: Any
+    parts: list[assembly.HostBlock]
+    count: int
+    points: int
+    slots: int
+    contribution_offset: int
+    element_offset: int
+
+    def kernels_for(self, dtype: str, damping: str | None) -> Any:
+        """The kernels of this kind of element with another form of damping."""
+        k = self.key
+        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping)
+
+
+class Model:
+    """Made by ModelBuilder.finalize; constant but for `set_gravity`.
+
+    Attributes:
+        bodies: the bodies, in the order they were added.
+        worlds, dtype, device, up_axis: as given.
+        slots: number of slots of all bodies.
+        blocks: element blocks.
+    """
+
+    def __init__(
+        self, builder: ModelBuilder, *, device: Any = None, dtype: str = "float64", worlds: int = 1, tables: bool = False
+    ) -> None:
+        if dtype not in ("float64", "float32"):
+            raise ModelError(f"dtype = {dtype!r} is neither 'float64' nor 'float32'")
+        if not isinstance(worlds, (int, np.integer)) or worlds < 1:
+            raise ModelError(f"worlds = {worlds!r} must be a positive whole number")
+        if not builder.bodies:
+            raise ModelError("the model has no body: call ModelBuilder.add_solid first")
+        self.device = _device(device)
+        self.dtype = dtype
+        self.worlds = int(worlds)
+        self.up_axis = builder.up_axis
+        self.description = builder.description
+        self.bodies: list[Body] = list(builder.bodies)
+        self.types = precision(dtype)
+        self._memory: dict[str, int] = {}
+        self._number()
+        self._assemble_mass()
+        self._build_blocks(tables)
+        self.loads = Loads(self, builder.gravity)
+        self._build_topology()
+        self._build_groups()
+        self.probes = list(builder.description.probes)
+        self.evaluation = Evaluation(self)
+
+    # construction
+
+    def array(self, name: str, values: Any, dtype: Any) -> wp.array:
+        """Upload a constant; its bytes are counted under `name`."""
+        out = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+        self._memory[name] = self._memory.get(name, 0) + out.size * wp.types.type_size_in_bytes(out.dtype)
+        return out
+
+    def _number(self) -> None:
+        offset = 0
+        for body in self.bodies:
+            assembly.check_orientation(body, body.family.rule(body.rule))
+            body.slot_offset = offset
+            offset += body.slot_count
+        self.slots = offset
+        self.slot_kind = np.concatenate([body.slot_kind for body in self.bodies])
+        self.reference = np.concatenate([body.reference for body in self.bodies])
+        self.is_position_host = (self.slot_kind == 0).astype(float)
+        T, vec3 = self.types.T, self.types.vec3
+        self.is_position = self.array("slots", self.is_position_host, T)
+        self.reference_device = None
+        if self.description.pressures or self.description.body_forces:
+            self.reference_device = self.array("reference", self.reference, vec3)
+        self.free_host = np.ones((self.slots, 3))
+        for support in self.description.supports:
+            rows = support.body.slot_offset + support.slots
+            self.free_host[rows] *= 1.0 - support.components
+        if not self.free_host.any():
+            raise ModelError("every component of every node is prescribed: nothing is left to solve for")
+
+    def _assemble_mass(self) -> None:
+        self._mass = sp.block_diag([assembly.body_mass(b) for b in self.bodies], format="csr")
+        self._mass.sum_duplicates()
+        self.lumped_host = self._mass @ self.is_position_host
+        self.lumped = self.array("slots", self.lumped_host, self.types.T)
+
+    def _build_blocks(self, tables: bool) -> None:
+        groups: dict[assembly.BlockKey, list[assembly.HostBlock]] = {}
+        materials: list[tuple[Body, str, Any]] = []
+        self._material_offset: dict[int, int] = {}
+        for body in self.bodies:
+            self._material_offset[body.index] = len(materials)
+            materials += [(body, group, material) for group, material in body.materials]
+            for host in assembly.host_blocks(body, tables=tables):
+                groups.setdefault(host.key, []).append(host)
+        rows = np.zeros((1, len(materials), NCOEF))
+        for k, (_, _, material) in enumerate(materials):
+            rows[0, k, :3] = material.coefficients()
+            if material.damping:
+                rows[0, k, 3:] = material.damping.eta, material.damping.lambda_v
+        self.materials = materials
+        self.coefficients = self.array("materials", rows, self.types.T)
+        self.blocks: list[Block] = []
+        contribution, element, history = 0, 0, 0
+        for key, parts in groups.items():
+            block = self._build_block(key, parts, contribution, element, history)
+            self.blocks.append(block)
+            contribution += block.count * block.slots
+            element += block.count
+            if key.damping == "incremental":
+                history += block.count * block.points
+        self.contributions, self.element_count, self.history_count = contribution, element, history
+
+    def _build_block(
+        self, key: assembly.BlockKey, parts: list[assembly.HostBlock], contribution: int, element: int, history: int
+    ) -> Block:
+        T, vec3, mat33 = self.types.T, self.types.vec3, self.types.mat33
+        family = elements.get(key.family)
+        rule = family.rules[key.rule]
+        S, Q = family.slots, len(rule.weights)
+        data = block_struct(self.dtype)()
+        conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
+        data.conn = self.array("elements", conn.T, wp.int32)
+        data.is_position = self.array("elements", (family.slot_kind == 0).astype(float), T)
+        data.material = self.array(
+            "elements",
+            np.concatenate([p.body.material_of[p.elements] + self._material_offset[p.body.index] for p in parts]),
+            wp.int32,
+        )
+        data.coefficients = self.coefficients
+        points = np.vstack([rule.points, family.vertices])
+        h, w, J0 = [], [], []
+        for part in parts:
+            for first in range(0, len(part.elements), assembly.CHUNK):
+                members = part.elements[first : first + assembly.CHUNK]
+                if key.affine:
+                    _, _, J, det = assembly.geometry(part.body, members, family.vertices[:1])
+                    J0.append(np.linalg.inv(J[:, 0]))
+                    w.append(det[:, 0])
+                else:
+                    _, ds, J, det = assembly.geometry(part.body, members, points)
+                    h.append(assembly.gradients(ds, J))
+                    w.append(det[:, :Q] * rule.weights)
+        if key.affine:
+            _, ds = family.shape(points, np.zeros((1, 10, 3)))
+            table = ds[0][:, :, None, :]
+            data.J0_inv = self.array("elements", np.concatenate(J0), mat33)
+            data.det_J0 = self.array("elements", np.concatenate(w), T)
+            data.weight = self.array("elements", rule.weights[:, None], T)
+        else:
+            table = np.moveaxis(np.concatenate(h), 0, 2)
+            data.weight = self.array("elements", np.concatenate(w).T, T)
+        data.gradient = self.array("elements", table[:Q], vec3)
+        if key.law != "svk":
+            data.vertex_gradient = self.array("elements", table[Q:], vec3)
+        data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
+        data.count = len(conn)
+        kernels = element_kernels(self.dtype, key.law, S, Q, key.affine, key.damping)
+        return Block(key, data, kernels, parts, len(conn), Q, S, contribution, element)
+
+    def _build_topology(self) -> None:
+        T, vec3 = self.types.T, self.types.vec3
+        topo = topology_struct(self.dtype)()
+        conn = [np.concatenate([p.conn + p.body.slot_offset for p in b.parts]) for b in self.blocks]
+        start, entry = assembly.gather_table(conn, self.slots)
+        topo.start = self.array("topology", start, wp.int32)
+        topo.entry = self.array("topology", entry, wp.int32)
+        topo.mass_start = self.array("mass", self._mass.indptr, wp.int32)
+        topo.mass_column = self.array("mass", self._mass.indices, wp.int32)
+        topo.mass_value = self.array("mass", self._mass.data, T)
+        topo.free = self.array("slots", self.free_host, vec3)
+        self.topology = topo
+
+    def _build_groups(self) -> None:
+        """Bodies, or separate parts of one, that no support holds in some direction (DESIGN 5)."""
+        T, vec3 = self.types.T, self.types.vec3
+        label = assembly.components_of(self._mass)
+        count = int(label.max()) + 1
+        free = np.ones((count, 3))
+        for c in range(3):
+            held = np.unique(label[self.free_host[:, c] == 0.0])
+            free[held, c] = 0.0
+        self.component = label
+        keep = np.flatnonzero(free.any(axis=1))
+        self.group_count = len(keep)
+        self.groups = groups_struct(self.dtype)()
+        if not self.group_count:
+            return
+        number = np.full(count, -1)
+        number[keep] = np.arange(len(keep))
+        of_slot = number[label]
+        slots = np.flatnonzero((of_slot >= 0) & (self.slot_kind == 0))
+        slots = slots[np.argsort(of_slot[slots], kind="stable")]
+        mass = np.bincount(of_slot[slots], weights=self.lumped_host[slots], minlength=len(keep))
+        start = np.concatenate([[0], np.cumsum(np.bincount(of_slot[slots], minlength=len(keep)))])
+        self.groups.start = self.array("groups", start, wp.int32)
+        self.groups.slot = self.array("groups", slots, wp.int32)
+        self.groups.of_slot = self.array("groups", of_slot, wp.int32)
+        self.groups.is_position = self.is_position
+        self.groups.lumped = self.lumped
+        self.groups.mass = self.array("groups", mass, T)
+        self.groups.free = self.array("groups", free[keep], vec3)
+
+    def check_static_supports(self) -> None:
+        """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
+        for label in range(int(self.component.max()) + 1):
+            slots = np.flatnonzero(self.component == label)
+            modes = assembly.rigid_modes(self.reference[slots], self.slot_kind[slots])
+            held = modes[:, self.free_host[slots] == 0.0]
+            scale = np.linalg.norm(modes.reshape(6, -1), axis=1)
+            values = np.linalg.svd(held / scale[:, None], compute_uv=False) if held.size else np.zeros(6)
+            rank = int(np.sum(values > 1e-9))
+            if rank < 6:
+                body = next(b for b in self.bodies if b.slot_offset <= slots[0] < b.slot_offset + b.slot_count)
+                raise ModelError(
+                    f"body {body.name!r} is not supported: its supports leave {6 - rank} rigid motions free, and statics "
+                    "has no unique answer; clamp or drive more nodes"
+                )
+
+    # what users call
+
+    @property
+    def free_slots(self) -> np.ndarray:
+        """(slots, 3) mask of the components that are unknowns."""
+        return self.free_host.astype(bool)
+
+    @property
+    def needs_positive_J(self) -> bool:
+        """Whether a law of the model is defined for J > 0 only."""
+        return any(b.key.law != "svk" for b in self.blocks)
+
+    @property
+    def features(self) -> dict[str, bool]:
+        """Which optional features the scene uses."""
+        forms = {b.key.damping for b in self.blocks}
+        d = self.description
+        return {
+            "straight elements": any(b.key.affine for b in self.blocks),
+            "table elements": any(not b.key.affine for b in self.blocks),
+            "damping incremental": "incremental" in forms,
+            "damping rate": "rate" in forms,
+            "damping explicit": "explicit" in forms,
+            "gravity": bool(np.any(self.loads.gravity_host)),
+            "dead loads": bool(d.dead_loads),
+            "body forces": bool(d.body_forces),
+            "follower pressure": bool(d.pressures),
+            "driven nodes": any(s.law or s.node_laws for s in d.supports),
+            "free groups": self.group_count > 0,
+            "probes": bool(self.probes),
+        }
+
+    @property
+    def bytes(self) -> dict[str, int]:
+        """Bytes of the constant arrays by purpose."""
+        return dict(self._memory)
+
+    def info(self) -> dict[str, Any]:
+        """Features in and left out, counts, bytes of the constants, kernels' modules of the elements."""
+        features = self.features
+        return {
+            "bodies": [
+                {
+                    "name": b.name,
+                    "element": b.family.name,
+                    "quadrature": b.rule,
+                    "elements": len(b.mesh.cells),
+                    "nodes": len(b.mesh.used_nodes),
+                    "materials": [type(m).__name__ + (f" ({g})" if g else "") for g, m in b.materials],
+                }
+                for b in self.bodies
+            ],
+            "worlds": self.worlds,
+            "dtype": self.dtype,
+            "device": str(self.device),
+            "slots": self.slots,
+            "unknowns": int(self.free_slots.sum()),
+            "elements": self.element_count,
+            "mass": float(self.lumped_host[self.slot_kind == 0].sum()),
+            "features": [k for k, on in features.items() if on],
+            "left_out": [k for k, on in features.items() if not on]
+            + ["constraints", "contact", "friction", "per-world parameters"],
+            "blocks": [
+                {"law": b.key.law, "elements": b.count, "points": b.points, "affine": b.key.affine} for b in self.blocks
+            ],
+            "bytes": self.bytes | {"total": sum(self._memory.values())},
+            "kernels": sorted({b.kernels.module.name.removeprefix("warpfea.kernels.") for b in self.blocks}),
+        }
+
+    def state(self) -> State:
+        """A new State with the initial displacements and velocities of the bodies."""
+        out = State(self.worlds, self.device)
+        vec3 = self.types.vec3
+        u = np.zeros((self.slots, 3))
+        v = np.zeros((self.slots, 3))
+        for body in self.bodies:
+            rows = body.slots
+            if body.initial_displacement is not None:
+                u[rows] = np.where((body.slot_kind == 0)[:, None], body.initial_displacement[body.slot_node], 0.0)
+            if body.velocity is not None:
+                v[rows] = body.velocity
+        v *= self.free_host
+        out.register("displacement", vec3, (self.slots,), u)
+        out.register("velocity", vec3, (self.slots,), v)
+        out.register("time", wp.float64)
+        return out
+
+    def mass_matrix(self) -> sp.csr_matrix:
+        """Consistent mass, (3 slots, 3 slots) CSR, kg; unknown 3 slot + component."""
+        return sp.kron(self._mass, sp.identity(3), format="csr")
+
+    def internal_force(self, state: State) -> np.ndarray:
+        """Elastic internal force, Eq. (32), [world, slot, 3], N."""
+        return self.evaluation.internal_force(state)[0]
+
+    def viscous_force(self, state: State) -> np.ndarray:
+        """Kelvin-Voigt force of Eqs. (58)-(70) at the state's displacement and velocity, [world, slot, 3], N."""
+        return self.evaluation.viscous_force(state)[0]
+
+    def dissipation_rate(self, state: State) -> np.ndarray:
+        """Viscous dissipation, the integral of S_vis : Edot, [world], W."""
+        return self.evaluation.viscous_force(state)[1]
+
+    def strain_energy(self, state: State) -> np.ndarray:
+        """[world], J."""
+        return self.evaluation.internal_force(state)[1]
+
+    def minimum_jacobian(self, state: State) -> np.ndarray:
+        """Smallest det F at the points (and vertices, for laws that need J > 0), [world]."""
+        return self.evaluation.internal_force(state)[2]
+
+    def tangent_matrix(self, state: State, world: int = 0) -> sp.csr_matrix:
+        """Elastic tangent df_int/dq of one world, (3 slots, 3 slots) CSR, N/m; clamped rows included."""
+        return self.evaluation.tangent_matrix(state, world)
+
+    def set_gravity(self, gravity: Any) -> None:
+        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2."""
+        self.loads.set_gravity(gravity)
+
+    def set_parameter(self, name: str, values: Any) -> None:
+        """Per-world material parameters are not part of this version."""
+        raise NotImplementedError("set_parameter: per-world material parameters are not part of this version")
+
+    def fingerprint(self) -> str:
+        """Hash of all that a checkpoint must agree with: topology, geometry, laws, precision, supports, worlds."""
+        h = hashlib.sha256(f"{self.dtype} {self.worlds} {self.slots}".encode())
+        for block in self.blocks:
+            h.update(repr(block.key).encode())
+            for part in block.parts:
+                h.update(np.ascontiguousarray(part.conn).tobytes())
+        h.update(self.reference.tobytes())
+        h.update(self.free_host.tobytes())
+        h.update(self._mass.data.tobytes())
+        h.update(self.coefficients.numpy().tobytes())
+        self.loads.hash(h)
+        return h.hexdigest()
+
+
+def _device(device: Any) -> Any:
+    try:
+        return wp.get_device(device) if device is not None else wp.get_preferred_device()
+    except Exception as error:
+        names = ", ".join(str(d) for d in wp.get_devices())
+        raise ModelError(f"device {device!r} is not there; Warp finds {names}") from error

@@ -1,0 +1,468 @@
+"""Simulation: the step loop as users drive it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import sys
+import time as clock
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import integrators
+from .bodies import Body, NodeSet
+from .errors import ConvergenceError, ModelError
+from .evaluation import von_mises
+from .kernels.newton import FAIL_CURVATURE, FAIL_ITERATIONS, FAIL_JACOBIAN, FAIL_LINE_SEARCH, FAIL_NAN
+from .kernels.step import LEDGER, REPORT, STATUS
+from .solvers import NewtonPCG
+from .state import State
+from .stepper import Stepper
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["ProbeRecord", "Simulation", "StepReport"]
+
+REASONS = {
+    FAIL_ITERATIONS: "Newton's method did not converge",
+    FAIL_LINE_SEARCH: "the line search found no decrease",
+    FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined",
+    FAIL_NAN: "a force or energy was not finite",
+    FAIL_CURVATURE: "no descent direction was found",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StepReport:
+    """What a step took, each an array [world].
+
+    Attributes:
+        converged: the step was accepted.
+        newton, pcg: iterations, refused attempts included.
+        residual: |g| over the largest force, of the last attempt.
+        halvings: refused attempts.
+        status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
+        min_J: smallest det F; a value <= 0 means that an element turned inside out (SVK only; others refuse it).
+        time: s.
+    """
+
+    converged: np.ndarray
+    newton: np.ndarray
+    pcg: np.ndarray
+    residual: np.ndarray
+    halvings: np.ndarray
+    status: np.ndarray
+    min_J: np.ndarray
+    time: np.ndarray
+    failure: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ProbeRecord:
+    """A probe over time: time (steps,), position, displacement and velocity (worlds, steps, 3), in m and m/s."""
+
+    time: np.ndarray
+    position: np.ndarray
+    displacement: np.ndarray
+    velocity: np.ndarray
+
+
+class Simulation:
+    """Steps a model through time.
+
+    Args:
+        model: from ModelBuilder.finalize.
+        state: where it starts; by default model.state(). It is advanced in place.
+        dt: step, s. `sim.dt` may be set later.
+        integrator: "backward_euler" or "bdf2".
+        solver: NewtonPCG options.
+        constraint_tol: for joints, which are not part of this version.
+        ledger: keep the energy ledger.
+        capture: record a step as one graph, on the GPU and on the CPU.
+        on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
+            several only once all have failed.
+
+    Raises:
+        ModelError: dt or an option out of range.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        state: State | None = None,
+        *,
+        dt: float,
+        integrator: str = "backward_euler",
+        solver: NewtonPCG | None = None,
+        constraint_tol: float = 1e-8,
+        ledger: bool = True,
+        capture: bool = True,
+        on_failure: str | None = None,
+    ) -> None:
+        self._start(model, state, integrators.get(integrator), solver or NewtonPCG(), ledger, capture)
+        self.dt = dt
+        if on_failure not in (None, "raise", "freeze"):
+            raise ModelError(f"on_failure = {on_failure!r} is neither 'raise' nor 'freeze'")
+        self.on_failure = on_failure
+
+    @classmethod
+    def _static(cls, model: Model, state: State, solver: NewtonPCG, dt: float) -> Simulation:
+        """The same loop for load steps of statics."""
+        self = cls.__new__(cls)
+        self._start(model, state, integrators.INTEGRATORS["static"], solver, False, True)
+        self.dt = dt
+        self.on_failure = "raise"
+        return self
+
+    def _start(
+        self, model: Model, state: State | None, scheme: Any, solver: NewtonPCG, ledger: bool, capture: bool
+    ) -> None:
+        self.model = model
+        self.state = model.state() if state is None else state
+        if self.state.worlds != model.worlds:
+            raise ModelError(f"the state has {self.state.worlds} worlds, the model {model.worlds}")
+        self.integrator = scheme
+        self.solver = solver
+        began = clock.perf_counter()
+        self.stepper = Stepper(model, self.state, scheme, solver, ledger=ledger, capture=capture)
+        self.compile_s = clock.perf_counter() - began
+        self.steps = 0
+        self.last: StepReport | None = None
+        self.totals = {"newton": np.zeros(model.worlds, int), "pcg": np.zeros(model.worlds, int)}
+        self.max_residual = 0.0
+        self._history: list[np.ndarray] = []
+
+    # stepping
+
+    @property
+    def dt(self) -> float:
+        """Step, s."""
+        return self._dt
+
+    @dt.setter
+    def dt(self, value: float) -> None:
+        if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
+            raise ModelError(f"dt = {value!r} must be a positive finite time (s)")
+        self._dt = float(value)
+        self.stepper.work.step.dt.fill_(self._dt)
+
+    @property
+    def time(self) -> np.ndarray:
+        """[world], s."""
+        return self.state.time.numpy()
+
+    @property
+    def status(self) -> np.ndarray:
+        """[world]: 0 running, 1 failed, 2 frozen."""
+        return self.state.status.numpy()
+
+    def step(self, count: int = 1) -> StepReport:
+        """Advance `count` steps of dt; the report is that of the last.
+
+        Raises:
+            ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
+        """
+        for _ in range(count):
+            self.stepper.run()
+            report = self.stepper.work.report.numpy()
+            self._digest(report)
+        assert self.last is not None
+        return self.last
+
+    def _digest(self, rows: np.ndarray) -> None:
+        column = {name: rows[:, k] for k, name in enumerate(REPORT)}
+        status = column["status"].astype(int)
+        before = self.last.status if self.last is not None else np.zeros(len(rows), int)
+        fresh = (status == STATUS["failed"]) & (before != STATUS["failed"])
+        self.last = StepReport(
+            converged=status == STATUS["running"],
+            newton=column["newton"].astype(int),
+            pcg=column["pcg"].astype(int),
+            residual=column["residual"].copy(),
+            halvings=column["halvings"].astype(int),
+            status=status,
+            min_J=column["min_J"].copy(),
+            time=column["time"].copy(),
+            failure=column["failure"].astype(int),
+        )
+        self.steps += 1
+        self.totals["newton"] += self.last.newton
+        self.totals["pcg"] += self.last.pcg
+        good = self.last.converged
+        if good.any():
+            self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
+        if self.model.probes:
+            self._history.append(rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy())
+        if fresh.any():
+            fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
+            if fatal:
+                self.steps -= 1
+                if self.model.probes:
+                    self._history.pop()
+                raise self._failure(int(np.flatnonzero(fresh)[0]))
+
+    def _failure(self, world: int) -> ConvergenceError:
+        """The error for a failed world; its status is cleared so that a caller may try again with another dt."""
+        assert self.last is not None
+        work = self.stepper.work
+        code = int(self.last.failure[world])
+        count = int(work.newton.iterations.numpy()[world]) + 1
+        history = work.newton.history.numpy()[world, :count].tolist()
+        element, where = self._worst_element(world)
+        time = float(self.last.time[world])
+        status = self.state.status.numpy()
+        status[status == STATUS["failed"]] = STATUS["running"]
+        self.state.status.assign(status)
+        self.last = None
+        return ConvergenceError(
+            f"step from t = {time:.6g} s with dt = {self._dt:g} s was not accepted in world {world}: "
+            f"{REASONS.get(code, 'unknown reason')} after {self.solver.max_halvings} halvings; relative residuals "
+            f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}",
+            time=time, world=world, residuals=history, element=element, state=self.state,
+        )  # fmt: skip
+
+    def _worst_element(self, world: int) -> tuple[int, str]:
+        """Model index and a description of the element whose slots carry the largest residual."""
+        m = self.model
+        g = np.abs(self.stepper.work.g.numpy()[world] * m.free_host).max(axis=1)
+        g = np.where(np.isfinite(g), g, np.inf)
+        best, index, text = -1.0, -1, "element unknown"
+        for block in m.blocks:
+            first = block.element_offset
+            for part in block.parts:
+                values = g[part.conn + part.body.slot_offset].max(axis=1)
+                k = int(np.argmax(values))
+                if values[k] > best:
+                    best, index = float(values[k]), first + k
+                    text = f"element {int(part.elements[k])} of body {part.body.name!r} (residual {best:.3g} N)"
+                first += len(part.elements)
+        return index, text
+
+    def run(
+        self,
+        t_end: float,
+        *,
+        outputs: Sequence[Any] = (),
+        on_step: Callable[[Simulation], Any] | None = None,
+        progress: bool | None = None,
+    ) -> StepReport:
+        """Step until t_end (s), writing outputs. Ctrl-C ends after the step in hand, with valid files.
+
+        Args:
+            t_end: end time, s; a last step that would overshoot by less than half a step is not taken.
+            outputs: writers (USDWriter, VTUWriter, Checkpoint, ...).
+            on_step: called after each step; ends the run when it returns False.
+            progress: show a bar on stderr; by default when stderr is a terminal.
+
+        Raises:
+            ConvergenceError, OutputError: the outputs hold what came before.
+            KeyboardInterrupt: after Ctrl-C, once outputs are closed.
+        """
+        if not math.isfinite(t_end):
+            raise ModelError(f"t_end = {t_end!r} must be finite")
+        total = max(0, round((t_end - float(self.time.min())) / self._dt))
+        opened: list[Any] = []
+        with _interruptible() as interrupted, _bar(total, t_end, progress) as bar:
+            try:
+                for out in outputs:
+                    opened.append(out)
+                    out.open(self)
+                    out.write(self)
+                for _ in range(total):
+                    report = self.step()
+                    for out in opened:
+                        out.write(self)
+                    bar(report)
+                    if (on_step is not None and on_step(self) is False) or interrupted() or not report.converged.any():
+                        break
+            except BaseException:
+                _close(opened, self)
+                raise
+            _close(opened, self, quiet=False)
+            if interrupted():
+                raise KeyboardInterrupt
+        if self.last is None:
+            self.last = self._idle_report()
+        return self.last
+
+    def _idle_report(self) -> StepReport:
+        B = self.model.worlds
+        zero, none = np.zeros(B, int), np.zeros(B)
+        return StepReport(self.status == 0, zero, zero, none, zero, self.status, none, self.time, zero)
+
+    def freeze(self, worlds: Any) -> None:
+        """Leave worlds (indices or mask) as they are from now on."""
+        status = self.state.status.numpy()
+        status[worlds] = STATUS["frozen"]
+        self.state.status.assign(status)
+
+    def reset(self, mask: Any = None, state: State | None = None) -> None:
+        """Set worlds back to a state, by default to the model's initial one; mask [world], by default all."""
+        B = self.model.worlds
+        mask = np.ones(B, bool) if mask is None else np.asarray(mask, dtype=bool)
+        if mask.shape != (B,):
+            raise ModelError(f"reset: mask has shape {mask.shape}, expected ({B},)")
+        source = self.model.state() if state is None else state
+        fresh = source.numpy()
+        values = self.state.numpy()
+        for name, array in values.items():
+            spec = self.state.specs[name]
+            array[mask] = fresh[name][mask] if name in fresh else np.asarray(spec.initial)
+        self.state.load(values)
+        if self.stepper.ledger:
+            self.stepper.begin_ledger(mask)
+
+    # results
+
+    def _rows(self, body: Body, values: np.ndarray) -> np.ndarray:
+        """Slot values to mesh nodes, (B, nodes, 3); nodes that no element uses get 0."""
+        out = np.zeros((self.model.worlds, len(body.mesh.points), 3))
+        used = body.mesh.used_nodes
+        out[:, used] = values[:, body.slot_offset + body.node_slot[used]]
+        return out
+
+    def displacements(self, body: Body) -> np.ndarray:
+        """(B, nodes, 3) m, in the mesh file's node order."""
+        return self._rows(body, self.state.displacement.numpy())
+
+    def positions(self, body: Body) -> np.ndarray:
+        """(B, nodes, 3) m."""
+        return body.mesh.points + self.displacements(body)
+
+    def velocities(self, body: Body) -> np.ndarray:
+        """(B, nodes, 3) m/s."""
+        return self._rows(body, self.state.velocity.numpy())
+
+    def skin_points(self, body: Body) -> np.ndarray:
+        """(B, skin points, 3) m: the drawn surface."""
+        u = self.state.displacement.numpy()[:, body.slots].astype(float)
+        W = body.skin.slot_weights
+        X = W @ body.reference + np.asarray(W @ (body.slot_kind == 0))[:, None] * body.origin
+        return X + np.stack([W @ row for row in u])
+
+    def skin_field(self, name: str, body: Body) -> np.ndarray:
+        """(B, skin points) scalars of a field at the drawn surface."""
+        return np.stack([body.skin.node_weights @ row for row in self.field(name, body)])
+
+    def field(self, name: str, body: Body) -> np.ndarray:
+        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress) or "displacement" (m, magnitude)."""
+        if name == "displacement":
+            return np.linalg.norm(self.displacements(body), axis=2)
+        if name == "von_mises":
+            return von_mises(self.model.evaluation.nodal_stress(self.state, body))
+        raise ModelError(f"field {name!r} is unknown; there are von_mises, displacement")
+
+    def probe(self, name: str) -> ProbeRecord:
+        """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""
+        names = [p.name for p in self.model.probes]
+        if name not in names:
+            raise ModelError(f"probe {name!r} is unknown; there are {names}")
+        k = names.index(name)
+        B = self.model.worlds
+        table = np.stack(self._history, axis=1) if self._history else np.zeros((B, 0, 1 + 6 * len(names)))
+        d, v = table[:, :, 1 + 6 * k : 4 + 6 * k], table[:, :, 4 + 6 * k : 7 + 6 * k]
+        return ProbeRecord(table[0, :, 0], self.model.probes[k].X + d, d, v)
+
+    def energies(self) -> dict[str, np.ndarray]:
+        """Energy ledger, each (B,), J.
+
+        kinetic, strain and potential (of gravity, from the reference) are current values. work (by loads, supports and
+        fields, also given apart), viscous, contact, friction and integrator add up from the start; ledger_residual is
+        change of energy + losses - work, which equals `unbalanced`, the sum of g . dq that the solver's tolerance left.
+        """
+        if not self.stepper.ledger:
+            raise ModelError("energies: the simulation was made with ledger=False")
+        table = self.state.ledger.numpy()
+        out = {name: table[:, k].copy() for k, name in enumerate(LEDGER)}
+        out["work"] = out["work_loads"] + out["work_supports"] + out["work_fields"]
+        out["contact"] = np.zeros(len(table))
+        out["friction"] = np.zeros(len(table))
+        return out
+
+    def reaction(self, nodes: NodeSet) -> np.ndarray:
+        """Force of the supports on the prescribed components of nodes at the last step, (B, 3), N."""
+        g = self.stepper.work.g.numpy() * (1.0 - self.model.free_host)
+        first = nodes.body.node_slot[nodes.indices]
+        rows = nodes.body.slot_offset + first[first >= 0]
+        return g[:, rows].sum(axis=1)
+
+    def joint_force(self, joint: Any) -> np.ndarray:
+        """Joints are not part of this version."""
+        raise NotImplementedError("joint_force: joints are not part of this version")
+
+    def violation(self, joint: Any) -> np.ndarray:
+        """Joints are not part of this version."""
+        raise NotImplementedError("violation: joints are not part of this version")
+
+    def contact_report(self, *pair: Any) -> Any:
+        """Contact is not part of this version."""
+        raise NotImplementedError("contact_report: contact is not part of this version")
+
+    def resume(self, path: Any) -> None:
+        """Continue from a checkpoint, bit for bit. Raises CheckpointError if it is of another model."""
+        from .checkpoint import load_checkpoint
+
+        load_checkpoint(self, path)
+
+    def bytes(self) -> dict[str, int]:
+        """Bytes on the device: constants, scratch, and each array of the state (twice where steps may be halved)."""
+        out = {f"model.{k}": v for k, v in self.model.bytes.items()}
+        out |= {f"work.{k}": v for k, v in self.stepper.work.bytes.items()}
+        for label, state in (("state", self.state), ("backup", self.stepper.backup)):
+            if state is not None:
+                out |= {f"{label}.{k}": v for k, v in state.bytes.items()}
+        return out
+
+
+def _close(opened: list[Any], sim: Simulation, *, quiet: bool = True) -> None:
+    for out in opened:
+        if quiet:
+            with contextlib.suppress(Exception):
+                out.close(sim)
+        else:
+            out.close(sim)
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C sets a flag instead of breaking a step; a second one breaks at once."""
+    hit = [False]
+
+    def handler(*_: Any) -> None:
+        if hit[0]:
+            raise KeyboardInterrupt
+        hit[0] = True
+
+    try:
+        old = signal.signal(signal.SIGINT, handler)
+    except ValueError:  # not in the main thread
+        yield lambda: False
+        return
+    try:
+        yield lambda: hit[0]
+    finally:
+        signal.signal(signal.SIGINT, old)
+
+
+@contextlib.contextmanager
+def _bar(total: int, t_end: float, progress: bool | None) -> Iterator[Callable[[StepReport], None]]:
+    if progress is None:
+        progress = sys.stderr.isatty()
+    if not progress:
+        yield lambda report: None
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=total, unit="step", dynamic_ncols=True) as bar:
+
+        def update(report: StepReport) -> None:
+            bar.set_description(f"t {report.time.min():.4g}/{t_end:g} s", refresh=False)
+            bar.set_postfix_str(f"newton {report.newton.max()} pcg {report.pcg.max()}", refresh=False)
+            bar.update()
+
+        yield update

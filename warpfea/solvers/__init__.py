@@ -1,0 +1,5 @@
+"""Solvers of a step."""
+
+from .newton import NewtonPCG
+
+__all__ = ["NewtonPCG"]

@@ -1,0 +1,127 @@
+"""Newton's method with PCG: options, and the loop as it runs on the device."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from ..errors import ModelError
+from ..kernels.newton import newton_kernels
+from .pcg import PCG
+from .preconditioner import make
+from .residual import Residual
+
+if TYPE_CHECKING:
+    from ..launch import Launcher
+    from ..model import Model
+    from ..workspace import Workspace
+
+__all__ = ["NewtonLoop", "NewtonPCG"]
+
+EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
+
+
+@dataclass(frozen=True)
+class NewtonPCG:
+    """Newton's method with a line search; linear systems by preconditioned conjugate gradients.
+
+    Args:
+        tol: |g| <= tol x max(|f_int|, |f_ext|, |M a|) in the D^-1 norm, above the rounding of the positions. None: 1e-8
+            in float64, 1e-4 in float32.
+        max_newton: iterations before a step is refused.
+        max_pcg: iterations per linear solve.
+        max_halvings: how often a refused step may be halved.
+        preconditioner: "auto" or "block-jacobi".
+
+    Raises:
+        ModelError: a value out of range.
+    """
+
+    tol: float | None = None
+    max_newton: int = 30
+    max_pcg: int = 2000
+    max_halvings: int = 8
+    preconditioner: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.tol is not None and not (math.isfinite(self.tol) and 0.0 < self.tol < 1.0):
+            raise ModelError(f"NewtonPCG: tol = {self.tol!r} must lie between 0 and 1")
+        for name in ("max_newton", "max_pcg"):
+            if not getattr(self, name) >= 1:
+                raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be at least 1")
+        if not 0 <= self.max_halvings <= 20:
+            raise ModelError(f"NewtonPCG: max_halvings = {self.max_halvings!r} must lie between 0 and 20")
+
+    def tolerance(self, dtype: str) -> float:
+        """The tolerance in one precision."""
+        return self.tol if self.tol is not None else {"float64": 1e-8, "float32": 1e-4}[dtype]
+
+
+class NewtonLoop:
+    """The iteration of all worlds: conditional loops on the device, one code path with and without capture."""
+
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, options: NewtonPCG, *, inertia: bool
+    ) -> None:
+        self.model, self.work, self.launch = model, work, launch
+        self.kernels = newton_kernels(model.dtype)
+        self.residual = Residual(model, work, launch)
+        self.preconditioner = make(options.preconditioner, model, work, launch, self.residual)
+        self.pcg = PCG(
+            model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
+        )
+        self.dim = (model.worlds, model.slots)
+        ctl = work.newton
+        ctl.dq_dv = work.step.dq_dv
+        ctl.tol = options.tolerance(model.dtype)
+        ctl.eps = EPS[model.dtype]
+        ctl.max_iterations = options.max_newton
+        ctl.need_positive_J = int(model.needs_positive_J)
+        ctl.nonpotential = int(model.loads.nonpotential or any(b.key.damping == "rate" for b in model.blocks))
+        self.iterating = work.any_flag[0:1]
+        self.searching = work.any_flag[1:2]
+
+    def run(self) -> None:
+        """Iterate from work.v until every active world has converged or failed."""
+        w = self.work
+        active = w.newton.active
+        self._clear_direction(active)
+        # D is needed to judge the first iterate, so the blocks come first
+        self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
+        self.preconditioner.build(active)
+        self.residual.evaluate(active)
+        self.launch(self.kernels.begin, self.model.worlds, [w.newton])
+        self._any(active, self.iterating)
+        wp.capture_while(self.iterating, self._iterate)
+
+    def _iterate(self) -> None:
+        w, k, launch = self.work, self.kernels, self.launch
+        active = w.newton.active
+        self.pcg.solve(active)
+        self.residual.hold_pushed(active)
+        launch(k.copy_active, self.dim, [w.v, active, w.base])
+        launch(k.dot_rows, self.dim, [w.g, w.direction, active, w.rows])
+        self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
+        launch(k.begin_search, self.model.worlds, [w.newton])
+        self._any(w.newton.searching, self.searching)
+        wp.capture_while(self.searching, self._search)
+        self.preconditioner.build(active)
+        self._any(active, self.iterating)
+
+    def _search(self) -> None:
+        w, k, launch = self.work, self.kernels, self.launch
+        launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.v])
+        self.residual.evaluate(w.newton.searching)
+        launch(k.judge_trial, self.model.worlds, [w.newton])
+        self._any(w.newton.searching, self.searching)
+
+    def _any(self, flags: wp.array, out: wp.array) -> None:
+        out.zero_()
+        self.launch(self.kernels.any_set, self.model.worlds, [flags, out])
+
+    def _clear_direction(self, active: wp.array) -> None:
+        self.launch(self.pcg.kernels.start, self.dim, [self.work.g, self.model.topology.free, active,
+                                                       self.work.direction, self.work.r])  # fmt: skip

@@ -1,0 +1,78 @@
+"""Preconditioned conjugate gradients on the matrix-free operator, per world, on the device."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from ..kernels.pcg import LANES, pcg_kernels
+from ..launch import Launcher
+from .preconditioner import Preconditioner
+from .residual import Residual
+
+if TYPE_CHECKING:
+    from ..model import Model
+    from ..workspace import Workspace
+
+__all__ = ["PCG"]
+
+
+class PCG:
+    """Solves H p = -g for the active worlds.
+
+    It starts from the Galerkin solution on the translations of the free groups and ends with the same correction, so
+    that a loose tolerance does not leak momentum. A direction of no positive curvature ends a solve with what it has.
+    """
+
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, residual: Residual, preconditioner: Preconditioner,
+        *, max_iterations: int, deflate: bool,
+    ) -> None:  # fmt: skip
+        self.model, self.work, self.launch = model, work, launch
+        self.residual = residual
+        self.preconditioner = preconditioner
+        self.kernels = pcg_kernels(model.dtype)
+        self.dim = (model.worlds, model.slots)
+        self.deflate = deflate and model.group_count > 0
+        work.pcg.max_iterations = max_iterations
+
+    def solve(self, active: wp.array) -> None:
+        """Put the direction into work.direction."""
+        m, w, k, launch = self.model, self.work, self.kernels, self.launch
+        launch(k.start, self.dim, [w.g, m.topology.free, active, w.direction, w.r])
+        self._translate(active)
+        self._precondition(active)
+        w.pcg.any_active.zero_()
+        launch(k.begin, m.worlds, [w.newton, w.pcg])
+        launch(self.residual.newton.copy_active, self.dim, [w.z, w.pcg.active, w.p])
+        wp.capture_while(w.pcg.any_active, self._iterate)
+        self._translate(active)
+
+    def _iterate(self) -> None:
+        m, w, k, launch = self.model, self.work, self.kernels, self.launch
+        active = w.pcg.active
+        self.residual.product(w.p, w.Hp, active)
+        self.residual.reduce(w.rows, 1, active, w.pcg.sums)
+        launch(k.step_length, m.worlds, [w.pcg])
+        launch(k.update, self.dim, [w.pcg, w.p, w.Hp, w.direction, w.r])
+        self._precondition(active)
+        launch(k.direction_factor, m.worlds, [w.pcg])
+        launch(k.new_direction, self.dim, [w.pcg, active, w.z, w.p])
+
+    def _precondition(self, active: wp.array) -> None:
+        w = self.work
+        self.preconditioner.apply(w.r, w.z, active)
+        self.residual.reduce(w.rows, 1, active, w.pcg.sums)
+
+    def _translate(self, active: wp.array) -> None:
+        """x += Z (Z^T H Z)^-1 Z^T r."""
+        if not self.deflate:
+            return
+        m, w, k, launch = self.model, self.work, self.kernels, self.launch
+        mass = w.step.mass_factor
+        launch(k.group_partial, (m.worlds, m.group_count, LANES), [m.groups, w.r, active, w.group_partial])
+        args = [m.groups, w.group_partial, mass, active, w.group_velocity]
+        launch(k.group_velocity, (m.worlds, m.group_count), args)
+        args = [m.groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
+        launch(k.translate_groups, self.dim, args)

@@ -1,0 +1,107 @@
+"""Evaluation of the step's residual, Eq. (17), and of the operator H v, for the worlds whose flag is set."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from ..kernels.gather import RESIDUAL_ROWS, gather_kernels
+from ..kernels.newton import newton_kernels
+from ..kernels.reduce import CHUNK, reduce_kernels
+
+if TYPE_CHECKING:
+    from ..launch import Launcher
+    from ..model import Model
+    from ..workspace import Workspace
+
+__all__ = ["Reducer", "Residual"]
+
+
+class Reducer:
+    """Sums rows [row, world, item] into [row, world], in an order that depends on the row's length alone."""
+
+    def __init__(self, launch: Launcher, work: Workspace, worlds: int) -> None:
+        self.launch = launch
+        self.work = work
+        self.worlds = worlds
+        self.kernels = reduce_kernels()
+
+    def __call__(self, rows: wp.array, count: int, active: wp.array, out: wp.array) -> None:
+        """out[k] = sum of rows[k], k < count, in the active worlds."""
+        n = rows.shape[2]
+        if n > CHUNK:
+            partial = self.work.partial
+            self.launch.tiled(
+                self.kernels.partial_sums, (count, self.worlds, -(-n // CHUNK)), [rows, active, partial]
+            )
+            rows = partial
+        self.launch.tiled(self.kernels.final_sums, (count, self.worlds), [rows, active, out])
+
+
+class Residual:
+    """Launches that evaluate g(v), Phi(v), the norms, and H p."""
+
+    def __init__(self, model: Model, work: Workspace, launch: Launcher) -> None:
+        self.model = model
+        self.work = work
+        self.launch = launch
+        self.reduce = Reducer(launch, work, model.worlds)
+        self.gather = gather_kernels(model.dtype, model.loads.nonpotential)
+        self.newton = newton_kernels(model.dtype)
+        self.dim = (model.worlds, model.slots)
+
+    def evaluate(self, active: wp.array) -> None:
+        """q, forces, g and all sums at the iterate v."""
+        m, w, launch = self.model, self.work, self.launch
+        launch(self.newton.reset_min_J, m.worlds, [w.newton, active])
+        launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
+        for block in m.blocks:
+            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, w.contribution, w.energy_rows, w.newton.min_J]
+            launch(block.kernels.internal_force, (m.worlds, block.count), args)
+        self.push(active)
+        args = [m.topology, w.contribution, w.v, w.v_tilde, w.dead, w.dead_magnitude, w.pushed, w.pushed_held]
+        args += [w.direction, w.diagonal, w.u, w.step.mass_factor, w.step.dq_dv, active]
+        launch(self.gather.residual, self.dim, [*args, w.inertia, w.internal, w.g, w.rows])
+        self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
+        self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
+
+    def push(self, active: wp.array) -> None:
+        """Forces without a potential at the iterate: fields b(r, t) and follower pressure."""
+        m, w, launch = self.model, self.work, self.launch
+        loads = m.loads
+        if not loads.nonpotential:
+            return
+        for part in loads.pressures:
+            args = [part.conn, part.law, part.shape, part.d_xi, part.d_eta, part.weight, m.reference_device, w.u]
+            args += [w.law_value, part.offset, active, w.pushed_contribution]
+            launch(loads.kernels.follower_pressure, (m.worlds, part.count), args)
+        for field in loads.fields:
+            args = [field.block.data, field.members, m.reference_device, field.origin, w.u, w.step.new_time]
+            args += [w.step.ramp, active, field.offset, w.pushed_contribution]
+            launch(field.kernel, (m.worlds, field.count), args)
+        launch(self.gather.gather_force, self.dim, [loads.pushed_topology, w.pushed_contribution, active, w.pushed])
+
+    def hold_pushed(self, active: wp.array) -> None:
+        """From here on Phi holds the non-potential forces of this iterate."""
+        if self.model.loads.nonpotential:
+            args = [self.work.pushed, active, self.work.pushed_held]
+            self.launch(self.newton.copy_active, self.dim, args)
+
+    def blocks(self, active: wp.array) -> None:
+        """Diagonal blocks of H at the iterate: D for the norms, inverses for the preconditioner."""
+        m, w, launch = self.model, self.work, self.launch
+        for block in m.blocks:
+            args = [block.data, w.u, w.step.dq_dv, active, w.block_contribution]
+            launch(block.kernels.diagonal_blocks, (m.worlds, block.count), args)
+        args = [m.topology, w.block_contribution, w.step.mass_factor, w.step.dq_dv, active, w.diagonal, w.inverse]
+        launch(self.gather.gather_blocks, self.dim, args)
+
+    def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
+        """out = H p at the iterate, and p.Hp per slot in rows[0]."""
+        m, w, launch = self.model, self.work, self.launch
+        for block in m.blocks:
+            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
+            launch(block.kernels.tangent_product, (m.worlds, block.count), args)
+        args = [m.topology, w.contribution, p, w.step.mass_factor, w.step.dq_dv, active, out, w.rows]
+        launch(self.gather.product, self.dim, args)

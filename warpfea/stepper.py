@@ -1,0 +1,217 @@
+"""One step on the device: predict, solve, accept or halve, book the energy, report. Recorded once, then replayed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from .integrators import Integrator
+from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_kernels
+from .launch import Launcher
+from .solvers.newton import NewtonLoop, NewtonPCG
+from .state import State
+from .workspace import Workspace
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["Stepper"]
+
+
+class Stepper:
+    """The launches of a step of all worlds, and the graph that replays them.
+
+    The host writes `work.step.dt` and reads `work.report`; everything between stays on the device.
+    """
+
+    def __init__(
+        self, model: Model, state: State, integrator: Integrator, solver: NewtonPCG, *, ledger: bool, capture: bool
+    ) -> None:
+        self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
+        self.ledger = ledger
+        self.launch = Launcher(model.device)
+        self.kernels = step_kernels(model.dtype, integrator.coefficients, integrator.static, integrator.multistep)
+        vec3 = model.types.vec3
+        if integrator.multistep:
+            state.register("previous_displacement", vec3, (model.slots,))
+            state.register("previous_velocity", vec3, (model.slots,))
+            state.register("previous_step", wp.float64)
+        if ledger:
+            state.register("ledger", wp.float64, (len(LEDGER),))
+        state.register("status", wp.int32)
+        self.work = Workspace(model, integrator, max_newton=solver.max_newton, ledger=ledger)
+        self.newton = NewtonLoop(model, self.work, self.launch, solver, inertia=not integrator.static)
+        self.dim = (model.worlds, model.slots)
+        self.running = self.work.any_flag[2:3]
+        self._bind()
+        self.backup = state.like() if solver.max_halvings > 0 else None
+        if ledger:
+            self.begin_ledger(~self.state.ledger.numpy().any(axis=1))
+        self.graph = self._record() if capture else None
+
+    def _bind(self) -> None:
+        w, state = self.work, self.state
+        w.step.time = state.time
+        w.step.status = state.status
+        w.step.gravity = self.model.loads.gravity
+        w.step.any_running = self.running
+        w.step.max_halvings = self.solver.max_halvings
+        if self.integrator.multistep:
+            w.step.previous_h = state.previous_step
+        self.u_before = state.previous_displacement if self.integrator.multistep else state.displacement
+        self.v_before = state.previous_velocity if self.integrator.multistep else state.velocity
+
+    def begin_ledger(self, mask: np.ndarray) -> None:
+        """Write the energies of the present state into the ledger of the chosen worlds."""
+        m = self.model
+        rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
+        kernel = self.newton.residual.gather.mass_product
+        Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
+        u = self.state.displacement.numpy().astype(float)
+        fresh = np.zeros((m.worlds, len(LEDGER)))
+        fresh[:, 0] = rows.numpy()[0].sum(axis=1)
+        fresh[:, 1] = m.strain_energy(self.state)
+        fresh[:, 2] = -np.einsum("bc,s,bsc->b", m.loads.gravity_host, m.lumped_host, u)
+        ledger = self.state.ledger.numpy()
+        ledger[mask] = fresh[mask]
+        self.state.ledger.assign(ledger)
+
+    def _record(self) -> wp.Graph:
+        self._load_modules()
+        with wp.ScopedCapture(device=self.model.device) as capture:
+            self.sequence()
+        return capture.graph
+
+    def modules(self) -> list[wp.Module]:
+        """Modules a step launches, found by recording the launches without doing them."""
+        from .kernels.gather import gather_kernels
+        from .kernels.newton import newton_kernels
+        from .kernels.pcg import pcg_kernels
+        from .kernels.reduce import reduce_kernels
+        from .kernels.state import state_kernels
+
+        m = self.model
+        out = {b.kernels.module for b in m.blocks} | {self.kernels.module, reduce_kernels().module}
+        out |= {gather_kernels(m.dtype, m.loads.nonpotential).module, newton_kernels(m.dtype).module}
+        out |= {pcg_kernels(m.dtype).module, m.loads.kernels.module, state_kernels().module}
+        out |= {f.kernel.module for f in m.loads.fields} | {k.module for k, _ in m.loads.function_laws}
+        return sorted(out, key=lambda module: module.name)
+
+    def _load_modules(self) -> None:
+        for module in self.modules():
+            module.load(self.model.device)
+
+    def run(self) -> None:
+        """Do one step of every running world."""
+        if self.graph is not None:
+            wp.capture_launch(self.graph)
+        else:
+            self.sequence()
+
+    # the sequence of launches
+
+    def sequence(self) -> None:
+        """All launches of a step."""
+        m, w, launch = self.model, self.work, self.launch
+        self.running.zero_()
+        launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
+        wp.capture_while(self.running, self._attempt)
+        if self.backup is not None:
+            launch(self.kernels.failed_now, m.worlds, [w.step, w.newton.active])
+            self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
+        launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
+        if m.probes:
+            self._probe()
+
+    def _attempt(self) -> None:
+        m, w, launch, state = self.model, self.work, self.launch, self.state
+        launch(self.kernels.begin_attempt, m.worlds, [w.step, w.newton])
+        running = w.step.running
+        args = [w.step, m.is_position, m.topology.free, state.displacement, state.velocity, self.u_before, self.v_before]
+        launch(self.kernels.predict, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
+        self._loads(running)
+        self._damping(running)
+        self.newton.run()
+        launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
+        if self.backup is not None:
+            # before the first halving the state is still that of the step's start: keep it
+            self.backup.copy_rows(launch, w.step.first_refusal, state)
+        if self.ledger:
+            self._book()
+        args = [w.step, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
+        launch(self.kernels.commit, self.dim, args)
+
+    def _loads(self, active: wp.array) -> None:
+        m, w, launch, loads = self.model, self.work, self.launch, self.model.loads
+        k = loads.kernels
+        if loads.law_count:
+            launch(
+                k.evaluate_laws, (m.worlds, loads.law_count), [loads.laws, w.step.new_time, w.step.ramp, active, w.law_value]
+            )
+            for kernel, law in loads.function_laws:
+                launch(kernel, m.worlds, [law, w.step.new_time, active, w.law_value])
+        if loads.has_dead:
+            args = [loads.dead_start, loads.dead_law, loads.dead_weight, w.law_value, m.lumped, loads.gravity]
+            launch(k.dead_load, self.dim, [*args, w.step.ramp, active, w.dead, w.dead_magnitude])
+        if loads.moved:
+            d = loads.moved
+            args = [d.slot, d.law, d.components, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
+            launch(k.drive_displacement, (m.worlds, d.count), args)
+        if loads.turned:
+            d = loads.turned
+            args = [d.slot, d.law, d.components, d.arm, d.axis, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
+            launch(k.drive_rotation, (m.worlds, d.count), args)
+
+    def _damping(self, active: wp.array) -> None:
+        m, w, launch, state = self.model, self.work, self.launch, self.state
+        explicit = False
+        for block in m.blocks:
+            dim = (m.worlds, block.count)
+            if block.key.damping == "incremental":
+                args = [block.data, state.displacement, self.u_before, w.step.a0, w.step.a1, active, w.history]
+                launch(block.kernels.strain_history, dim, args)
+            elif block.key.damping == "explicit" and not self.integrator.static:
+                args = [block.data, state.displacement, state.velocity, active, w.contribution, w.explicit_power]
+                launch(block.kernels.viscous_force, dim, args)
+                explicit = True
+        if explicit:
+            gather = self.newton.residual.gather
+            self._gather_explicit(gather.gather_force, active)
+
+    def _gather_explicit(self, kernel: wp.Kernel, active: wp.array) -> None:
+        m, w, launch = self.model, self.work, self.launch
+        launch(kernel, self.dim, [m.topology, w.contribution, active, w.explicit])
+        launch(m.loads.kernels.add_explicit, self.dim, [w.explicit, active, w.dead])
+
+    def _book(self) -> None:
+        m, w, launch, state = self.model, self.work, self.launch, self.state
+        accepted = w.step.accepted
+        reduce = self.newton.residual.reduce
+        topo = m.topology
+        args = [w.step, topo.mass_start, topo.mass_column, topo.mass_value, topo.free, m.lumped, w.u, w.v]
+        args += [state.displacement, state.velocity, w.inertia, w.internal, w.dead, w.g, w.rows]
+        launch(self.kernels.ledger_rows, self.dim, args)
+        reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
+        if any(b.key.damping == "explicit" for b in m.blocks):
+            args = [w.explicit, w.u, state.displacement, accepted, w.rows]
+            launch(m.loads.kernels.work_rows, self.dim, args)
+            reduce(w.rows, 1, accepted, w.explicit_work)
+        args = [w.step, w.newton, w.ledger_sums, w.explicit_work[0], state.ledger]
+        launch(self.kernels.ledger_update, m.worlds, args)
+
+    def _probe(self) -> None:
+        m, w = self.model, self.work
+        if not hasattr(self, "_probe_tables"):
+            start = np.concatenate([[0], np.cumsum([len(p.slots) for p in m.probes])])
+            slot = np.concatenate([p.body.slot_offset + p.slots for p in m.probes])
+            weight = np.concatenate([p.weights for p in m.probes])
+            device = m.device
+            self._probe_tables = [
+                wp.array(start, dtype=wp.int32, device=device),
+                wp.array(slot, dtype=wp.int32, device=device),
+                wp.array(weight, dtype=m.types.T, device=device),
+            ]
+        args = [*self._probe_tables, self.state.displacement, self.state.velocity, len(REPORT), w.report]
+        self.launch(self.kernels.probe_values, (m.worlds, len(m.probes)), args)

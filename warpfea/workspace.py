@@ -1,0 +1,82 @@
+"""All arrays that a step writes, allocated once when the simulation is made."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from .integrators import Integrator
+from .kernels.gather import RESIDUAL_ROWS
+from .kernels.newton import control_struct
+from .kernels.pcg import LANES, pcg_struct
+from .kernels.reduce import CHUNK
+from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_struct
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["Workspace"]
+
+
+class Workspace:
+    """Scratch of a simulation. Features that a scene does not use get an array of one item."""
+
+    def __init__(self, model: Model, integrator: Integrator, *, max_newton: int, ledger: bool) -> None:
+        self.device = model.device
+        self.bytes: dict[str, int] = {}
+        B, n, vec3 = model.worlds, model.slots, model.types.vec3
+        field = lambda name: self.array(name, (B, n), vec3)  # noqa: E731
+        for name in ("v", "u", "q_tilde", "v_tilde", "base", "direction", "r", "z", "p", "Hp"):
+            setattr(self, name, field(name))
+        for name in ("g", "inertia", "internal", "dead", "dead_magnitude", "diagonal"):
+            setattr(self, name, field(name))
+        loads = model.loads
+        self.inverse = self.array("inverse", (B, n), model.types.mat33)
+        self.contribution = self.array("contribution", (B, model.contributions), vec3)
+        self.block_contribution = self.array("block_contribution", (B, model.contributions), model.types.sym)
+        none = self.array("none", (1, 1), vec3)
+        pushed = loads.nonpotential
+        self.pushed = field("pushed") if pushed else none
+        self.pushed_held = field("pushed_held") if pushed else none
+        self.pushed_contribution = self.array("pushed_contribution", (B, loads.pushed_entries), vec3) if pushed else none
+        forms = {b.key.damping for b in model.blocks}
+        self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
+        self.explicit = field("explicit") if "explicit" in forms else none
+        self.explicit_power = self.array(
+            "explicit_power", (B, model.element_count) if "explicit" in forms else (1, 1), wp.float64
+        )
+        self.explicit_work = self.array("explicit_work", (1, B), wp.float64)
+        self.rows = self.array("rows", (RESIDUAL_ROWS, B, n), wp.float64)
+        self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
+        longest = max(n, model.element_count)
+        chunks = -(-longest // CHUNK) if longest > CHUNK else 1
+        self.partial = self.array("partial", (RESIDUAL_ROWS, B, chunks), wp.float64)
+        self.law_value = self.array("law_value", (B, max(loads.law_count, 1)), wp.vec3d)
+        self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), LANES), vec3)
+        self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
+        self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
+        self.report = self.array("report", (B, len(REPORT) + 6 * len(model.probes)), wp.float64)
+        self.any_flag = self.array("any_flag", (4,), wp.int32)
+        self.newton = self._struct(control_struct(), B, history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B))
+        self.pcg = self._struct(pcg_struct(), B, sums=(1, B))
+        self.step = self._struct(step_struct(), B)
+        self.all_worlds = self.array("all_worlds", (B,), wp.int32)
+        self.all_worlds.fill_(1)
+        assert len(LEDGER)
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """Zeroed array; its bytes are counted."""
+        out = wp.zeros(shape, dtype=dtype, device=self.device)
+        self.bytes[name] = int(np.prod(shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
+        return out
+
+    def _struct(self, kind: Any, worlds: int, **shapes: tuple[int, ...]) -> Any:
+        """A control struct with an array [world] for each array field, unless a shape is given."""
+        out = kind()
+        special = {"elem_sums": (2, worlds), "slope_sum": (1, worlds), "any_active": (1,), "any_running": (1,)} | shapes
+        for name, var in kind.vars.items():
+            if isinstance(var.type, wp.array):
+                setattr(out, name, self.array(f"{kind.key}.{name}", special.get(name, (worlds,)), var.type.dtype))
+        return out
