@@ -101,14 +101,14 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def add_explicit(
-        explicit: wp.array2d(dtype=vec3),
+        explicit_force: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
         force: wp.array2d(dtype=vec3),
     ):
         """Dead force -= explicit internal force."""
         world, slot = wp.tid()
         if active[world] != 0:
-            force[world, slot] = force[world, slot] - explicit[world, slot]
+            force[world, slot] = force[world, slot] - explicit_force[world, slot]
 
     @wp.kernel(module=module)
     def drive_displacement(

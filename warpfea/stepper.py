@@ -46,6 +46,7 @@ class Stepper:
         self.dim = (model.worlds, model.slots)
         self.running = self.work.any_flag[2:3]
         self._bind()
+        self._probe_tables = self._upload_probes() if model.probes else []
         self.backup = state.like() if solver.max_halvings > 0 else None
         if ledger:
             self.begin_ledger(~self.state.ledger.numpy().any(axis=1))
@@ -201,17 +202,15 @@ class Stepper:
         args = [w.step, w.newton, w.ledger_sums, w.explicit_work[0], state.ledger]
         launch(self.kernels.ledger_update, m.worlds, args)
 
+    def _upload_probes(self) -> list[wp.array]:
+        m = self.model
+        start = np.concatenate([[0], np.cumsum([len(p.slots) for p in m.probes])])
+        slot = np.concatenate([p.body.slot_offset + p.slots for p in m.probes])
+        weight = np.concatenate([p.weights for p in m.probes])
+        values = ((start, wp.int32), (slot, wp.int32), (weight, m.types.T))
+        return [wp.array(a, dtype=dtype, device=m.device) for a, dtype in values]
+
     def _probe(self) -> None:
         m, w = self.model, self.work
-        if not hasattr(self, "_probe_tables"):
-            start = np.concatenate([[0], np.cumsum([len(p.slots) for p in m.probes])])
-            slot = np.concatenate([p.body.slot_offset + p.slots for p in m.probes])
-            weight = np.concatenate([p.weights for p in m.probes])
-            device = m.device
-            self._probe_tables = [
-                wp.array(start, dtype=wp.int32, device=device),
-                wp.array(slot, dtype=wp.int32, device=device),
-                wp.array(weight, dtype=m.types.T, device=device),
-            ]
         args = [*self._probe_tables, self.state.displacement, self.state.velocity, len(REPORT), w.report]
         self.launch(self.kernels.probe_values, (m.worlds, len(m.probes)), args)
