@@ -49,6 +49,8 @@ def control_struct():
         norm: wp.array(dtype=wp.float64)  # |g| in the D^-1 norm
         scale: wp.array(dtype=wp.float64)  # what it is compared with
         accept: wp.array(dtype=wp.float64)  # norm at which the iteration ends
+        floor: wp.array(dtype=wp.float64)  # norm that the rounding of the positions alone may cause
+        reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
         forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
         min_J: wp.array(dtype=wp.float64)
         history: wp.array2d(dtype=wp.float64)  # [world, iteration] norm / scale
@@ -91,8 +93,8 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         scale = wp.sqrt(biggest)
         ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
         ctl.scale[world] = scale
-        rounding = ctl.eps * (f64(FLOOR) * scale + f64(2.0) * wp.sqrt(ctl.slot_sums[8, world]))
-        ctl.accept[world] = ctl.tol * scale + rounding
+        ctl.accept[world] = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
+        ctl.floor[world] = f64(2.0) * ctl.eps * wp.sqrt(ctl.slot_sums[8, world])
 
     @wp.func
     def record(ctl: Control, world: int):
@@ -102,9 +104,10 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def settle(ctl: Control, world: int):
-        """End the iteration where it has converged or used up its iterations."""
+        """End the iteration where it has converged, stands still within rounding, or used up its iterations."""
         record(ctl, world)
-        if ctl.norm[world] <= ctl.accept[world]:
+        stalled = ctl.iterations[world] > 0 and ctl.reduction[world] > f64(0.5)
+        if ctl.norm[world] <= ctl.accept[world] or (stalled and ctl.norm[world] <= ctl.floor[world]):
             ctl.active[world] = 0
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
@@ -112,9 +115,12 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def fail(ctl: Control, world: int, why: int):
+        """End without convergence, unless rounding alone explains what is left of the residual."""
         ctl.active[world] = 0
         ctl.searching[world] = 0
-        ctl.failed[world] = why
+        within = ctl.norm[world] <= ctl.floor[world] and ctl.iterations[world] > 0
+        if not (within and why != FAIL_NAN):
+            ctl.failed[world] = why
 
     @wp.kernel(module=module)
     def reset_min_J(ctl: Control, active: wp.array(dtype=wp.int32)):
@@ -188,6 +194,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             ctl.iterations[world] = ctl.iterations[world] + 1
             ctl.total_iterations[world] = ctl.total_iterations[world] + 1
             ratio = norm / wp.max(old_norm, f64(1.0e-300))
+            ctl.reduction[world] = ratio
             eta = f64(0.9) * ratio * ratio
             guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
             if guard > f64(0.1):
