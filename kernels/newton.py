@@ -140,10 +140,10 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = magnitude(ctl, world)
         ctl.forcing[world] = f64(0.1)
-        if not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
-            fail(ctl, world, FAIL_NAN)
-        elif ctl.need_positive_J != 0 and ctl.min_J[world] <= f64(0.0):
+        if ctl.need_positive_J != 0 and ctl.min_J[world] <= f64(0.0):
             fail(ctl, world, FAIL_JACOBIAN)
+        elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
+            fail(ctl, world, FAIL_NAN)
         else:
             settle(ctl, world)
 

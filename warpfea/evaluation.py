@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from .assembly import CHUNK, geometry, gradients
 from .kernels.gather import gather_kernels
 from .kernels.types import precision
 from .launch import Launcher
@@ -138,6 +139,29 @@ class Evaluation:
                 for b in range(m.worlds):
                     np.add.at(total[b], cells, at_nodes[b] * v[:, None, None])
         return total / np.where(weight > 0.0, weight, 1.0)[None, :, None]
+
+
+def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
+    """Model index and description of the element with the smallest J at points and vertices; u (slots, 3), m."""
+    best, index, text = np.inf, -1, "no element"
+    for block in model.blocks:
+        first = block.element_offset
+        for part in block.parts:
+            body = part.body
+            rule = body.family.rules[body.rule]
+            points = np.vstack([rule.points, body.family.vertices])
+            for k in range(0, len(part.elements), CHUNK):
+                members = part.elements[k : k + CHUNK]
+                _, ds, J0, _ = geometry(body, members, points)
+                U = u[body.slot_offset + body.connectivity[members]]
+                F = np.eye(3) + np.einsum("esk,eqsl->eqkl", U, gradients(ds, J0))
+                J = np.linalg.det(F).min(axis=1)
+                low = int(np.argmin(np.where(np.isnan(J), -np.inf, J)))
+                if not J[low] >= best:
+                    best, index = float(J[low]), first + k + low
+                    text = f"element {int(members[low])} of body {body.name!r} (J = {best:.3g})"
+            first += len(part.elements)
+    return index, text
 
 
 def _extrapolation(points: np.ndarray, nodes: np.ndarray) -> np.ndarray:

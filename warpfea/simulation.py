@@ -16,7 +16,7 @@ import numpy as np
 from . import integrators
 from .bodies import Body, NodeSet
 from .errors import ConvergenceError, ModelError
-from .evaluation import von_mises
+from .evaluation import lowest_jacobian, von_mises
 from .kernels.newton import FAIL_CURVATURE, FAIL_ITERATIONS, FAIL_JACOBIAN, FAIL_LINE_SEARCH, FAIL_NAN
 from .kernels.step import LEDGER, REPORT, STATUS
 from .solvers import NewtonPCG
@@ -213,7 +213,10 @@ class Simulation:
         code = int(self.last.failure[world])
         count = int(work.newton.iterations.numpy()[world]) + 1
         history = work.newton.history.numpy()[world, :count].tolist()
-        element, where = self._worst_element(world)
+        if code == FAIL_JACOBIAN:
+            element, where = lowest_jacobian(self.model, work.u.numpy()[world].astype(float))
+        else:
+            element, where = self._worst_element(world)
         time = float(self.last.time[world])
         status = self.state.status.numpy()
         status[status == STATUS["failed"]] = STATUS["running"]
