@@ -32,9 +32,9 @@ class Reducer:
         n = rows.shape[2]
         if n > CHUNK:
             partial = self.work.partial
-            self.launch.tiled(
-                self.kernels.partial_sums, (count, self.worlds, -(-n // CHUNK)), [rows, active, partial]
-            )
+            # every chunk of the scratch is written: those beyond the row's end with zeros
+            dim = (count, self.worlds, partial.shape[2])
+            self.launch.tiled(self.kernels.partial_sums, dim, [rows, active, partial])
             rows = partial
         self.launch.tiled(self.kernels.final_sums, (count, self.worlds), [rows, active, out])
 
