@@ -8,11 +8,13 @@ import warp as wp
 from .types import kernel_module, precision
 
 __all__ = [
+    "COMPONENT_ROWS",
     "FAIL_CURVATURE",
     "FAIL_ITERATIONS",
     "FAIL_JACOBIAN",
     "FAIL_LINE_SEARCH",
     "FAIL_NAN",
+    "LANES",
     "control_struct",
     "newton_kernels",
 ]
@@ -25,6 +27,8 @@ FAIL_CURVATURE = 5
 
 ARMIJO = 1.0e-4
 WOLFE = 0.8
+COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
+LANES = 32
 NOISE = 100.0  # Phi is blind below this many roundings of its parts
 FLOOR = 16.0
 MAX_SEARCH = 20
@@ -47,9 +51,13 @@ def control_struct():
         phi_magnitude: wp.array(dtype=wp.float64)
         slope: wp.array(dtype=wp.float64)  # g.p at the iterate
         norm: wp.array(dtype=wp.float64)  # |g| in the D^-1 norm
-        scale: wp.array(dtype=wp.float64)  # what it is compared with
-        accept: wp.array(dtype=wp.float64)  # norm at which the iteration ends
-        floor: wp.array(dtype=wp.float64)  # norm that the rounding of the positions alone may cause
+        relative: wp.array(dtype=wp.float64)  # |g| over the largest force, of the worst component
+        excess: wp.array(dtype=wp.float64)  # largest norm over accepted norm of the components
+        floor_excess: wp.array(dtype=wp.float64)  # the same over what rounding of positions alone may cause
+        solve_norm: wp.array(dtype=wp.float64)  # |g| of the components that are not converged
+        solve_accept: wp.array(dtype=wp.float64)  # smallest accepted norm among them
+        component_sums: wp.array3d(dtype=wp.float64)  # [COMPONENT_ROWS, world, component], with several components
+        quiet: wp.array2d(dtype=wp.int32)  # [world, component] converged
         reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
         forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
         min_J: wp.array(dtype=wp.float64)
@@ -61,6 +69,7 @@ def control_struct():
         tol: wp.float64
         eps: wp.float64
         max_iterations: wp.int32
+        components: wp.int32
         need_positive_J: wp.int32
         nonpotential: wp.int32
 
@@ -88,26 +97,57 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def measure(ctl: Control, world: int):
-        """Norm, scale and acceptance threshold of the residual just evaluated."""
-        biggest = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
-        scale = wp.sqrt(biggest)
+        """Norms and acceptance of the residual just evaluated, for each component apart where there are several.
+
+        Components that do not touch must not hide behind each other's forces, and a converged one is left alone.
+        """
+        largest = f64(0.0)
+        excess = f64(0.0)
+        floor_excess = f64(0.0)
+        solve = f64(0.0)
+        solve_accept = f64(1.0e300)
+        for c in range(ctl.components):
+            g2 = ctl.slot_sums[0, world]
+            f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
+            spread = ctl.slot_sums[8, world]
+            if ctl.components > 1:
+                g2 = ctl.component_sums[0, world, c]
+                f2 = wp.max(
+                    ctl.component_sums[1, world, c],
+                    wp.max(ctl.component_sums[2, world, c], ctl.component_sums[3, world, c]),
+                )
+                spread = ctl.component_sums[4, world, c]
+            norm = wp.sqrt(g2)
+            scale = wp.sqrt(f2)
+            accept = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
+            loud = norm > accept
+            ctl.quiet[world, c] = wp.where(loud, 0, 1)
+            if loud:
+                solve += g2
+                solve_accept = wp.min(solve_accept, accept)
+                floor_excess = wp.max(floor_excess, norm / (f64(2.0) * ctl.eps * wp.sqrt(spread) + f64(1.0e-300)))
+            ratio = norm / wp.max(scale, f64(1.0e-300))
+            largest = wp.max(largest, ratio)
+            excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))
         ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
-        ctl.scale[world] = scale
-        ctl.accept[world] = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
-        ctl.floor[world] = f64(2.0) * ctl.eps * wp.sqrt(ctl.slot_sums[8, world])
+        ctl.relative[world] = largest
+        ctl.excess[world] = excess
+        ctl.floor_excess[world] = floor_excess
+        ctl.solve_norm[world] = wp.sqrt(solve)
+        ctl.solve_accept[world] = solve_accept
 
     @wp.func
     def record(ctl: Control, world: int):
         k = ctl.iterations[world]
         if k < ctl.history.shape[1]:
-            ctl.history[world, k] = ctl.norm[world] / wp.max(ctl.scale[world], f64(1.0e-300))
+            ctl.history[world, k] = ctl.relative[world]
 
     @wp.func
     def settle(ctl: Control, world: int):
         """End the iteration where it has converged, stands still within rounding, or used up its iterations."""
         record(ctl, world)
         stalled = ctl.iterations[world] > 0 and ctl.reduction[world] > f64(0.5)
-        if ctl.norm[world] <= ctl.accept[world] or (stalled and ctl.norm[world] <= ctl.floor[world]):
+        if ctl.excess[world] <= f64(1.0) or (stalled and ctl.floor_excess[world] <= f64(1.0)):
             ctl.active[world] = 0
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
@@ -118,7 +158,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         """End without convergence, unless rounding alone explains what is left of the residual."""
         ctl.active[world] = 0
         ctl.searching[world] = 0
-        within = ctl.norm[world] <= ctl.floor[world] and ctl.iterations[world] > 0
+        within = ctl.floor_excess[world] <= f64(1.0) and ctl.iterations[world] > 0
         if not (within and why != FAIL_NAN):
             ctl.failed[world] = why
 
@@ -218,6 +258,38 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             wp.atomic_max(out, 0, 1)
 
     @wp.kernel(module=module)
+    def component_partial(
+        start: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        rows: wp.array3d(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        partial: wp.array4d(dtype=f64),
+    ):
+        """Strided partial sums of the residual's norms over the slots of a component."""
+        world, component, lane = wp.tid()
+        if active[world] == 0:
+            return
+        for row in range(COMPONENT_ROWS):
+            source = wp.where(row == 4, 8, row)
+            total = f64(0.0)
+            for k in range(start[component] + lane, start[component + 1], LANES):
+                total += rows[source, world, slot[k]]
+            partial[row, world, component, lane] = total
+
+    @wp.kernel(module=module)
+    def component_sum(
+        partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)
+    ):
+        """Sum of the lanes, in order."""
+        row, world, component = wp.tid()
+        if active[world] == 0:
+            return
+        total = f64(0.0)
+        for lane in range(LANES):
+            total += partial[row, world, component, lane]
+        out[row, world, component] = total
+
+    @wp.kernel(module=module)
     def update_position(
         q_tilde: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -270,6 +342,8 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         begin_search=begin_search,
         judge_trial=judge_trial,
         any_set=any_set,
+        component_partial=component_partial,
+        component_sum=component_sum,
         update_position=update_position,
         trial_velocity=trial_velocity,
         copy_active=copy_active,

@@ -82,6 +82,18 @@ def pcg_kernels(dtype: str) -> _types.SimpleNamespace:
             r[world, slot] = -wp.cw_mul(g[world, slot], free[slot])
 
     @wp.kernel(module=module)
+    def silence(
+        newton: Newton,
+        of_slot: wp.array(dtype=wp.int32),
+        active: wp.array(dtype=wp.int32),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """r = 0 on converged components: the iteration for the others must not move them."""
+        world, slot = wp.tid()
+        if active[world] != 0 and newton.quiet[world, of_slot[slot]] != 0:
+            r[world, slot] = vec3()
+
+    @wp.kernel(module=module)
     def block_jacobi(
         inverse: wp.array2d(dtype=mat33),
         r: wp.array2d(dtype=vec3),
@@ -108,7 +120,9 @@ def pcg_kernels(dtype: str) -> _types.SimpleNamespace:
         rz = ctl.sums[0, world]
         ctl.rz[world] = rz
         ctl.iterations[world] = 0
-        ctl.target[world] = wp.max(newton.forcing[world] * newton.norm[world], f64(0.1) * newton.accept[world])
+        ctl.target[world] = wp.max(
+            newton.forcing[world] * newton.solve_norm[world], f64(0.1) * newton.solve_accept[world]
+        )
         if rz > ctl.target[world] * ctl.target[world] and ctl.max_iterations > 0:
             ctl.active[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)
@@ -230,6 +244,7 @@ def pcg_kernels(dtype: str) -> _types.SimpleNamespace:
     return _types.SimpleNamespace(
         module=module,
         start=start,
+        silence=silence,
         block_jacobi=block_jacobi,
         begin=begin,
         step_length=step_length,

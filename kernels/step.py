@@ -327,7 +327,7 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         report[world, 0] = f64(step.status[world])
         report[world, 1] = f64(newton.total_iterations[world])
         report[world, 2] = f64(pcg.total[world])
-        report[world, 3] = newton.norm[world] / wp.max(newton.scale[world], f64(1.0e-300))
+        report[world, 3] = newton.relative[world]
         report[world, 4] = f64(step.halvings[world])
         report[world, 5] = step.total_J[world]
         report[world, 6] = step.time[world]

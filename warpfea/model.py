@@ -217,6 +217,13 @@ class Model:
             held = np.unique(label[self.free_host[:, c] == 0.0])
             free[held, c] = 0.0
         self.component = label
+        self.component_count = count
+        if count > 1:
+            order = np.argsort(label, kind="stable")
+            edges = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
+            self.component_start = self.array("components", edges, wp.int32)
+            self.component_slot = self.array("components", order, wp.int32)
+            self.component_of_slot = self.array("components", label, wp.int32)
         keep = np.flatnonzero(free.any(axis=1))
         self.group_count = len(keep)
         self.groups = groups_struct(self.dtype)()
@@ -282,6 +289,7 @@ class Model:
             "follower pressure": bool(d.pressures),
             "driven nodes": any(s.law or s.node_laws for s in d.supports),
             "free groups": self.group_count > 0,
+            "separate components": self.component_count > 1,
             "probes": bool(self.probes),
         }
 

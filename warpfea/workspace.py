@@ -9,8 +9,9 @@ import warp as wp
 
 from .integrators import Integrator
 from .kernels.gather import RESIDUAL_ROWS
-from .kernels.newton import control_struct
-from .kernels.pcg import LANES, pcg_struct
+from .kernels.newton import COMPONENT_ROWS, LANES, control_struct
+from .kernels.pcg import LANES as GROUP_LANES
+from .kernels.pcg import pcg_struct
 from .kernels.reduce import CHUNK
 from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_struct
 
@@ -54,12 +55,19 @@ class Workspace:
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
         self.partial = self.array("partial", (RESIDUAL_ROWS, B, chunks), wp.float64)
         self.law_value = self.array("law_value", (B, max(loads.law_count, 1)), wp.vec3d)
-        self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), LANES), vec3)
+        self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
         self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
         self.report = self.array("report", (B, len(REPORT) + 6 * len(model.probes)), wp.float64)
         self.any_flag = self.array("any_flag", (4,), wp.int32)
-        self.newton = self._struct(control_struct(), B, history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B))
+        C = model.component_count
+        sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
+        self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
+        self.newton = self._struct(
+            control_struct(), B,
+            history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
+        )  # fmt: skip
+        self.newton.components = C
         self.pcg = self._struct(pcg_struct(), B, sums=(1, B))
         self.step = self._struct(step_struct(), B)
         self.all_worlds = self.array("all_worlds", (B,), wp.int32)

@@ -41,6 +41,8 @@ class PCG:
         """Put the direction into work.direction."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         launch(k.start, self.dim, [w.g, m.topology.free, active, w.direction, w.r])
+        if m.component_count > 1:
+            launch(k.silence, self.dim, [w.newton, m.component_of_slot, active, w.r])
         self._translate(active)
         self._precondition(active)
         w.pcg.any_active.zero_()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..kernels.gather import RESIDUAL_ROWS, gather_kernels
-from ..kernels.newton import newton_kernels
+from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
 
 if TYPE_CHECKING:
@@ -65,6 +65,11 @@ class Residual:
         launch(self.gather.residual, self.dim, [*args, w.inertia, w.internal, w.g, w.rows])
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
+        if m.component_count > 1:
+            args = [m.component_start, m.component_slot, w.rows, active, w.component_partial]
+            launch(self.newton.component_partial, (m.worlds, m.component_count, LANES), args)
+            dim = (COMPONENT_ROWS, m.worlds, m.component_count)
+            launch(self.newton.component_sum, dim, [w.component_partial, active, w.newton.component_sums])
 
     def push(self, active: wp.array) -> None:
         """Forces without a potential at the iterate: fields b(r, t) and follower pressure."""

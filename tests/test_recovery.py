@@ -1,0 +1,135 @@
+"""Hard steps are recovered or refused by name, with the state as it was; NaN never leaves a step."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpfea as wf
+
+SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
+SOFT = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
+
+
+def box(material, cells=(4, 2, 2), **options):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    return b, b.add_solid(wf.mesh.box((1, 0.4, 0.4), cells=cells), material=material, **options)
+
+
+def bits(state):
+    return {name: array.tobytes() for name, array in state.numpy().items()}
+
+
+def test_inverted_start_is_refused_where_the_law_is_undefined():
+    b, body = box(SOFT, initial=lambda X: X * (-1.0, 1.0, 1.0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    before = bits(sim.state)
+    with pytest.raises(wf.ConvergenceError, match=r"J <= 0.*element \d+ of body 'box' \(J = -1\)") as caught:
+        sim.step()
+    assert bits(sim.state) == before
+    assert caught.value.world == 0
+    assert caught.value.time == 0.0
+    assert caught.value.element >= 0
+    assert caught.value.state is sim.state
+
+
+def test_inverted_start_of_svk_is_reported():
+    """SVK does not see a mirror image (E = 0): the step is accepted and the smallest J says so."""
+    b, body = box(SVK, initial=lambda X: X * (-1.0, 1.0, 1.0))
+    report = wf.Simulation(b.finalize(device="cpu"), dt=1e-3).step()
+    assert report.converged.all()
+    assert report.min_J[0] == pytest.approx(-1.0)
+
+
+def test_scrambled_start_settles():
+    rng = np.random.default_rng(0)
+    b, body = box(SVK)
+    noise = 0.05 * rng.standard_normal(body.mesh.points.shape)
+    b.set_initial(body, displacement=noise)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2)
+    start = sim.energies()["strain"][0]
+    report = sim.step(20)
+    assert report.converged.all()
+    assert sim.energies()["strain"][0] < 1e-3 * start
+
+
+@pytest.mark.parametrize("steps", [50, 5, 1])
+def test_svk_squeezed_to_three_tenths(steps):
+    b, body = box(SVK)
+    b.clamp(body.nodes("x-"))
+    b.drive(body.nodes("x+"), displacement=([0, 0.5], [(0, 0, 0), (-0.7, 0, 0)]))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=0.5 / steps)
+    before = bits(sim.state)
+    try:
+        for _ in range(steps):
+            before = bits(sim.state)
+            report = sim.step()
+        assert report.residual[0] < 1e-7
+        assert sim.positions(body)[0, body.nodes("x+").indices, 0] == pytest.approx(0.3)
+    except wf.ConvergenceError:
+        assert bits(sim.state) == before
+
+
+def test_impact_that_needs_halving_is_recovered():
+    b, body = box(SOFT)
+    b.clamp(body.nodes("x-"))
+    b.set_initial(body, velocity=(-30.0, 0, 0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2)
+    halvings = [int(sim.step().halvings[0]) for _ in range(5)]
+    assert max(halvings) > 0
+    assert sim.time[0] == pytest.approx(0.05, rel=1e-12)
+    e = sim.energies()
+    assert e["ledger_residual"][0] == pytest.approx(e["unbalanced"][0], abs=1e-9 * e["work_supports"][0] + 1e-6)
+
+
+def test_impact_beyond_recovery_leaves_the_state():
+    b, body = box(SOFT)
+    b.clamp(body.nodes("x-"))
+    b.set_initial(body, velocity=(-300.0, 0, 0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2)
+    sim.state.register("dummy", wp.float64, (2,), 3.0)
+    before = bits(sim.state)
+    with pytest.raises(wf.ConvergenceError, match="8 halvings"):
+        sim.step()
+    assert bits(sim.state) == before
+    sim.dt = 1e-6  # the refused step may be tried again
+    assert sim.step().converged.all()
+
+
+def test_partly_done_step_is_taken_back():
+    """A step whose first substep was accepted before a later one failed for good starts again from its own start."""
+    b, body = box(SOFT)
+    b.clamp(body.nodes("x-"))
+    # quiet for the first half of the step, then an impossible motion
+    b.drive(body.nodes("x+"), displacement=([0, 0.0099, 0.01], [(0, 0, 0), (0, 0, 0), (-3.0, 0, 0)]))
+    b.set_initial(body, velocity=(0.0, 0.0, 1.0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, solver=wf.NewtonPCG(max_halvings=3), integrator="bdf2")
+    before = bits(sim.state)
+    with pytest.raises(wf.ConvergenceError):
+        sim.step()
+    assert sim.stepper.work.step.accepted.numpy()[0] == 0
+    assert bits(sim.state) == before
+
+
+def test_nan_in_a_field_is_refused():
+    b, body = box(SVK)
+    b.add_body_force(bad_field)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    before = bits(sim.state)
+    with pytest.raises(wf.ConvergenceError, match="not finite"):
+        sim.step()
+    assert bits(sim.state) == before
+
+
+@wp.func
+def bad_field(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
+    return wp.vec3d(wp.sqrt(wp.float64(-1.0) - t), wp.float64(0.0), wp.float64(0.0))
+
+
+def test_iteration_caps_give_an_error_not_a_wrong_step():
+    b, body = box(SVK)
+    b.clamp(body.nodes("x-"))
+    b.set_initial(body, velocity=(0.0, 0.0, 5.0))
+    model = b.finalize(device="cpu")
+    sim = wf.Simulation(model, dt=1e-2, solver=wf.NewtonPCG(max_newton=1, max_pcg=3, max_halvings=2))
+    with pytest.raises(wf.ConvergenceError, match="did not converge after 2 halvings"):
+        sim.step()
