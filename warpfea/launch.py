@@ -33,5 +33,6 @@ class Launcher:
 
     def _count(self, kernel: wp.Kernel) -> None:
         self.launches += 1
-        self.kernels.add(f"{kernel.module.name.removeprefix('warpfea.kernels.')}.{kernel.key}")
+        name = kernel.key.rsplit("__locals__", 1)[-1]
+        self.kernels.add(f"{kernel.module.name.removeprefix('warpfea.kernels.')}.{name}")
         self.modules.add(kernel.module.name)
