@@ -4,36 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh.cells import TET_EDGES, barycentric, tet4_gradients, tet10_gradients
 from .family import Family, register
 from .quadrature import TET_RULES, conical_tet
 
 __all__ = ["T4", "T10"]
 
-EDGES = ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))
-
-_DL = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 _CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _bary(xi: np.ndarray) -> np.ndarray:
-    return np.column_stack([1.0 - xi.sum(axis=1), xi])
-
-
 def _shape4(xi: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    L = _bary(xi)
-    return L[None], np.broadcast_to(_DL, (len(xi), 4, 3))[None]
+    return barycentric(xi)[None], tet4_gradients(xi)[None]
 
 
 def _shape10(xi: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    L = _bary(xi)
-    s = np.empty((len(xi), 10))
-    ds = np.empty((len(xi), 10, 3))
-    s[:, :4] = L * (2.0 * L - 1.0)
-    ds[:, :4] = (4.0 * L - 1.0)[:, :, None] * _DL
-    for k, (a, b) in enumerate(EDGES, start=4):
-        s[:, k] = 4.0 * L[:, a] * L[:, b]
-        ds[:, k] = 4.0 * (L[:, a, None] * _DL[b] + L[:, b, None] * _DL[a])
-    return s[None], ds[None]
+    L = barycentric(xi)
+    a, b = TET_EDGES.T
+    return np.concatenate([L * (2.0 * L - 1.0), 4.0 * L[:, a] * L[:, b]], axis=1)[None], tet10_gradients(xi)[None]
 
 
 T10 = register(
@@ -47,7 +34,7 @@ T10 = register(
         curved_mass_rule=conical_tet(4),
         vertices=_CORNERS,
         affine=True,
-        node_points=np.vstack([_CORNERS, [(_CORNERS[a] + _CORNERS[b]) / 2 for a, b in EDGES]]),
+        node_points=np.vstack([_CORNERS, [(_CORNERS[a] + _CORNERS[b]) / 2 for a, b in TET_EDGES]]),
     )
 )
 

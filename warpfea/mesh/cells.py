@@ -55,7 +55,7 @@ class CellType:
         return self.nodes > self.corners
 
 
-_TET_EDGES = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)], dtype=np.int64)
+TET_EDGES = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)], dtype=np.int64)
 _TET_FACES = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], dtype=np.int64)
 _TET10_FACES = np.array(
     [(0, 2, 1, 6, 5, 4), (0, 1, 3, 4, 8, 7), (1, 2, 3, 5, 9, 8), (0, 3, 2, 7, 9, 6)], dtype=np.int64
@@ -63,20 +63,20 @@ _TET10_FACES = np.array(
 _DL = np.array([(-1.0, -1.0, -1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])  # dL_i/dxi
 
 
-def _barycentric(xi: Floats) -> Floats:
+def barycentric(xi: Floats) -> Floats:
     """Barycentric coordinates (P, 4) of xi (P, 3)."""
     return np.column_stack([1.0 - xi.sum(axis=1), xi])
 
 
-def _tet_gradients(xi: Floats) -> Floats:
+def tet4_gradients(xi: Floats) -> Floats:
     """ds_i/dxi of T4: (P, 4, 3)."""
     return np.broadcast_to(_DL, (len(xi), 4, 3))
 
 
-def _tet10_gradients(xi: Floats) -> Floats:
+def tet10_gradients(xi: Floats) -> Floats:
     """ds_i/dxi of T10, (P, 10, 3): corners s = L (2 L - 1), mid-edges s = 4 L_a L_b."""
-    lam = _barycentric(xi)
-    a, b = _TET_EDGES.T
+    lam = barycentric(xi)
+    a, b = TET_EDGES.T
     corner = (4.0 * lam - 1.0)[:, :, None] * _DL
     mid = 4.0 * (lam[:, a, None] * _DL[b] + lam[:, b, None] * _DL[a])
     return np.concatenate([corner, mid], axis=1)
@@ -112,8 +112,8 @@ _CHECKED = np.array(
 )
 
 CELL_TYPES: dict[str, CellType] = {
-    "tetra": CellType("tetra", 4, 4, _TET_EDGES, _TET_FACES, 3, _tet_gradients, _RULE1, _RULE1[0]),
-    "tetra10": CellType("tetra10", 10, 4, _TET_EDGES, _TET10_FACES, 3, _tet10_gradients, _RULE5, _CHECKED),
+    "tetra": CellType("tetra", 4, 4, TET_EDGES, _TET_FACES, 3, tet4_gradients, _RULE1, _RULE1[0]),
+    "tetra10": CellType("tetra10", 10, 4, TET_EDGES, _TET10_FACES, 3, tet10_gradients, _RULE5, _CHECKED),
 }
 ELEMENT_CELLS = {"T4": "tetra", "T10": "tetra10"}
 """Element name in the API -> cell type."""

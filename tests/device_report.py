@@ -1,0 +1,122 @@
+"""Compares the CPU and a CUDA device on the same scenes and writes what it finds.
+
+    python tests/device_report.py --out tests/results/device_agreement.json
+
+needs a CUDA device. `test_device.py` runs the same cases where there is one, and reads the committed file everywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import platform
+import subprocess
+import sys
+import time
+
+import numpy as np
+import warp as wp
+
+import warpfea as wf
+
+HERE = pathlib.Path(__file__).resolve().parent
+SVK = {"E": 1e6, "nu": 0.3, "density": 1000.0}
+DAMPING = {form: wf.KelvinVoigt(3e3, 4.5e3, form=form) for form in ("incremental", "rate", "explicit")}
+
+
+@wp.func
+def swirl(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
+    return wp.vec3d(-x[1], x[0], wp.sin(t))
+
+
+def s3_mesh():
+    """The S3 cantilever, from a file that needs no mesh reader."""
+    table = np.load(HERE / "data" / "S3_cantilever.npz")
+    return wf.mesh.Mesh(table["points"], table["cells"], "tetra10", name="s3")
+
+
+def cantilever(material=None, mesh=None, **options):
+    b = wf.ModelBuilder()
+    body = b.add_solid(mesh or s3_mesh(), material=material or wf.SVK(**SVK), name="s3", **options)
+    low = body.mesh.points[:, 0].min()
+    b.clamp(body.nodes(lambda X: X[:, 0] < low + 1e-9))
+    b.add_probe("tip", body.surface(lambda X: X[:, 0] > low + 0.5 - 1e-9))
+    return b, body
+
+
+def loaded():
+    """Every kind of load at once, on a curved body."""
+    b = wf.ModelBuilder()
+    mesh = wf.mesh.cylinder(0.1, 0.5, cells=(4, 6))
+    soft = wf.MooneyRivlin(mu10=1e5, mu01=5e4, k=1e6, density=1000.0, damping=DAMPING["incremental"])
+    body = b.add_solid(mesh, material=soft, name="rod")
+    b.drive(body.nodes("bottom"), rotation=wf.Rotation((0, 0, 0), (0, 0, 1), ([0, 1], [0, 3.0])))
+    b.add_pressure(body.surface("side"), 500.0)
+    b.add_traction(body.surface("top"), ([0, 0.1], [(0, 0, 0), (300.0, 0, 100.0)]))
+    b.add_body_force(swirl)
+    b.add_probe("tip", body.surface("top"))
+    return b, body
+
+
+CASES = {
+    "S3 svk tet4": lambda: cantilever(),
+    "S3 svk tet5_paper": lambda: cantilever(quadrature="tet5_paper"),
+    "S3 svk damped incremental": lambda: cantilever(wf.SVK(**SVK, damping=DAMPING["incremental"])),
+    "S3 svk damped rate": lambda: cantilever(wf.SVK(**SVK, damping=DAMPING["rate"])),
+    "S3 mooney-rivlin": lambda: cantilever(wf.MooneyRivlin(mu10=1e5, mu01=5e4, k=1e6, density=1000.0)),
+    "S3 neo-hookean": lambda: cantilever(wf.NeoHookean(mu=3e5, k=1e6, density=1000.0)),
+    "curved rod, all loads": loaded,
+}
+
+
+def run(case, device, dtype="float64", steps=100, integrator="backward_euler", tol=None, worlds=1, dt=1e-3):
+    """Tip displacement over time (worlds, steps, 3) and the last report, of one case on one device."""
+    b, body = CASES[case]()
+    model = b.finalize(device=device, dtype=dtype, worlds=worlds)
+    tol = tol or (1e-12 if dtype == "float64" else None)
+    sim = wf.Simulation(model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(tol=tol))
+    start = time.perf_counter()
+    report = sim.step(steps)
+    wall = (time.perf_counter() - start) / steps
+    return sim.probe("tip").displacement, report, wall, sim
+
+
+def compare(case, integrator="backward_euler", steps=100):
+    """One row: how far CUDA is from the CPU in both precisions, relative to the tip's travel."""
+    row = {"case": case, "integrator": integrator, "steps": steps, "tol_float64": 1e-12}
+    reference, _, wall, _ = run(case, "cpu", steps=steps, integrator=integrator)
+    travel = np.abs(reference).max()
+    row["cpu_ms_per_step"] = 1e3 * wall
+    for dtype in ("float64", "float32"):
+        tip, report, wall, _ = run(case, "cuda:0", dtype, steps=steps, integrator=integrator)
+        row[f"cuda_{dtype}_difference"] = float(np.abs(tip - reference).max() / travel)
+        row[f"cuda_{dtype}_residual"] = float(report.residual[0])
+        row[f"cuda_{dtype}_ms_per_step"] = 1e3 * wall
+    return row
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=pathlib.Path, required=True)
+    args = parser.parse_args()
+    rows = []
+    for case in CASES:
+        rows.append(compare(case))
+        print(rows[-1], flush=True)
+    rows.append(compare("S3 svk tet4", integrator="bdf2"))
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=HERE, check=False)
+    result = {
+        "command": "python tests/device_report.py --out tests/results/device_agreement.json",
+        "commit": commit.stdout.strip(),
+        "machine": {"cpu": platform.processor() or platform.machine(), "gpu": wp.get_device("cuda:0").name},
+        "versions": {"python": sys.version.split()[0], "warp": wp.__version__, "numpy": np.__version__},
+        "settings": "h = 1e-3 s, 100 steps, tol 1e-12 in float64 and default in float32; differences over the tip's travel",
+        "rows": rows,
+    }
+    args.out.write_text(json.dumps(result, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,533 @@
+"""Element tables: quadrature, shape functions, mass, rigid motions, patch tests, and a family of the test's own."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpfea as wf
+from warpfea import assembly, elements
+from warpfea.elements import quadrature
+
+RHO = 7.0
+LAWS = {
+    "svk": wf.SVK(E=1e6, nu=0.3, density=RHO),
+    "mooney_rivlin": wf.MooneyRivlin(mu10=3e5, mu01=1e5, k=1e6, density=RHO),
+    "neo_hookean": wf.NeoHookean(mu=4e5, k=1e6, density=RHO),
+}
+AFFINE = np.array([[0.1, 0.3, -0.1], [0.05, -0.2, 0.1], [-0.1, 0.2, 0.25]])
+
+
+def rotation(angle, axis=(1.0, -2.0, 0.5)):
+    """Rotation matrix (Rodrigues), angle in degrees."""
+    a, (x, y, z) = math.radians(angle), np.array(axis) / np.linalg.norm(axis)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(a) * K + (1 - math.cos(a)) * K @ K
+
+
+def lift(mesh, seed=0, amount=0.2):
+    """The mesh with its inner corners moved at random; mid-edge nodes of straight elements stay in the middle."""
+    rng = np.random.default_rng(seed)
+    points = mesh.points.copy()
+    inner = np.setdiff1d(mesh.used_nodes, mesh.faces(mesh.boundary()))
+    size = np.cbrt(mesh.volumes().mean())
+    corners = np.intersect1d(inner, mesh.cells[:, :4])
+    points[corners] += amount * size * rng.uniform(-1, 1, (len(corners), 3))
+    if mesh.cells.shape[1] == 10:
+        for k, (a, b) in enumerate(mesh.kind.edges, start=4):
+            points[mesh.cells[:, k]] = 0.5 * (points[mesh.cells[:, a]] + points[mesh.cells[:, b]])
+    return replace(mesh, points=points)
+
+
+def bend(mesh, seed=0, amount=0.05):
+    """The mesh with its inner mid-edge nodes moved at random: every inner edge is curved."""
+    rng = np.random.default_rng(seed)
+    points = mesh.points.copy()
+    inner = np.setdiff1d(mesh.cells[:, 4:], mesh.faces(mesh.boundary()))
+    points[inner] += amount * np.cbrt(mesh.volumes().mean()) * rng.uniform(-1, 1, (len(inner), 3))
+    return replace(mesh, points=points)
+
+
+@functools.cache
+def mesh(name):
+    return {
+        "T4": lambda: lift(wf.mesh.box((1, 1, 1), cells=(3, 3, 3), element="T4")),
+        "T10": lambda: lift(wf.mesh.box((1, 1, 1), cells=(3, 2, 2))),
+        "bent": lambda: bend(wf.mesh.box((1, 1, 1), cells=(2, 2, 2))),
+        "sphere": lambda: wf.mesh.sphere(0.7, cells=2, center=(3, -2, 1)),
+        "cylinder": lambda: wf.mesh.cylinder(0.3, 1.2, cells=(2, 2)),
+        "tet": lambda: unit_tetrahedron(),
+    }[name]()
+
+
+def unit_tetrahedron():
+    return wf.mesh.Mesh(elements.lagrange.T10.node_points, np.arange(10)[None], "tetra10", name="tet")
+
+
+def make(mesh, law, rule=None, *, device="cpu", tables=False, dtype="float64", support=None, element=None):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = b.add_solid(mesh, material=law, quadrature=rule, element=element)
+    if support:
+        support(b, body)
+    return body, wf.Model(b, device=device, tables=tables, dtype=dtype)
+
+
+def displaced(model, values):
+    state = model.state()
+    state.displacement.assign(np.asarray(values)[None])
+    return state
+
+
+# quadrature
+
+
+def monomials(dimension, degree):
+    """Exponents of all monomials of a total degree."""
+    return [e for e in itertools.product(range(degree + 1), repeat=dimension) if sum(e) == degree]
+
+
+def exact_integral(exponents):
+    """Over the unit triangle or tetrahedron: prod a_k! / (sum a_k + d)!."""
+    return math.prod(map(math.factorial, exponents)) / math.factorial(sum(exponents) + len(exponents))
+
+
+RULES = {
+    "tet1": (elements.TET_RULES["tet1"], 1, 1),
+    "tet4": (elements.TET_RULES["tet4"], 4, 2),
+    "tet5_paper": (elements.TET_RULES["tet5_paper"], 5, 3),
+    "tet14": (elements.TET_RULES["tet14"], 14, 5),
+    "conical2": (quadrature.conical_tet(2), 8, 3),
+    "conical3": (quadrature.conical_tet(3), 27, 5),
+    "conical4": (quadrature.conical_tet(4), 64, 7),
+    "conical_triangle2": (quadrature.conical_triangle(2), 4, 3),
+    "conical_triangle3": (quadrature.conical_triangle(3), 9, 5),
+    "triangle6": (quadrature.triangle_6(), 6, 4),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_rule_is_exact_up_to_its_degree_and_no_further(name):
+    rule, points, degree = RULES[name]
+    assert (rule.name, len(rule.weights), rule.degree) == (name, points, degree)
+    dimension = rule.points.shape[1]
+
+    def error(exponents):
+        value = rule.weights @ np.prod(rule.points ** np.array(exponents), axis=1)
+        return abs(value / exact_integral(exponents) - 1.0)
+
+    for d in range(degree + 1):
+        assert max(map(error, monomials(dimension, d))) < 2e-14
+    assert max(map(error, monomials(dimension, degree + 1))) > 1e-4
+    inside = np.column_stack([rule.points, 1 - rule.points.sum(axis=1)])
+    assert inside.min() > 0
+
+
+def test_default_rules_have_positive_weights():
+    for name in ("T4", "T10"):
+        family = elements.get(name)
+        for rule in (family.rule(None), family.mass_rule, family.curved_mass_rule, quadrature.triangle_6()):
+            assert rule.weights.min() > 0, (name, rule.name)
+    assert [elements.get(name).rule(None).name for name in ("T10", "T4")] == ["tet4", "tet1"]
+    assert elements.TET_RULES["tet5_paper"].weights.min() == pytest.approx(-0.8 / 6, rel=1e-15)
+    assert list(elements.get("T10").rules) == ["tet4", "tet5_paper", "tet14"]
+
+
+# shape functions
+
+
+@pytest.mark.parametrize("name", ["T4", "T10"])
+def test_shape_functions(name):
+    family = elements.get(name)
+    xi = np.random.default_rng(0).uniform(-0.2, 0.8, (50, 3))
+    nodes = np.zeros((1, len(family.node_points), 3))
+    s, ds = (a[0] for a in family.shape(xi, nodes))
+    np.testing.assert_allclose(
+        family.shape(family.node_points, nodes)[0][0], np.eye(family.slots), atol=1e-15
+    )
+    np.testing.assert_allclose(s.sum(axis=1), 1.0, rtol=1e-14)
+    np.testing.assert_allclose(ds.sum(axis=1), 0.0, atol=1e-14)
+    np.testing.assert_allclose(s @ family.node_points, xi, atol=1e-14)
+    for k in range(3):  # central differences are exact for quadratics
+        step = 0.1 * np.eye(3)[k]
+        numeric = (family.shape(xi + step, nodes)[0][0] - family.shape(xi - step, nodes)[0][0]) / 0.2
+        np.testing.assert_allclose(ds[:, :, k], numeric, atol=1e-13)
+
+
+def test_t10_follows_meshio_node_order():
+    """Mid-edge nodes 12, 23, 31, 14, 24, 34 of corners 1-4."""
+    nodes = elements.get("T10").node_points
+    pairs = [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)]
+    np.testing.assert_array_equal(nodes[4:], [(nodes[a] + nodes[b]) / 2 for a, b in pairs])
+    np.testing.assert_array_equal(nodes[:4], [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+
+
+# volume and mass
+
+
+def gauss_tetrahedron(n=8):
+    """Points and weights of a Duffy-mapped Gauss-Legendre rule, exact for degree 2 n - 3: independent of ours."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    x, w = (1 + x) / 2, w / 2
+    a, b, c = (g.ravel() for g in np.meshgrid(x, x, x, indexing="ij"))
+    weights = np.einsum("i,j,k->ijk", w, w, w).ravel() * (1 - a) ** 2 * (1 - b)
+    return np.column_stack([a, b * (1 - a), c * (1 - a) * (1 - b)]), weights
+
+
+def lagrange(xi, nodes):
+    """Functions and gradients by inverting the monomials' values at the nodes; linear or quadratic."""
+    exponents = np.array([e for d in range(2 if len(nodes) == 4 else 3) for e in monomials(3, d)])
+
+    def basis(x):
+        return np.prod(x[:, None, :] ** exponents, axis=2)
+
+    def slopes(x):
+        out = np.empty((len(x), len(exponents), 3))
+        for k in range(3):
+            lower = exponents - np.eye(3, dtype=int)[k] * (exponents[:, k : k + 1] > 0)
+            out[:, :, k] = exponents[:, k] * np.prod(x[:, None, :] ** lower, axis=2)
+        return out
+
+    inverse = np.linalg.inv(basis(nodes))
+    return basis(xi) @ inverse, np.einsum("qmk,mi->qik", slopes(xi), inverse)
+
+
+def independent_mass(mesh, density):
+    """Dense scalar mass matrix (nodes, nodes) and volume."""
+    xi, w = gauss_tetrahedron()
+    s, ds = lagrange(xi, elements.get("T4" if mesh.cells.shape[1] == 4 else "T10").node_points)
+    M, volume = np.zeros((len(mesh.points),) * 2), 0.0
+    for cell in mesh.cells:
+        x = mesh.points[cell]
+        dV = w * np.linalg.det(np.einsum("ni,qnk->qik", x, ds))
+        M[np.ix_(cell, cell)] += np.einsum("q,qi,qj->ij", dV * density(s @ x), s, s)
+        volume += dV.sum()
+    return M, volume
+
+
+@pytest.mark.parametrize("name", ["T4", "T10", "bent", "sphere", "cylinder"])
+def test_volume_and_mass(name, data, device):
+    m = mesh(name)
+    body, model = make(m, LAWS["svk"], device=device)
+    M = model.mass_matrix()
+    scalar = M[::3, ::3].toarray()[np.ix_(body.node_slot, body.node_slot)]
+    expected, volume = independent_mass(m, lambda X: np.full(len(X), RHO))
+    assert data.error(m.volume(), volume) < 1e-12
+    assert data.error(scalar.sum(), RHO * volume) < 1e-12
+    assert data.error(model.info()["mass"], RHO * m.volume()) < 1e-12
+    assert data.error(scalar, expected) < 1e-12
+    assert (M != M.T).nnz == 0
+    assert M[::3, 1::3].nnz == 0
+    assert np.linalg.eigvalsh(scalar).min() > 0
+    if name in ("T4", "T10", "bent"):
+        assert data.error(volume, 1.0) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["T4", "T10"])
+def test_mass_with_a_density_that_varies(name, data, device):
+    def density(X):
+        return 2.0 + X[:, 0] + 0.5 * X[:, 1] - 0.25 * X[:, 2]
+
+    m = mesh(name)
+    body, model = make(m, wf.SVK(E=1e6, nu=0.3, density=density), device=device)
+    scalar = model.mass_matrix()[::3, ::3].toarray()[np.ix_(body.node_slot, body.node_slot)]
+    assert data.error(scalar, independent_mass(m, density)[0]) < 1e-13
+
+
+def test_t10_mass_of_one_tetrahedron(data, device):
+    ref = data.json("S6_i_iii_shell_basis_tet_rules")["ii_mass_T10"]
+    body, model = make(mesh("tet"), wf.SVK(E=1.0, nu=0.3, density=6.0), device=device)  # density 1 / volume
+    scalar = model.mass_matrix()[::3, ::3].toarray()[np.ix_(body.node_slot, body.node_slot)]
+    assert data.error(scalar, ref["exact_times_1_over_volume"]) < 1e-14
+    assert data.error(np.linalg.eigvalsh(scalar), ref["eig_exact"]) < 1e-14
+    rule = elements.TET_RULES["tet5_paper"]  # why it may not integrate the mass
+    s = elements.get("T10").shape(rule.points, np.zeros((1, 10, 3)))[0][0]
+    five = np.einsum("q,qi,qj->ij", 6 * rule.weights, s, s)
+    assert data.error(np.linalg.eigvalsh(five), ref["eig_5pt"]) < 1e-14
+    assert np.linalg.eigvalsh(five).min() < -0.006
+
+
+# rigid motions
+
+
+COMPACT = {
+    "T4": lambda: wf.mesh.box((1, 1, 1), cells=(1, 1, 1), element="T4"),
+    "T10": lambda: wf.mesh.box((1, 1, 1), cells=(1, 1, 1)),
+    "sphere": lambda: mesh("sphere"),
+}
+CURVED_RULE = "tet14"
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", COMPACT)
+def test_six_rigid_modes_and_no_more(name, law, device):
+    _, model = make(COMPACT[name](), LAWS[law], CURVED_RULE if name == "sphere" else None, device=device)
+    assert model.features["table elements"] == (name == "sphere")
+    K = model.tangent_matrix(model.state()).toarray()
+    values = np.linalg.eigvalsh(0.5 * (K + K.T))
+    assert np.abs(values[:6]).max() < 1e-10 * values[-1]
+    assert values[6] > 1e-6 * values[-1]
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", COMPACT)
+@pytest.mark.parametrize("angle", [1.0, 77.0, 180.0])
+def test_rigid_motion_costs_nothing(name, law, angle, device):
+    body, model = make(COMPACT[name](), LAWS[law], CURVED_RULE if name == "sphere" else None, device=device)
+    stiffness_times_size = np.abs(model.tangent_matrix(model.state())).max() * 1.0
+    u = body.reference @ (rotation(angle) - np.eye(3)).T + np.array([3.0, -4.0, 5.0])
+    state = displaced(model, u)
+    assert np.abs(model.internal_force(state)).max() < 1e-12 * stiffness_times_size
+    assert np.abs(model.strain_energy(state)).max() < 1e-24 * stiffness_times_size
+    assert model.minimum_jacobian(state)[0] == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_translation_is_exactly_free_of_force(law, device):
+    """Displacements are taken relative to the element's first node: no round-off, however far."""
+    _, model = make(COMPACT["T10"](), LAWS[law], device=device)
+    state = displaced(model, np.tile([1e7, -3e6, 2e5], (model.slots, 1)))
+    assert np.all(model.internal_force(state) == 0)
+    assert np.all(model.strain_energy(state) == 0)
+
+
+# patch tests
+
+
+def drive_outside(b, body):
+    """All outer nodes follow an affine field."""
+    outer = body.nodes(np.unique(body.mesh.faces(body.mesh.boundary())))
+    u = body.mesh.points[outer.indices] @ AFFINE.T
+    b.drive(outer, displacement=([0, 1], np.stack([0 * u, u])))
+
+
+PATCHES = [
+    ("T4", "svk", "tet1"),
+    ("T4", "mooney_rivlin", "tet1"),
+    ("T10", "svk", "tet4"),
+    ("T10", "mooney_rivlin", "tet4"),
+    ("T10", "neo_hookean", "tet4"),
+    ("sphere", "svk", "tet5_paper"),
+    ("sphere", "svk", "tet14"),
+    ("sphere", "mooney_rivlin", "tet14"),
+    ("bent", "svk", "tet5_paper"),
+    ("bent", "mooney_rivlin", "tet14"),
+]
+
+
+@pytest.mark.parametrize(("name", "law", "rule"), PATCHES)
+def test_patch(name, law, rule, data, device):
+    """A constant strain passes exactly. Curved elements need a rule of degree 3: cof J0 ds is cubic."""
+    m = mesh(name)
+    body, model = make(m, LAWS[law], rule, support=drive_outside, device=device)
+    free = body.node_slot[np.setdiff1d(m.used_nodes, m.faces(m.boundary()))]
+    assert len(free) >= 4
+    assert model.free_slots[free].all()
+    curved = name in ("sphere", "bent")
+    assert model.features["table elements"] == curved
+    result = wf.solve_static(model, load_steps=1, tol=1e-12)
+    assert data.error(result.displacements(body)[0], m.points @ AFFINE.T) < 1e-12
+    F = np.eye(3) + AFFINE
+    for _, stress in model.evaluation.stresses(result.state):  # uniform
+        assert np.ptp(stress, axis=(0, 1, 2)).max() < 1e-11 * np.abs(stress).max()
+    assert model.minimum_jacobian(result.state)[0] == pytest.approx(np.linalg.det(F), rel=1e-11)
+
+
+# both paths
+
+
+@pytest.mark.parametrize("law", ["svk", "mooney_rivlin"])
+def test_both_paths_agree_on_straight_elements(law, data, device):
+    m = mesh("T10")
+    results = []
+    u = 0.1 * np.random.default_rng(1).uniform(-1, 1, (len(m.points), 3)) / 3
+    for tables in (False, True):
+        _, model = make(m, LAWS[law], tables=tables, device=device)
+        assert model.features["table elements"] == tables
+        assert model.features["straight elements"] != tables
+        state = displaced(model, u)
+        results.append(
+            (
+                model.internal_force(state),
+                model.strain_energy(state),
+                model.minimum_jacobian(state),
+                model.tangent_matrix(state).toarray(),
+            )
+        )
+    for straight, table in zip(*results):
+        assert data.error(table, straight) < 1e-12
+
+
+def test_a_mesh_with_straight_and_curved_elements_uses_both_paths(device):
+    _, model = make(wf.mesh.sphere(1.0, cells=4), LAWS["svk"], device=device)
+    counts = {block.key.affine: block.count for block in model.blocks}
+    assert set(counts) == {True, False}
+    assert sum(counts.values()) == 6 * 4**3
+
+
+# a family with four slots per node, known to this test only
+
+EDGES = list(itertools.combinations(range(4), 2))
+KINDS = (0, 1, 2, 3)
+
+
+def hermite_basis(xi):
+    """Complete quadratics and one cubic L_i L_j (L_i - L_j) per edge: 16 functions and gradients at xi (Q, 3)."""
+    L = np.column_stack([1 - xi.sum(axis=1), xi])
+    dL = np.vstack([-np.ones(3), np.eye(3)])
+    values, slopes = [*L.T], [np.broadcast_to(d, xi.shape) for d in dL]
+    for i, j in EDGES:
+        a, b = L[:, i, None], L[:, j, None]
+        values += [(a * b)[:, 0], (a * b * (a - b))[:, 0]]
+        slopes += [b * dL[i] + a * dL[j], (2 * a * b - b * b) * dL[i] + (a * a - 2 * a * b) * dL[j]]
+    return np.stack(values, axis=1), np.stack(slopes, axis=1)
+
+
+def hermite_shape(xi, nodes):
+    """Functions of the nodal values and gradients d/dX in the global frame, one row per element."""
+    corners = elements.get("T4").node_points
+    at_nodes, slopes_at_nodes = hermite_basis(corners)
+    values, slopes = hermite_basis(xi)
+    s, ds = np.empty((len(nodes), len(xi), 16)), np.empty((len(nodes), len(xi), 16, 3))
+    for e, x in enumerate(nodes):
+        inverse = np.linalg.inv((x[1:] - x[0]).T)
+        B = np.empty((16, 16))
+        for n in range(4):
+            B[4 * n] = at_nodes[n]
+            B[4 * n + 1 : 4 * n + 4] = (slopes_at_nodes[n] @ inverse).T
+        C = np.linalg.inv(B)
+        s[e] = values @ C
+        ds[e] = np.einsum("qmk,mi->qik", slopes, C)
+    return s, ds
+
+
+@pytest.fixture(scope="module")
+def hermite():
+    family = elements.register(
+        elements.Family(
+            name="hermite-of-the-test",
+            cell_type="tetra",
+            node_slots=(KINDS,) * 4,
+            shape=hermite_shape,
+            rules={"tet14": elements.TET_RULES["tet14"]},
+            mass_rule=quadrature.conical_tet(4),
+            curved_mass_rule=quadrature.conical_tet(4),
+            vertices=elements.get("T4").vertices,
+            affine=False,
+            node_points=elements.get("T4").node_points,
+        )
+    )
+    yield family.name
+    elements.family._families.pop(family.name)
+
+
+@pytest.fixture(scope="module")
+def gradient_body(hermite, device):
+    def build(law="svk", gravity=(0, 0, 0), **options):
+        b = wf.ModelBuilder(gravity=gravity)
+        m = lift(wf.mesh.box((1, 1, 1), cells=(2, 2, 2), element="T4", origin=(2, 0, -1)))
+        body = b.add_solid(m, material=LAWS[law], element=hermite)
+        return body, wf.Model(b, device=device, **options)
+
+    return build
+
+
+def slot_values(body, function, gradient):
+    """Slots of a scalar field: values at position slots, derivatives at gradient slots."""
+    X = body.mesh.points[body.slot_node]
+    out = function(X)
+    for k in (1, 2, 3):
+        out = np.where(body.slot_kind == k, gradient(X)[:, k - 1], out)
+    return out
+
+
+def test_new_family_assembly(gradient_body, data):
+    body, model = gradient_body()
+    assert model.slots == 4 * 27
+    assert model.blocks[0].slots == 16
+    np.testing.assert_array_equal(body.slot_kind, np.tile(KINDS, 27))
+    np.testing.assert_array_equal(body.reference[1:4], np.eye(3))
+    _, _, J0, det = assembly.geometry(body, np.arange(48), gauss_tetrahedron(3)[0])
+    x = body.mesh.points[body.mesh.cells]
+    edges = np.moveaxis(x[:, 1:] - x[:, :1], 1, 2)
+    assert data.error(J0, np.broadcast_to(edges[:, None], J0.shape)) < 1e-13
+    assert data.error(det[:, 0] / 6, body.mesh.volumes()) < 1e-12
+
+
+def test_new_family_mass(gradient_body, data):
+    """Mass products of all quadratic fields, against closed-form integrals over the box."""
+    body, model = gradient_body()
+    scalar = model.mass_matrix()[::3, ::3]
+    low, high = np.array([2, 0, -1.0]), np.array([3, 1, 0.0])
+    powers = [e for d in range(3) for e in monomials(3, d)]
+
+    def integral(e):
+        return np.prod([(b ** (p + 1) - a ** (p + 1)) / (p + 1) for a, b, p in zip(low, high, e)])
+
+    def field(e):
+        e = np.array(e)
+
+        def value(X):
+            return np.prod(X**e, axis=1)
+
+        def gradient(X):
+            columns = [
+                e[k] * np.prod(X ** np.maximum(e - np.eye(3, dtype=int)[k], 0), axis=1) for k in range(3)
+            ]
+            return np.column_stack(columns)
+
+        return slot_values(body, value, gradient)
+
+    fields = np.array([field(e) for e in powers])
+    exact = RHO * np.array([[integral(np.add(a, b)) for b in powers] for a in powers])
+    assert data.error(fields @ (scalar @ fields.T), exact) < 1e-12
+    assert np.linalg.eigvalsh(scalar.toarray()).min() > 0
+    xi, w = gauss_tetrahedron()
+    total = np.zeros(scalar.shape)
+    x = body.mesh.points[body.mesh.cells]
+    s, _ = hermite_shape(xi, x)
+    for conn, table, volume in zip(body.connectivity, s, body.mesh.volumes()):
+        total[np.ix_(conn, conn)] += RHO * 6 * volume * np.einsum("q,qi,qj->ij", w, table, table)
+    assert data.error(scalar.toarray(), total) < 1e-12
+
+
+@pytest.mark.parametrize("law", ["svk", "mooney_rivlin"])
+def test_new_family_force(gradient_body, data, law):
+    body, model = gradient_body(law)
+    rng = np.random.default_rng(3)
+    u = body.reference @ AFFINE.T + 0.02 * rng.uniform(-1, 1, (model.slots, 3))
+    d = rng.uniform(-1, 1, u.shape)
+    force = model.internal_force(displaced(model, u))[0]
+
+    def energy(t):
+        return model.strain_energy(displaced(model, u + t * d))[0]
+
+    h = 1e-3
+    one, two, three = ((energy(k * h) - energy(-k * h)) / (60 * h) for k in (1, 2, 3))
+    assert data.error(45 * one - 9 * two + three, np.sum(force * d)) < 1e-9
+
+    stiffness = np.abs(model.tangent_matrix(model.state())).max()
+    turned = displaced(model, body.reference @ (rotation(130) - np.eye(3)).T + (body.slot_kind == 0)[:, None])
+    assert np.abs(model.internal_force(turned)).max() < 1e-12 * stiffness
+    # a constant strain: its energy is the density times the volume, its force vanishes at inner slots
+    state = displaced(model, body.reference @ AFFINE.T)
+    force = model.internal_force(state)[0]
+    inner = np.flatnonzero(~np.isin(body.slot_node, body.mesh.faces(body.mesh.boundary())))
+    assert len(inner) == 4
+    assert np.abs(force[inner]).max() < 1e-12 * np.abs(force).max()
+
+
+def test_new_family_falls_freely(gradient_body, data):
+    g, h = np.array([1.0, -2.0, -9.81]), 1e-2
+    body, model = gradient_body(gravity=g)
+    sim = wf.Simulation(model, dt=h)
+    sim.step(3)
+    fall = 6 * h**2 * g  # backward Euler: h^2 g n (n + 1) / 2
+    u = sim.state.displacement.numpy()[0]
+    exact = np.where((body.slot_kind == 0)[:, None], fall, 0.0)
+    assert data.error(u, exact) < 1e-12
+    assert data.error(sim.displacements(body)[0], np.broadcast_to(fall, (27, 3))) < 1e-12
