@@ -28,7 +28,7 @@ def law_struct():
 def load_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels of the loads in one precision."""
     p = precision(dtype)
-    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Laws = law_struct()
     module = kernel_module(f"loads_{dtype}")

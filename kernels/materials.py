@@ -92,11 +92,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
         Fa = F * a
         S = t.isotropic(t.green(G), c[0], c[1])
         geometric = wp.max(T(0.0), wp.dot(a, S * a))
-        return (
-            (c[0] + c[1]) * wp.outer(Fa, Fa)
-            + c[1] * wp.dot(a, a) * (F * wp.transpose(F))
-            + geometric * t.identity()
-        )
+        return (c[0] + c[1]) * wp.outer(Fa, Fa) + c[1] * wp.dot(a, a) * (F * wp.transpose(F)) + geometric * t.identity()
 
     return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block)
 
@@ -181,9 +177,7 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
         Jm = wp.pow(J, -two_thirds)
         c1 = T(4.0) * c[0] * Jm
         tau = c[1] * j1 * J * t.identity() + c1 * dev(b)
-        dtau = c[1] * (T(2.0) * J - T(1.0)) * J * trL * t.identity() + c1 * (
-            dev(db) - two_thirds * trL * dev(b)
-        )
+        dtau = c[1] * (T(2.0) * J - T(1.0)) * J * trL * t.identity() + c1 * (dev(db) - two_thirds * trL * dev(b))
         if wp.static(second_invariant):
             c2 = T(2.0) * c[2] * Jm * Jm
             s = T(2.0) + T(4.0) * wp.trace(b)
@@ -215,9 +209,7 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
             Q = wp.outer(Fa, Fa) + (I1 * aa - wp.dot(Fa, Fa)) * t.identity() - aa * B
             d = I1 * Fa - B * Fa
             H = H + c[2] * Jm * Jm * (
-                T(2.0) * Q
-                - eight_thirds * (wp.outer(d, f) + wp.outer(f, d))
-                + rank_one_2 * I2 * wp.outer(f, f)
+                T(2.0) * Q - eight_thirds * (wp.outer(d, f) + wp.outer(f, d)) + rank_one_2 * I2 * wp.outer(f, f)
             )
         return H
 

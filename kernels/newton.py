@@ -277,9 +277,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             partial[row, world, component, lane] = total
 
     @wp.kernel(module=module)
-    def component_sum(
-        partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)
-    ):
+    def component_sum(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
         """Sum of the lanes, in order."""
         row, world, component = wp.tid()
         if active[world] == 0:
@@ -315,9 +313,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
 
     @wp.kernel(module=module)
-    def copy_active(
-        source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)
-    ):
+    def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):
         """target = source in the active worlds."""
         world, slot = wp.tid()
         if active[world] != 0:

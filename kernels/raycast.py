@@ -73,9 +73,7 @@ def shade_ground(scene: Scene, p: wp.vec3, distance: float, slope: float, behind
     base = wp.vec3(0.80, 0.81, 0.83)
     pixel = distance * wp.length(scene.up) * 2.0 / scene.height
     footprint = pixel / wp.max(slope, 0.05)
-    fine = wp.max(
-        line(p[0], scene.grid, 0.4 * pixel, footprint), line(p[1], scene.grid, 0.4 * pixel, footprint)
-    )
+    fine = wp.max(line(p[0], scene.grid, 0.4 * pixel, footprint), line(p[1], scene.grid, 0.4 * pixel, footprint))
     big = 5.0 * scene.grid
     strong = wp.max(line(p[0], big, 0.7 * pixel, footprint), line(p[1], big, 0.7 * pixel, footprint))
     base = mix(base, wp.vec3(0.50, 0.53, 0.58), wp.max(0.45 * fine, 0.70 * strong))
@@ -117,11 +115,7 @@ def cast(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.
         p = scene.eye + ray * hit.t
         w = 1.0 - hit.u - hit.v
         k = 3 * hit.face
-        n = (
-            scene.corner_normals[k] * hit.u
-            + scene.corner_normals[k + 1] * hit.v
-            + scene.corner_normals[k + 2] * w
-        )
+        n = scene.corner_normals[k] * hit.u + scene.corner_normals[k + 1] * hit.v + scene.corner_normals[k + 2] * w
         albedo = (
             scene.colors[wp.mesh_get_index(scene.mesh, k)] * hit.u
             + scene.colors[wp.mesh_get_index(scene.mesh, k + 1)] * hit.v

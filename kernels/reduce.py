@@ -21,9 +21,7 @@ def reduce_kernels() -> _types.SimpleNamespace:
     module = kernel_module("reduce")
 
     @wp.kernel(module=module)
-    def partial_sums(
-        rows: wp.array3d(dtype=f64), active: wp.array(dtype=wp.int32), partial: wp.array3d(dtype=f64)
-    ):
+    def partial_sums(rows: wp.array3d(dtype=f64), active: wp.array(dtype=wp.int32), partial: wp.array3d(dtype=f64)):
         """One block sums one chunk of one row of one world."""
         row, world, chunk = wp.tid()
         if active[world] == 0:
@@ -34,9 +32,7 @@ def reduce_kernels() -> _types.SimpleNamespace:
         partial[row, world, chunk] = wp.tile_extract(wp.tile_sum(acc), 0)
 
     @wp.kernel(module=module)
-    def final_sums(
-        rows: wp.array3d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=f64)
-    ):
+    def final_sums(rows: wp.array3d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=f64)):
         """One block sums one row of one world."""
         row, world = wp.tid()
         if active[world] == 0:

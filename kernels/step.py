@@ -257,8 +257,8 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         g: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq, pushed.dq,
-        inertia.dq."""
+        """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq,
+        pushed.dq, inertia.dq."""
         world, slot = wp.tid()
         if step.accepted[world] == 0:
             return

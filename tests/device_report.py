@@ -111,7 +111,7 @@ def main() -> int:
         "commit": commit.stdout.strip(),
         "machine": {"cpu": platform.processor() or platform.machine(), "gpu": wp.get_device("cuda:0").name},
         "versions": {"python": sys.version.split()[0], "warp": wp.__version__, "numpy": np.__version__},
-        "settings": "h = 1e-3 s, 100 steps, tol 1e-12 in float64 and default in float32; differences over the tip's travel",
+        "settings": "h = 1e-3 s, 100 steps, tol 1e-12 (float64), default (float32); differences over the tip's travel",
         "rows": rows,
     }
     args.out.write_text(json.dumps(result, indent=1) + "\n")

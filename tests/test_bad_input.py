@@ -63,7 +63,7 @@ CASES = {
     "unknown element": (lambda: start(element="T11"), wf.ModelError, r"'T11' is unknown.*T10"),
     "wrong element": (lambda: start(element="T4"), wf.ModelError, r"'bar'.*T4 needs tetra cells"),
     "quadrature": (lambda: start(quadrature="tet99"), wf.ModelError, r"'tet99'.*tet4"),
-    "name twice": (lambda: build(lambda b, _: b.add_solid(MESH, material=LAW, name="bar")), wf.ModelError, r"'bar' is used"),
+    "name twice": (lambda: build(lambda b, _: b.add_solid(MESH, material=LAW, name="bar")), wf.ModelError, r"'bar' is"),
     "initial shape": (lambda: start(initial=np.zeros((3, 3))), wf.ModelError, r"'bar': initial.*\(3, 3\)"),
     "initial nan": (lambda: start(initial=MESH.points * np.nan), wf.ModelError, r"'bar': initial: node 0"),
     "node group": (lambda: build(lambda b, s: b.clamp(s.nodes("top"))), wf.MeshError, r"'top'.*x-"),
@@ -79,15 +79,15 @@ CASES = {
         lambda: build(lambda b, s: b.clamp(s.nodes("x-"), components="xw")), wf.ModelError, r"components = 'xw'"),
     "clamp slots": (lambda: build(lambda b, s: b.clamp(s.nodes("x-"), slots="some")), wf.ModelError, r"slots = 'some'"),
     "traction nan": (
-        lambda: build(lambda b, s: b.add_traction(s.surface("x+"), (0, 0, np.nan))), wf.ModelError, r"traction on 'x\+'.*nan"),
+        lambda: build(lambda b, s: b.add_traction(s.surface("x+"), (0, 0, np.nan))), wf.ModelError, r"traction.*nan"),
     "force shape": (
         lambda: build(lambda b, s: b.add_point_load(s.at((1, 0, 0)), 5.0)), wf.ModelError, r"point load on 'bar'"),
     "pressure vector": (
         lambda: build(lambda b, s: b.add_pressure(s.surface("x+"), (1, 2, 3))), wf.ModelError, r"pressure on 'x\+'"),
     "times that fall": (
-        lambda: build(lambda b, s: b.add_pressure(s.surface("x+"), ([0, 2, 1], [0, 1, 2]))), wf.ModelError, r"increase"),
+        lambda: build(lambda b, s: b.add_pressure(s.surface("x+"), ([0, 2, 1], [0, 1, 2]))), wf.ModelError, r"increas"),
     "values per time": (
-        lambda: build(lambda b, s: b.add_pressure(s.surface("x+"), ([0, 1], [0, 1, 2]))), wf.ModelError, r"\(3,\).*2 times"),
+        lambda: build(lambda b, s: b.add_pressure(s.surface("x+"), ([0, 1], [0, 1, 2]))), wf.ModelError, r"\(3,\)"),
     "python function": (
         lambda: build(lambda b, s: b.add_pressure(s.surface("x+"), lambda t: t)), wf.ModelError, r"wp\.func"),
     "field": (lambda: build(lambda b, s: b.add_body_force((0, 0, 1))), wf.ModelError, r"wp\.func, got \(0, 0, 1\)"),

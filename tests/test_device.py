@@ -99,5 +99,7 @@ def test_float32_statics_agree(data, shift):
         end = body.surface(lambda X: X[:, 0] > shift + 1 - 1e-6)
         b.add_traction(end, (0, 0, -1050.0))
         b.add_probe("tip", end)
-        tips.append(wf.solve_static(b.finalize(device="cpu", dtype=dtype), load_steps=3).probe("tip").displacement[0, -1])
+        tips.append(
+            wf.solve_static(b.finalize(device="cpu", dtype=dtype), load_steps=3).probe("tip").displacement[0, -1]
+        )
     assert np.abs(tips[1] - tips[0]).max() < 1e-4 * np.abs(tips[0]).max()

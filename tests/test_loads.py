@@ -51,7 +51,9 @@ def test_point_load_at_any_material_point():
     total, sim = loads_of(b)
     assert total == pytest.approx([5.0, 1.0, -2.0], rel=1e-9)
     work = sim.energies()["work_loads"][0]
-    assert work == pytest.approx(np.array([5.0, 1.0, -2.0]) @ (point.weights @ sim.state.displacement.numpy()[0][point.slots]))
+    assert work == pytest.approx(
+        np.array([5.0, 1.0, -2.0]) @ (point.weights @ sim.state.displacement.numpy()[0][point.slots])
+    )
 
 
 def test_point_outside_is_refused():

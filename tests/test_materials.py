@@ -5,10 +5,10 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
-
-import warpfea as wf
 from warpfea.kernels import materials
 from warpfea.kernels.types import kernel_module, precision
+
+import warpfea as wf
 
 LAWS = {
     "svk": wf.SVK(E=1e6, nu=0.3),

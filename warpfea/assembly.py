@@ -56,7 +56,9 @@ class HostBlock:
         return self.body.mesh.points[self.body.mesh.cells[self.elements]] - self.body.origin
 
 
-def geometry(body: Body, elements: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def geometry(
+    body: Body, elements: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Functions and J0 at parent points.
 
     Returns:

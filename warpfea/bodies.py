@@ -235,7 +235,7 @@ def locate(body: Body, X: np.ndarray) -> MaterialPoint:
     coords = mesh.points[mesh.cells]
     low, high = coords.min(axis=1), coords.max(axis=1)
     size = float(np.max(high - low))
-    near = np.flatnonzero(np.all((X >= low - 0.1 * size) & (X <= high + 0.1 * size), axis=1))
+    near = np.flatnonzero(np.all((low - 0.1 * size <= X) & (high + 0.1 * size >= X), axis=1))
     tolerance = 1e-9
     best = (np.inf, -1, np.zeros(3))
     if len(near):

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from . import elements, mesh as meshes
+from . import elements
+from . import mesh as meshes
 from .bodies import Body, MaterialPoint, NodeSet, SurfaceSet
 from .errors import ModelError
 from .laws import TimeLaw, time_law
@@ -451,9 +452,7 @@ def _support_slots(nodes: NodeSet, which: str) -> np.ndarray:
     return np.concatenate([f + np.arange(c) for f, c in zip(first, counts)]) if len(first) else first
 
 
-def _assign_materials(
-    name: str, mesh: Mesh, material: Any
-) -> tuple[list[tuple[str, Material]], np.ndarray]:
+def _assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[str, Material]], np.ndarray]:
     if isinstance(material, Material):
         _check_density_length(name, "", material, len(mesh.cells), mesh)
         return [("", material)], np.zeros(len(mesh.cells), dtype=np.int64)

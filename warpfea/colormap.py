@@ -33,9 +33,7 @@ def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return np.where(c <= 0.0031308, c * 12.92, 1.055 * c ** (1.0 / 2.4) - 0.055)
 
 
-def map_colors(
-    values: npt.ArrayLike, low: float, high: float, *, linear: bool = False
-) -> npt.NDArray[np.float32]:
+def map_colors(values: npt.ArrayLike, low: float, high: float, *, linear: bool = False) -> npt.NDArray[np.float32]:
     """Colours (..., 3) of scalars (...): `low` and below is dark violet, `high` and above yellow.
 
     An empty range (low = high) gives the lowest colour, a value that is not finite mid grey. The table is

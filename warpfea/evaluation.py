@@ -50,7 +50,17 @@ class Evaluation:
         history = self._zeros((1, 1), m.types.sym)
         for block in m.blocks:
             kernel = block.kernels_for(m.dtype, None).internal_force
-            args = [block.data, state.displacement, state.velocity, history, one, self._all(), contribution, energy, low]
+            args = [
+                block.data,
+                state.displacement,
+                state.velocity,
+                history,
+                one,
+                self._all(),
+                contribution,
+                energy,
+                low,
+            ]
             self.launch(kernel, (m.worlds, block.count), args)
         return self._gather(contribution), energy.numpy()[0].sum(axis=1), low.numpy()
 

@@ -10,6 +10,7 @@ Backward Euler is (a0, a1, beta) = (1, 0, 1), which is Eq. (17).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import warp as wp
 
@@ -48,7 +49,7 @@ class Integrator:
     """
 
     name: str
-    coefficients: wp.Function
+    coefficients: Any
     multistep: bool
     static: bool
     order: int

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -33,7 +33,9 @@ def _check_density(owner: str, density: Density) -> None:
         return
     values = np.asarray(density, dtype=float)
     if values.ndim > 1 or not np.all(np.isfinite(values)) or not np.all(values > 0.0):
-        raise ModelError(f"{owner}: density = {density!r} must be positive (kg/m^3): a number, one per element, or f(X)")
+        raise ModelError(
+            f"{owner}: density = {density!r} must be positive (kg/m^3): a number, one per element, or f(X)"
+        )
 
 
 def _check_nu(owner: str, nu: float) -> None:
@@ -71,6 +73,8 @@ class Material:
     """Base of the laws: a density and optional damping."""
 
     law: ClassVar[str]
+    density: Any = field(default=1000.0, kw_only=True)
+    damping: KelvinVoigt | None = field(default=None, kw_only=True)
 
     def coefficients(self) -> tuple[float, float, float]:
         """Device coefficients of the law."""
@@ -102,8 +106,6 @@ class SVK(Material):
 
     E: float
     nu: float
-    density: Any = 1000.0
-    damping: KelvinVoigt | None = None
     law: ClassVar[str] = "svk"
 
     def __post_init__(self) -> None:
@@ -143,8 +145,6 @@ class MooneyRivlin(Material):
     mu10: float
     mu01: float
     k: float
-    density: Any = 1000.0
-    damping: KelvinVoigt | None = None
     law: ClassVar[str] = "mooney_rivlin"
 
     def __post_init__(self) -> None:
@@ -189,8 +189,6 @@ class NeoHookean(Material):
 
     mu: float
     k: float
-    density: Any = 1000.0
-    damping: KelvinVoigt | None = None
     law: ClassVar[str] = "neo_hookean"
 
     def __post_init__(self) -> None:
@@ -198,9 +196,7 @@ class NeoHookean(Material):
         _check_density("NeoHookean", self.density)
 
     @classmethod
-    def from_E_nu(
-        cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None
-    ) -> NeoHookean:
+    def from_E_nu(cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None) -> NeoHookean:
         """From Young's modulus and Poisson's ratio at rest."""
         _positive("NeoHookean", E=E)
         _check_nu("NeoHookean", nu)

@@ -59,7 +59,13 @@ class Model:
     """
 
     def __init__(
-        self, builder: ModelBuilder, *, device: Any = None, dtype: str = "float64", worlds: int = 1, tables: bool = False
+        self,
+        builder: ModelBuilder,
+        *,
+        device: Any = None,
+        dtype: str = "float64",
+        worlds: int = 1,
+        tables: bool = False,
     ) -> None:
         if dtype not in ("float64", "float32"):
             raise ModelError(f"dtype = {dtype!r} is neither 'float64' nor 'float32'")
@@ -88,7 +94,7 @@ class Model:
 
     def array(self, name: str, values: Any, dtype: Any) -> wp.array:
         """Upload a constant; its bytes are counted under `name`."""
-        out = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+        out: Any = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
         self._memory[name] = self._memory.get(name, 0) + out.size * wp.types.type_size_in_bytes(out.dtype)
         return out
 

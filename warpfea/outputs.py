@@ -223,9 +223,7 @@ class Surface:
         points = np.asarray(sim.skin_points(body), dtype=np.float64)
         if not np.isfinite(points).all():
             world = int(np.argmin(np.isfinite(points).all(axis=(1, 2))))
-            raise OutputError(
-                f"body {body.name!r}, world {world}: positions are not finite at t = {time_of(sim):g} s"
-            )
+            raise OutputError(f"body {body.name!r}, world {world}: positions are not finite at t = {time_of(sim):g} s")
         return points
 
     def triangles(self) -> npt.NDArray[np.int32]:

@@ -59,9 +59,7 @@ class Camera:
         low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
         size = max(0.5 * float(np.linalg.norm(high - low)), 1e-9)
         azimuth, elevation = np.radians(view)
-        back = np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
+        back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         left, right_, bottom, top = margins
         share = np.array([1.0 - left - right_, 1.0 - bottom - top])
         tangent = np.tan(np.radians(0.5 * fov)) * np.array([aspect, 1.0])
@@ -150,9 +148,7 @@ class Renderer:
             image[rough] = self._cast(wp, raycast, scene, fine).reshape(-1, len(_SUBPIXELS), 3).mean(axis=1)
         return np.asarray(np.round(to_srgb(image) * 255.0), dtype=np.uint8)
 
-    def _scene(
-        self, wp: Any, raycast: Any, unit: Floats, colors: Floats, camera: Camera, size: tuple[int, int]
-    ) -> Any:
+    def _scene(self, wp: Any, raycast: Any, unit: Floats, colors: Floats, camera: Camera, size: tuple[int, int]) -> Any:
         assert self._groups is not None
         points = np.ascontiguousarray(unit, dtype=np.float32)
         if self._mesh is None or len(self._mesh.points) != len(points):

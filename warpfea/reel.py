@@ -77,17 +77,13 @@ class Reel:
         """The colour range: as wanted, or the extremes over all frames."""
         if self.shown is not None:
             return self.shown
-        values = [
-            frame.values[np.isfinite(frame.values)] for frame in self.frames if frame.values is not None
-        ]
+        values = [frame.values[np.isfinite(frame.values)] for frame in self.frames if frame.values is not None]
         values = [v for v in values if v.size]
         if not values:
             return 0.0, 0.0
         return min(float(v.min()) for v in values), max(float(v.max()) for v in values)
 
-    def save_png(
-        self, target: pathlib.Path, size: tuple[int, int], view: tuple[float, float], ground: bool
-    ) -> None:
+    def save_png(self, target: pathlib.Path, size: tuple[int, int], view: tuple[float, float], ground: bool) -> None:
         """Draw the last frame. OutputError if the file can't be written."""
         from PIL import Image as Pictures
 
@@ -116,9 +112,7 @@ class Reel:
                 advance()
 
         def save(path: pathlib.Path) -> None:
-            pictures[0].save(
-                path, format="GIF", save_all=True, append_images=pictures[1:], duration=durations, loop=0
-            )
+            pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=durations, loop=0)
 
         write_whole(target, save)
 
@@ -139,16 +133,12 @@ def label(image: Image, time: str, bar: tuple[float, float, str, str] | None) ->
         return np.asarray(picture)
     low, high, title, units = bar
     factor, prefix = (
-        next((p for p in _PREFIXES if max(abs(low), abs(high)) >= 0.9995 * p[0]), (1.0, ""))
-        if units
-        else (1.0, "")
+        next((p for p in _PREFIXES if max(abs(low), abs(high)) >= 0.9995 * p[0]), (1.0, "")) if units else (1.0, "")
     )
     left, right = round(width * (1.0 - 0.75 * _BAR)), round(width * (1.0 - 0.61 * _BAR))
     top, bottom = round(0.26 * height), round(0.80 * height)
     ramp = map_colors(np.linspace(1.0, 0.0, bottom - top), 0.0, 1.0 if high > low else 0.0)
-    strip = np.broadcast_to(np.round(255 * ramp)[:, None, :], (bottom - top, right - left, 3)).astype(
-        np.uint8
-    )
+    strip = np.broadcast_to(np.round(255 * ramp)[:, None, :], (bottom - top, right - left, 3)).astype(np.uint8)
     picture.paste(Pictures.fromarray(np.ascontiguousarray(strip)), (left, top))
     draw.rectangle((left - 1, top - 1, right, bottom), outline=_INK)
     ticks = np.linspace(low, high, 5) if high > low else np.array([low])

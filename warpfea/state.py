@@ -133,7 +133,7 @@ class State:
 def _words(array: wp.array) -> wp.array:
     """The array seen as [world, 32-bit word]."""
     size = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
-    out = wp.array(
+    out: Any = wp.array(
         ptr=array.ptr, dtype=wp.uint32, shape=(array.shape[0], size // max(array.shape[0], 1)), device=array.device
     )
     out._owner = array  # keeps the memory alive

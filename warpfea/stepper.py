@@ -101,8 +101,13 @@ class Stepper:
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
-        for module in self.modules():
-            module.load(self.model.device)
+        modules, device = self.modules(), self.model.device
+        for k, module in enumerate(modules):
+            if self.on_compile:
+                self.on_compile(k, len(modules), module.name)
+            wp.force_load(device=device, modules=[module])
+        if self.on_compile:
+            self.on_compile(len(modules), len(modules), "")
 
     def run(self) -> None:
         """Do one step of every running world."""
@@ -130,7 +135,15 @@ class Stepper:
         m, w, launch, state = self.model, self.work, self.launch, self.state
         launch(self.kernels.begin_attempt, m.worlds, [w.step, w.newton])
         running = w.step.running
-        args = [w.step, m.is_position, m.topology.free, state.displacement, state.velocity, self.u_before, self.v_before]
+        args = [
+            w.step,
+            m.is_position,
+            m.topology.free,
+            state.displacement,
+            state.velocity,
+            self.u_before,
+            self.v_before,
+        ]
         launch(self.kernels.predict, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
         self._loads(running)
         self._damping(running)
@@ -149,7 +162,9 @@ class Stepper:
         k = loads.kernels
         if loads.law_count:
             launch(
-                k.evaluate_laws, (m.worlds, loads.law_count), [loads.laws, w.step.new_time, w.step.ramp, active, w.law_value]
+                k.evaluate_laws,
+                (m.worlds, loads.law_count),
+                [loads.laws, w.step.new_time, w.step.ramp, active, w.law_value],
             )
             for kernel, law in loads.function_laws:
                 launch(kernel, m.worlds, [law, w.step.new_time, active, w.law_value])

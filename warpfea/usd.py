@@ -74,9 +74,7 @@ class USDWriter(Output):
         self.fps = FrameClock(fps).fps
         self.color = color
         self.fields = list(dict.fromkeys([*fields, *([color] if color else [])]))
-        if color_range is not None and not (
-            np.isfinite(color_range).all() and color_range[0] < color_range[1]
-        ):
+        if color_range is not None and not (np.isfinite(color_range).all() and color_range[0] < color_range[1]):
             raise OutputError(f"color_range must be two finite rising numbers, got {color_range!r}")
         self.color_range = color_range
         self.spacing = spacing
@@ -248,9 +246,7 @@ class _Mesh:
         self.color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
         api = UsdGeom.PrimvarsAPI(mesh)
         self.fields = {
-            name: api.CreatePrimvar(
-                Tf.MakeValidIdentifier(name), Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex
-            )
+            name: api.CreatePrimvar(Tf.MakeValidIdentifier(name), Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
             for name in fields
         }
 
@@ -294,9 +290,7 @@ def _pair(pair: tuple[float, float]) -> Any:
     return Gf.Vec2d(float(pair[0]), float(pair[1]))
 
 
-def _define_view(
-    stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], up_axis: str
-) -> None:
+def _define_view(stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], up_axis: str) -> None:
     """A camera that frames the box (m) from the front right above, a sky and a sun."""
     from pxr import Gf, UsdGeom, UsdLux
 

@@ -109,9 +109,7 @@ class VTUWriter(Output):
             for world in range(int(sim.model.worlds)):
                 file = f"{name}_{world:04d}_{frame:06d}.vtu"
                 of_world = {key: np.ascontiguousarray(value[world]) for key, value in data.items()}
-                write_whole(
-                    self.folder / file, functools.partial(_write_vtu, body, positions[world], of_world)
-                )
+                write_whole(self.folder / file, functools.partial(_write_vtu, body, positions[world], of_world))
                 files.append(file)
         if frame + 1 >= self._listed + max(1, self._listed // 10):
             self._write_series()

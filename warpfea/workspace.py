@@ -28,11 +28,19 @@ class Workspace:
         self.device = model.device
         self.bytes: dict[str, int] = {}
         B, n, vec3 = model.worlds, model.slots, model.types.vec3
-        field = lambda name: self.array(name, (B, n), vec3)  # noqa: E731
-        for name in ("v", "u", "q_tilde", "v_tilde", "base", "direction", "r", "z", "p", "Hp"):
-            setattr(self, name, field(name))
-        for name in ("g", "inertia", "internal", "dead", "dead_magnitude", "diagonal"):
-            setattr(self, name, field(name))
+
+        def field(name: str) -> wp.array:
+            return self.array(name, (B, n), vec3)
+
+        # the iterate and what it is measured from
+        self.v, self.u, self.base = field("v"), field("u"), field("base")
+        self.q_tilde, self.v_tilde = field("q_tilde"), field("v_tilde")
+        # conjugate gradients
+        self.direction, self.r, self.z, self.p, self.Hp = (field(k) for k in ("direction", "r", "z", "p", "Hp"))
+        # the parts of the residual, and the diagonal of H
+        self.g, self.inertia, self.internal = field("g"), field("inertia"), field("internal")
+        self.dead, self.dead_magnitude = field("dead"), field("dead_magnitude")
+        self.diagonal = field("diagonal")
         loads = model.loads
         self.inverse = self.array("inverse", (B, n), model.types.mat33)
         self.contribution = self.array("contribution", (B, model.contributions), vec3)
@@ -41,7 +49,9 @@ class Workspace:
         pushed = loads.nonpotential
         self.pushed = field("pushed") if pushed else none
         self.pushed_held = field("pushed_held") if pushed else none
-        self.pushed_contribution = self.array("pushed_contribution", (B, loads.pushed_entries), vec3) if pushed else none
+        self.pushed_contribution = (
+            self.array("pushed_contribution", (B, loads.pushed_entries), vec3) if pushed else none
+        )
         forms = {b.key.damping for b in model.blocks}
         self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
         self.explicit = field("explicit") if "explicit" in forms else none

@@ -63,9 +63,7 @@ class NewtonPCG:
 class NewtonLoop:
     """The iteration of all worlds: conditional loops on the device, one code path with and without capture."""
 
-    def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, options: NewtonPCG, *, inertia: bool
-    ) -> None:
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, options: NewtonPCG, *, inertia: bool) -> None:
         self.model, self.work, self.launch = model, work, launch
         self.kernels = newton_kernels(model.dtype)
         self.residual = Residual(model, work, launch)

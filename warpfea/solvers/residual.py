@@ -57,7 +57,17 @@ class Residual:
         launch(self.newton.reset_min_J, m.worlds, [w.newton, active])
         launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         for block in m.blocks:
-            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, w.contribution, w.energy_rows, w.newton.min_J]
+            args = [
+                block.data,
+                w.u,
+                w.v,
+                w.history,
+                w.step.dq_dv,
+                active,
+                w.contribution,
+                w.energy_rows,
+                w.newton.min_J,
+            ]
             launch(block.kernels.internal_force, (m.worlds, block.count), args)
         self.push(active)
         args = [m.topology, w.contribution, w.v, w.v_tilde, w.dead, w.dead_magnitude, w.pushed, w.pushed_held]
