@@ -74,7 +74,7 @@ def test_tangent_is_the_derivative_of_the_force(name, material, data):
     assert abs(K - K.T).max() < 1e-14 * abs(K).max()
     for seed in range(3):
         d = np.random.default_rng(seed).uniform(-1, 1, u.shape)
-        numeric = difference(lambda t: model.internal_force(state_of(model, u + t * d))[0], 1e-3)  # noqa: B023
+        numeric = difference(lambda t: model.internal_force(state_of(model, u + t * d))[0], 3e-4)  # noqa: B023
         assert data.error((K @ d.ravel()).reshape(-1, 3), numeric) < 1e-9
 
 
@@ -83,11 +83,11 @@ def test_force_is_the_derivative_of_the_energy(material, data):
     _, body, model = make("T10", law(material))
     u = deformed(body)
     d = np.random.default_rng(5).uniform(-1, 1, u.shape)
-    numeric = difference(lambda t: model.strain_energy(state_of(model, u + t * d))[0], 1e-3)
+    numeric = difference(lambda t: model.strain_energy(state_of(model, u + t * d))[0], 3e-4)
     assert data.error(numeric, np.sum(model.internal_force(state_of(model, u))[0] * d)) < 1e-10
 
 
-def test_tangent_of_each_world_is_its_own(data):
+def test_tangent_of_each_world_is_its_own():
     _, body, model = make("T10", law("svk"), worlds=2)
     u = np.stack([0 * body.reference, deformed(body)])
     state = model.state()
@@ -97,7 +97,8 @@ def test_tangent_of_each_world_is_its_own(data):
         K = model.tangent_matrix(state, world=world)
         expected = alone.tangent_matrix(state_of(alone, u[world]))
         assert abs(K - expected).max() == 0
-        assert data.error(model.internal_force(state)[world], alone.internal_force(state_of(alone, u[world]))[0]) == 0
+        force = alone.internal_force(state_of(alone, u[world]))[0]
+        np.testing.assert_array_equal(model.internal_force(state)[world], force)
 
 
 # damping
@@ -151,7 +152,7 @@ def test_incremental_damping_has_a_potential(data):
     d = np.random.default_rng(2).uniform(-1, 1, u0.shape)
     force, _ = step_force(model, block, u0, u1, h)
     viscous = force - model.internal_force(state_of(model, u1))[0]
-    numeric = difference(lambda t: step_force(model, block, u0, u1 + t * d, h)[1], 1e-3)
+    numeric = difference(lambda t: step_force(model, block, u0, u1 + t * d, h)[1], 3e-4)
     assert data.error(numeric, np.sum(viscous * d)) < 1e-9
 
 
@@ -188,7 +189,7 @@ def test_rate_damping_swells_a_turning_body(data):
 
 @pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
 def test_a_spinning_damped_body_keeps_its_shape(integrator):
-    """More than a turn in steps of about 20 degrees; centrifugal strain is below 1e-5, damping far above elasticity."""
+    """More than a turn in steps of up to 20 degrees; centrifugal strain is below 1e-5, damping far above elasticity."""
     stiff = wf.SVK(E=1e8, nu=0.3, density=1.0, damping=wf.KelvinVoigt(1e7, 1e7))
     b, body, _ = make("T10", stiff)
     b.set_initial(body, angular_velocity=(10.0, 20.0, -20.0))
@@ -197,7 +198,7 @@ def test_a_spinning_damped_body_keeps_its_shape(integrator):
     X = body.mesh.points
     distances = lambda p: np.linalg.norm(p[:, None] - p[None], axis=2)  # noqa: E731
     worst, turned, before = 0.0, 0.0, X
-    for _ in range(30):
+    for _ in range(50):
         sim.step()
         x = sim.positions(body)[0]
         worst = max(worst, np.abs(distances(x) - distances(X)).max())
@@ -205,5 +206,5 @@ def test_a_spinning_damped_body_keeps_its_shape(integrator):
         R = a @ np.diag([1, 1, np.linalg.det(a @ c)]) @ c
         turned += math.degrees(math.acos(min(1.0, (np.trace(R) - 1) / 2)))
         before = x
-    assert turned > 360 if integrator == "bdf2" else turned > 90
-    assert worst < 1e-4
+    assert turned > 360
+    assert worst < 1e-5

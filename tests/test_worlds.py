@@ -95,7 +95,7 @@ def test_a_registered_array_is_known_everywhere(tmp_path):
     from warpfea.checkpoint import load_checkpoint, save_checkpoint
 
     save_checkpoint(sim, tmp_path / "c.npz")
-    assert np.all(np.load(tmp_path / "c.npz", allow_pickle=False)["state/dummy"] == 1.0)
+    assert np.all(np.load(tmp_path / "c.npz", allow_pickle=False)["state.dummy"] == 1.0)
     state.dummy.fill_(2.0)
     load_checkpoint(sim, tmp_path / "c.npz")
     assert np.all(state.dummy.numpy() == 1.0)

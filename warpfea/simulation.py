@@ -84,6 +84,7 @@ class Simulation:
         constraint_tol: for joints, which are not part of this version.
         ledger: keep the energy ledger.
         capture: record a step as one graph, on the GPU and on the CPU.
+        on_compile: called with (modules ready, modules in all, name) while kernels compile.
         on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
             several only once all have failed.
 
@@ -103,8 +104,9 @@ class Simulation:
         ledger: bool = True,
         capture: bool = True,
         on_failure: str | None = None,
+        on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
-        self._start(model, state, integrators.get(integrator), solver or NewtonPCG(), ledger, capture)
+        self._start(model, state, integrators.get(integrator), solver or NewtonPCG(), ledger, capture, on_compile)
         self.dt = dt
         if on_failure not in (None, "raise", "freeze"):
             raise ModelError(f"on_failure = {on_failure!r} is neither 'raise' nor 'freeze'")
@@ -120,7 +122,14 @@ class Simulation:
         return self
 
     def _start(
-        self, model: Model, state: State | None, scheme: Any, solver: NewtonPCG, ledger: bool, capture: bool
+        self,
+        model: Model,
+        state: State | None,
+        scheme: Any,
+        solver: NewtonPCG,
+        ledger: bool,
+        capture: bool,
+        on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
         self.model = model
         self.state = model.state() if state is None else state
@@ -129,7 +138,9 @@ class Simulation:
         self.integrator = scheme
         self.solver = solver
         began = clock.perf_counter()
-        self.stepper = Stepper(model, self.state, scheme, solver, ledger=ledger, capture=capture)
+        self.stepper = Stepper(
+            model, self.state, scheme, solver, ledger=ledger, capture=capture, on_compile=on_compile
+        )
         self.compile_s = clock.perf_counter() - began
         self.steps = 0
         self.last: StepReport | None = None
@@ -275,7 +286,13 @@ class Simulation:
                 for out in outputs:
                     opened.append(out)
                     out.open(self)
+                for out in opened:
                     out.write(self)
+            except BaseException:  # nothing has been done yet: leave no half-empty files
+                for out in opened:
+                    out.abort()
+                raise
+            try:
                 for _ in range(total):
                     report = self.step()
                     for out in opened:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Stepper"]
 
+OnCompile = Callable[[int, int, str], None]
+
 
 class Stepper:
     """The launches of a step of all worlds, and the graph that replays them.
@@ -27,10 +33,18 @@ class Stepper:
     """
 
     def __init__(
-        self, model: Model, state: State, integrator: Integrator, solver: NewtonPCG, *, ledger: bool, capture: bool
+        self,
+        model: Model,
+        state: State,
+        integrator: Integrator,
+        solver: NewtonPCG,
+        *,
+        ledger: bool,
+        capture: bool,
+        on_compile: OnCompile | None = None,
     ) -> None:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
-        self.ledger = ledger
+        self.ledger, self.on_compile = ledger, on_compile
         self.launch = Launcher(model.device)
         self.kernels = step_kernels(model.dtype, integrator.coefficients, integrator.static, integrator.multistep)
         vec3 = model.types.vec3
@@ -48,6 +62,7 @@ class Stepper:
         self._bind()
         self._probe_tables = self._upload_probes() if model.probes else []
         self.backup = state.like() if solver.max_halvings > 0 else None
+        self._load_modules()
         if ledger:
             self.begin_ledger(~self.state.ledger.numpy().any(axis=1))
         self.graph = self._record() if capture else None
@@ -80,7 +95,6 @@ class Stepper:
         self.state.ledger.assign(ledger)
 
     def _record(self) -> wp.Graph:
-        self._load_modules()
         with wp.ScopedCapture(device=self.model.device) as capture:
             self.sequence()
         return capture.graph
@@ -101,13 +115,21 @@ class Stepper:
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
-        modules, device = self.modules(), self.model.device
-        for k, module in enumerate(modules):
-            if self.on_compile:
-                self.on_compile(k, len(modules), module.name)
-            wp.force_load(device=device, modules=[module])
-        if self.on_compile:
-            self.on_compile(len(modules), len(modules), "")
+        """Compile what a step launches, and what starts the ledger, on several threads; loaded modules cost nothing."""
+        from .kernels.gather import gather_kernels
+
+        m = self.model
+        modules = {module.name: module for module in self.modules()}
+        if self.ledger:
+            extra = [b.kernels_for(m.dtype, None).module for b in m.blocks] + [gather_kernels(m.dtype, False).module]
+            modules |= {module.name: module for module in extra}
+        with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
+            load = partial(wp.force_load, m.device, max_workers=0)
+            waiting = {pool.submit(load, [module]): name for name, module in modules.items()}
+            for done, future in enumerate(as_completed(waiting)):
+                future.result()
+                if self.on_compile:
+                    self.on_compile(done + 1, len(waiting), waiting[future])
 
     def run(self) -> None:
         """Do one step of every running world."""

@@ -1,0 +1,154 @@
+"""Every delivered line of the public interface, as users write it."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpfea as wf
+
+
+@wp.func
+def my_field(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
+    return wp.vec3d(wp.float64(0.0), wp.float64(0.0), -x[2])
+
+
+@pytest.fixture
+def hook_file(tmp_path):
+    """A mesh file with two element groups, a fixed and a pulled side."""
+    import meshio
+
+    mesh = wf.mesh.box((0.2, 0.1, 0.1), cells=(2, 1, 1))
+    arm = (mesh.centroids()[:, 0] < 0.1).astype(np.int32)
+    faces = {name: mesh.faces(mesh.surface_sets[side]) for name, side in (("fixed", "x-"), ("pull", "x+"))}
+    cells = [("tetra10", mesh.cells[arm == 1]), ("tetra10", mesh.cells[arm == 0])]
+    cells += [("triangle6", f) for f in faces.values()]
+    tags = [np.full(len(c), k + 1) for k, (_, c) in enumerate(cells)]
+    names = {"arm": [1, 3], "pad": [2, 3], "fixed": [3, 2], "pull": [4, 2]}
+    out = meshio.Mesh(
+        1e3 * mesh.points,
+        cells,
+        cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags},
+        field_data={k: np.array(v) for k, v in names.items()},
+    )
+    path = tmp_path / "hook.msh"
+    meshio.write(path, out, file_format="gmsh22", binary=False)
+    return path
+
+
+def test_the_interface(hook_file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    steel = wf.SVK(E=7e8, nu=0.33, density=2700.0)
+    rubber = wf.MooneyRivlin(
+        mu10=3e5, mu01=1e5, k=1e8, density=1000.0, damping=wf.KelvinVoigt(eta=3e3, lambda_v=4.5e3, form="incremental")
+    )
+    soft = wf.NeoHookean(mu=4e5, k=1e7, density=1000.0)
+    for law in (wf.SVK, wf.MooneyRivlin, wf.NeoHookean):
+        lam, mu = law.from_E_nu(E=1e6, nu=0.3, density=10.0).lame
+        assert (lam, mu) == pytest.approx((1e6 * 0.3 / (1.3 * 0.4), 1e6 / 2.6))
+
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81), up_axis="Z")
+    hook = b.add_solid(
+        "hook.msh",
+        material={"arm": steel, "pad": rubber},
+        quadrature="tet4",
+        scale=1e-3,
+        transform=None,
+        initial=None,
+        name="hook",
+    )
+    box = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(10, 2, 2), element="T10"), material=soft, name="box")
+    assert len(hook.nodes("fixed"))
+    assert len(hook.surface("pull"))
+    assert len(hook.elements("arm"))
+    assert len(hook.nodes(lambda X: X[:, 0] < 1e-9))
+    assert hook.at((0.1, 0, 0)).weights.sum() == pytest.approx(1.0)
+    assert len(box.surface("x+"))
+
+    b.clamp(hook.nodes("fixed"))
+    b.drive(box.nodes("x+"), displacement=([0, 1], [(0, 0, 0), (0.1, 0, 0)]))
+    b.drive(
+        box.nodes("x-"),
+        rotation=wf.Rotation(anchor=(0, 0.05, 0.05), axis=(1, 0, 0), angle=([0, 1], [0, np.pi / 2])),
+    )
+    b.add_point_load(box.at((0.5, 0.1, 0.05)), force=(0, 0, -100))
+    b.add_traction(hook.surface("pull"), (0, 0, -1e3))
+    b.add_pressure(box.surface("z+"), 2e4)
+    b.add_body_force(my_field, bodies=[box])
+    b.set_initial(hook, velocity=(0, 0, 0), angular_velocity=(0, 0, 0))
+    b.add_probe("tip", hook.surface("pull"))
+    b.add_probe("p", box.at((0.5, 0.05, 0.05)))
+
+    model = b.finalize(device="cpu", dtype="float64", worlds=1)
+    info = model.info()
+    assert {"features", "left_out", "bytes", "kernels"} <= set(info)
+    state = model.state()
+    assert state.displacement.shape == (1, model.slots)
+    assert state.velocity.shape == (1, model.slots)
+    assert state.time.shape == (1,)
+    sim = wf.Simulation(
+        model,
+        state,
+        dt=1e-3,
+        integrator="backward_euler",
+        solver=wf.NewtonPCG(tol=1e-8, max_newton=30, max_pcg=2000, preconditioner="auto"),
+        constraint_tol=1e-8,
+    )
+    rep = sim.step()
+    for name in ("converged", "newton", "pcg", "residual", "halvings", "status"):
+        assert getattr(rep, name).shape == (1,)
+    sim.run(
+        t_end=0.01,
+        outputs=[
+            wf.USDWriter("o.usdc", fps=60, fields=["von_mises"]),
+            wf.VTUWriter("vtu"),
+            wf.Checkpoint("c.npz", every=100),
+        ],
+        on_step=None,
+        progress=None,
+    )
+    sim.resume("c.npz")
+    assert sim.time == pytest.approx(0.01)
+
+    N = len(hook.mesh.points)
+    assert sim.positions(hook).shape == sim.displacements(hook).shape == sim.velocities(hook).shape == (1, N, 3)
+    p = sim.probe("tip")
+    assert p.time.shape == (10,)
+    assert p.position.shape == p.displacement.shape == p.velocity.shape == (1, 10, 3)
+    names = "kinetic strain potential work viscous contact friction integrator ledger_residual".split()
+    assert all(sim.energies()[name].shape == (1,) for name in names)
+    assert sim.field("von_mises", hook).shape == (1, N)
+    assert sim.reaction(hook.nodes("fixed")).shape == (1, 3)
+    assert model.internal_force(state).shape == model.viscous_force(state).shape == (1, model.slots, 3)
+    assert model.strain_energy(state).shape == (1,)
+    n = 3 * model.slots
+    assert model.mass_matrix().shape == model.tangent_matrix(state, world=0).shape == (n, n)
+    assert model.free_slots.shape == (model.slots, 3)
+    assert hook.slots.shape == (N,)
+
+
+def test_statics_and_worlds():
+    b = wf.ModelBuilder()
+    box = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(4, 1, 1)), material=wf.SVK(E=1e6, nu=0.3), name="box")
+    b.clamp(box.nodes("x-"))
+    b.add_probe("tip", box.surface("x+"))
+    static = wf.solve_static(b.finalize(device="cpu"), load_steps=10, tol=1e-10)
+    assert static.report.converged.all()
+    assert static.state.displacement.shape[0] == 1
+    assert static.probe("tip").displacement[0, -1, 2] < 0.0
+    m = b.finalize(device="cpu", worlds=4)
+    m.set_gravity(np.outer([1, 2, 3, 4], (0, 0, -1.0)))
+    s = wf.Simulation(m, dt=1e-3)
+    s.step(3)
+    assert list(s.status) == [0, 0, 0, 0]
+    tip = s.probe("tip").displacement[:, -1, 2]
+    assert tip == pytest.approx(tip[0] * np.arange(1, 5), rel=1e-6)
+    s.reset([True, False, False, True], state=None)
+    assert list(s.time > 0) == [False, True, True, False]
+
+
+def test_errors_derive_from_one():
+    for name in "MeshError ModelError ConvergenceError ConstraintError PenetrationError CapacityError CheckpointError".split():
+        assert issubclass(getattr(wf, name), wf.Error)
+    for name in ("GROUND", "Rectangle", "HalfSpace"):
+        with pytest.raises(NotImplementedError, match=name):
+            getattr(wf, name)
