@@ -148,15 +148,16 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
-        E = t.green(G)
-        tr = wp.trace(E)
+        # A = J^(-2/3) C - I has det(I + A) = 1, which gives its first invariant x = I1bar - 3 from terms of second
+        # order, without subtracting equal numbers; and then I2bar - 3 = x - det A
         j1 = t.volume_change(G)
         d = power_change(j1)
-        Jm = T(1.0) + d
-        psi = T(0.5) * c[1] * j1 * j1 + c[0] * (T(3.0) * d + T(2.0) * tr * Jm)
+        A = T(2.0) * (T(1.0) + d) * t.green(G) + d * t.identity()
+        q = T(0.5) * wp.ddot(A, A) - wp.determinant(A)
+        x = T(2.0) * q / (T(1.0) + wp.sqrt(wp.max(T(0.0), T(1.0) + T(2.0) * q)))
+        psi = T(0.5) * c[1] * j1 * j1 + c[0] * x
         if wp.static(second_invariant):
-            I2_change = T(4.0) * tr + T(2.0) * (tr * tr - wp.ddot(E, E))
-            psi = psi + c[2] * (T(3.0) * d * (T(2.0) + d) + Jm * Jm * I2_change)
+            psi = psi + c[2] * (x - wp.determinant(A))
         return psi
 
     @wp.func

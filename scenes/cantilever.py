@@ -6,12 +6,12 @@ import warpfea as wf
 from warpfea.scene import scene
 
 
-@scene(dt=1e-3, t_end=0.5, fps=120.0, speed=0.2)
+@scene(dt=2.5e-3, t_end=0.5, fps=120.0, speed=0.2, picture=0.2)
 def cantilever(
     *,
     length: float = 1.0,
     width: float = 0.1,
-    thickness: float = 0.025,
+    thickness: float = 0.03,
     cells: int = 10,
     E: float = 7e8,
     nu: float = 0.33,

@@ -8,13 +8,13 @@ import warpfea as wf
 from warpfea.scene import scene
 
 
-@scene(dt=1.0 / 120.0, t_end=1.5, fps=60.0, speed=0.5)
+@scene(dt=1.0 / 60.0, t_end=1.1, tol=1e-6, speed=0.5)
 def twist(
     *,
     length: float = 0.3,
     width: float = 0.06,
-    cells: int = 16,
-    across: int = 3,
+    cells: int = 12,
+    across: int = 2,
     turns: float = 1.0,
     duration: float = 1.0,
     mu10: float = 3e5,
@@ -40,9 +40,7 @@ def twist(
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     half = 0.5 * width
-    mesh = wf.mesh.box(
-        (length, width, width), cells=(cells, across, across), origin=(0.0, -half, -half), name="bar"
-    )
+    mesh = wf.mesh.box((length, width, width), cells=(cells, across, across), origin=(0.0, -half, -half), name="bar")
     bar = b.add_solid(mesh, material=wf.MooneyRivlin(mu10=mu10, mu01=mu01, k=k, density=density))
     b.clamp(bar.nodes("x-"))
     angle = ([0.0, duration], [0.0, 2.0 * math.pi * turns])

@@ -253,18 +253,24 @@ def test_t10_mass_of_one_tetrahedron(data, device):
 
 
 COMPACT = {
-    "T4": lambda: wf.mesh.box((1, 1, 1), cells=(1, 1, 1), element="T4"),
-    "T10": lambda: wf.mesh.box((1, 1, 1), cells=(1, 1, 1)),
-    "sphere": lambda: mesh("sphere"),
+    "T4": (lambda: wf.mesh.box((1, 1, 1), cells=(1, 1, 1), element="T4"), "tet1"),
+    "T10": (lambda: wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), "tet4"),
+    "sphere": (lambda: mesh("sphere"), "tet4"),
+    "sphere-tet14": (lambda: mesh("sphere"), "tet14"),
 }
-CURVED_RULE = "tet14"
+
+
+def compact(name, law, device):
+    build, rule = COMPACT[name]
+    body, model = make(build(), LAWS[law], rule, device=device)
+    assert model.features["table elements"] == name.startswith("sphere")
+    return body, model
 
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", COMPACT)
 def test_six_rigid_modes_and_no_more(name, law, device):
-    _, model = make(COMPACT[name](), LAWS[law], CURVED_RULE if name == "sphere" else None, device=device)
-    assert model.features["table elements"] == (name == "sphere")
+    _, model = compact(name, law, device)
     K = model.tangent_matrix(model.state()).toarray()
     values = np.linalg.eigvalsh(0.5 * (K + K.T))
     assert np.abs(values[:6]).max() < 1e-10 * values[-1]
@@ -275,7 +281,7 @@ def test_six_rigid_modes_and_no_more(name, law, device):
 @pytest.mark.parametrize("name", COMPACT)
 @pytest.mark.parametrize("angle", [1.0, 77.0, 180.0])
 def test_rigid_motion_costs_nothing(name, law, angle, device):
-    body, model = make(COMPACT[name](), LAWS[law], CURVED_RULE if name == "sphere" else None, device=device)
+    body, model = compact(name, law, device)
     stiffness_times_size = np.abs(model.tangent_matrix(model.state())).max() * 1.0
     u = body.reference @ (rotation(angle) - np.eye(3)).T + np.array([3.0, -4.0, 5.0])
     state = displaced(model, u)
@@ -287,7 +293,7 @@ def test_rigid_motion_costs_nothing(name, law, angle, device):
 @pytest.mark.parametrize("law", LAWS)
 def test_translation_is_exactly_free_of_force(law, device):
     """Displacements are taken relative to the element's first node: no round-off, however far."""
-    _, model = make(COMPACT["T10"](), LAWS[law], device=device)
+    _, model = compact("T10", law, device)
     state = displaced(model, np.tile([1e7, -3e6, 2e5], (model.slots, 1)))
     assert np.all(model.internal_force(state) == 0)
     assert np.all(model.strain_energy(state) == 0)

@@ -79,12 +79,13 @@ def save_checkpoint(sim: Simulation, path: str | os.PathLike[str]) -> None:
         "worlds": sim.model.worlds,
         "slots": sim.model.slots,
         "integrator": sim.integrator.name,
+        "gravity": sim.model.loads.gravity_host.tolist(),
         "dt": sim.dt,
         "steps": sim.steps,
         "max_residual": sim.max_residual,
         "probes": [probe.name for probe in sim.model.probes],
     }
-    arrays = {f"state.{name}": values for name, values in sim.state.numpy().items()}
+    arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
     arrays |= {f"total.{name}": values for name, values in sim.totals.items()}
     if sim._history:
         arrays["history"] = np.stack(sim._history)
@@ -100,7 +101,7 @@ def save_checkpoint(sim: Simulation, path: str | os.PathLike[str]) -> None:
 
 
 def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a checkpoint says of itself: schema, dtype, worlds, integrator, dt (s), steps, ... CheckpointError as below."""
+    """What a checkpoint says of itself: dtype, worlds, integrator, dt (s), steps, ... CheckpointError if unreadable."""
     return _read(pathlib.Path(path))[0]
 
 
@@ -140,13 +141,14 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Simulation) -> None:
         "slots": ("number of unknown slots", sim.model.slots),
         "probes": ("probes", [probe.name for probe in sim.model.probes]),
         "fingerprint": ("model", sim.model.fingerprint()),
+        "gravity": ("gravity", sim.model.loads.gravity_host.tolist()),
     }
     for key, (what, value) in expected.items():
         if meta.get(key) == value:
             continue
         if key == "fingerprint":
             raise CheckpointError(
-                f"{file}: the checkpoint is of another model: mesh, materials, supports, loads or gravity differ"
+                f"{file}: the checkpoint is of another model: mesh, materials, supports or loads differ"
             )
         raise CheckpointError(f"{file}: {what} of the checkpoint is {meta.get(key)!r}, of the simulation {value!r}")
 

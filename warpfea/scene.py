@@ -72,6 +72,7 @@ class Scene(Generic[P]):
         dt, t_end: step and end time, s. integrator: name. tol: of the solver, or None.
         fps: frames of a USD file per simulated second.
         speed: simulated seconds per second of an animation.
+        picture: time of a picture, s, or None for the end.
         description: first line of the docstring.
         parameters: by name.
     """
@@ -86,6 +87,7 @@ class Scene(Generic[P]):
         tol: float | None = None,
         fps: float = 60.0,
         speed: float = 1.0,
+        picture: float | None = None,
     ) -> None:
         for what, value in (("dt", dt), ("t_end", t_end), ("fps", fps), ("speed", speed)):
             if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
@@ -94,7 +96,7 @@ class Scene(Generic[P]):
         functools.update_wrapper(self, function)
         self.name = function.__name__
         self.dt, self.t_end, self.fps, self.speed = float(dt), float(t_end), float(fps), float(speed)
-        self.integrator, self.tol = integrator, tol
+        self.integrator, self.tol, self.picture = integrator, tol, picture
         text = inspect.getdoc(function) or ""
         self.description = text.split("\n\n")[0].replace("\n", " ").strip()
         self.details = text.partition("\n\n")[2].partition("Args:")[0].strip()
@@ -133,9 +135,8 @@ class Scene(Generic[P]):
         out = {}
         for name, parameter in self.parameters.items():
             if name not in given and parameter.required:
-                raise ModelError(
-                    f"scene {self.name!r}: parameter {name!r} ({parameter.kind_name}) has no default, give --set {name}=..."
-                )
+                kind = parameter.kind_name
+                raise ModelError(f"scene {self.name!r}: parameter {name!r} ({kind}) has no default, give --set {name}=")
             out[name] = given.get(name, parameter.default)
         return out
 
@@ -163,6 +164,7 @@ def scene(
     tol: float | None = None,
     fps: float = 60.0,
     speed: float = 1.0,
+    picture: float | None = None,
 ) -> Callable[[Callable[P, ModelBuilder]], Scene[P]]:
     """Make a function that returns a ModelBuilder a scene.
 
@@ -173,13 +175,16 @@ def scene(
         tol: default tolerance of the solver; None: the solver's own.
         fps: frames per simulated second in a USD file.
         speed: simulated seconds per second of a GIF; less than 1 is slow motion.
+        picture: time that a PNG shows, s; None: the end.
 
     Raises:
         ModelError: a number that is not positive.
     """
 
     def decorate(function: Callable[P, ModelBuilder]) -> Scene[P]:
-        return Scene(function, dt=dt, t_end=t_end, integrator=integrator, tol=tol, fps=fps, speed=speed)
+        return Scene(
+            function, dt=dt, t_end=t_end, integrator=integrator, tol=tol, fps=fps, speed=speed, picture=picture
+        )
 
     return decorate
 
@@ -189,9 +194,8 @@ def scene(
 
 def names() -> list[str]:
     """Names of the scenes that come with warpfea. Imports none of them."""
-    from . import scenes
-
-    return sorted(m.name for m in pkgutil.iter_modules(scenes.__path__) if not m.name.startswith("_"))
+    package = importlib.import_module(f"{__package__}.scenes")
+    return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if not m.name.startswith("_"))
 
 
 def find(name: str) -> Scene[Any]:

@@ -138,9 +138,7 @@ class Simulation:
         self.integrator = scheme
         self.solver = solver
         began = clock.perf_counter()
-        self.stepper = Stepper(
-            model, self.state, scheme, solver, ledger=ledger, capture=capture, on_compile=on_compile
-        )
+        self.stepper = Stepper(model, self.state, scheme, solver, ledger=ledger, capture=capture, on_compile=on_compile)
         self.compile_s = clock.perf_counter() - began
         self.steps = 0
         self.last: StepReport | None = None
@@ -440,12 +438,15 @@ class Simulation:
 
 
 def _close(opened: list[Any], sim: Simulation, *, quiet: bool = True) -> None:
+    """Close all, also after one has failed; then raise the first error, unless `quiet`."""
+    failed: Exception | None = None
     for out in opened:
-        if quiet:
-            with contextlib.suppress(Exception):
-                out.close(sim)
-        else:
+        try:
             out.close(sim)
+        except Exception as error:
+            failed = failed or error
+    if failed and not quiet:
+        raise failed
 
 
 @contextlib.contextmanager

@@ -1,0 +1,43 @@
+"""A hook of soft rubber, pulled by a sling and let go."""
+
+from __future__ import annotations
+
+import pathlib
+
+import warpfea as wf
+from warpfea.scene import scene
+
+MESH = pathlib.Path(__file__).with_name("hook.msh")
+
+
+@scene(dt=1.0 / 240.0, t_end=0.26, tol=1e-3, fps=240.0, speed=0.1, picture=0.14)
+def hook(
+    *,
+    pull: float = 1200.0,
+    hold: float = 0.13,
+    E: float = 2.5e5,
+    nu: float = 0.35,
+    density: float = 1070.0,
+) -> wf.ModelBuilder:
+    """A crane hook of soft rubber, from a Gmsh mesh, is pulled down by a sling, opens and springs back.
+
+    The mesh (hook.msh, made from the hook.geo beside it) has 3119 T10 elements, straight and curved, and the groups
+    "fixed", the top of the shank, and "pull", the saddle where the sling lies. The pull grows for 0.06 s, is held, and
+    is released within 0.01 s; gravity acts all the time. All is seen in slow motion, 240 frames per second.
+
+    Args:
+        pull: largest traction of the sling on its saddle (5.6e-4 m^2), Pa.
+        hold: when the sling is let go, s.
+        E: Young's modulus (SVK), Pa.
+        nu: Poisson's ratio.
+        density: kg/m^3.
+    """
+    b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    body = b.add_solid(MESH, material=wf.SVK(E=E, nu=nu, density=density))
+    b.clamp(body.nodes("fixed"))
+    down = (0.0, 0.0, -pull)
+    rise = min(0.06, 0.5 * hold)
+    b.add_traction(body.surface("pull"), ([0.0, rise, hold, hold + 0.01], [(0, 0, 0), down, down, (0, 0, 0)]))
+    b.add_probe("saddle", body.surface("pull"))
+    b.add_probe("tip", body.nodes(lambda X: (X[:, 0] > 0.03) & (X[:, 2] > 0.065)))
+    return b

@@ -1,0 +1,256 @@
+"""`warpfea bench`: time and error of the solver on a bar of 3 x 2 x 1 m that is pulled at its end.
+
+T10, SVK (E = 7e8 Pa, nu = 0.33, 2700 kg/m^3), clamped at x = 0; 5000 N in +x act on the face x = 3 from t = 0, as a
+uniform traction, consistently spread over its nodes; no gravity. Sizes are numbers of unknowns, met as closely as cells
+near the proportion 3 : 2 : 1 allow. The tip is the mean of the face x = 3; its error is measured against the same mesh
+and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pathlib
+import platform
+import shlex
+import statistics
+import subprocess
+import sys
+import time as clock
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from . import mesh as meshes
+from .builder import ModelBuilder
+from .materials import SVK
+from .model import Model
+from .simulation import Simulation
+from .solvers import NewtonPCG
+
+__all__ = ["Row", "bar", "bar_cells", "bench", "machine", "measure"]
+
+SCHEMA = 1
+SIZE = (3.0, 2.0, 1.0)
+FORCE = 5000.0
+E, NU, DENSITY = 7e8, 0.33, 2700.0
+WARM_UP = 2
+TIGHTER = 100.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """A measurement. Times in ms or s, the tip in m; `tip_error` is None where no reference was made."""
+
+    dtype: str
+    unknowns: int
+    elements: int
+    ms_per_step: float
+    newton_per_step: float
+    pcg_per_step: float
+    bytes_per_unknown: float
+    residual: float
+    tip: float
+    tip_error: float | None
+    setup_s: float
+    compile_s: float
+
+
+def unknowns_of(cells: tuple[int, int, int]) -> int:
+    """Unknowns of a T10 box whose face x = 0 is clamped."""
+    nx, ny, nz = cells
+    return 3 * (2 * nx) * (2 * ny + 1) * (2 * nz + 1)
+
+
+def bar_cells(unknowns: int) -> tuple[int, int, int]:
+    """Cells close to the proportion 3 : 2 : 1 whose number of unknowns is nearest in ratio."""
+    limit = 2.0 * (unknowns / 72.0) ** (1.0 / 3.0) + 2.0
+    choices = {tuple(max(1, round(k * s)) for k in (3, 2, 1)) for s in np.arange(1.0, limit, 0.05)}
+    return min(sorted(choices), key=lambda cells: abs(np.log(unknowns_of(cells) / unknowns)))  # type: ignore[arg-type, return-value]
+
+
+def bar(cells: tuple[int, int, int]) -> ModelBuilder:
+    """The bar."""
+    b = ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = b.add_solid(meshes.box(SIZE, cells=cells), material=SVK(E=E, nu=NU, density=DENSITY), name="bar")
+    b.clamp(body.nodes("x-"))
+    b.add_traction(body.surface("x+"), (FORCE / (SIZE[1] * SIZE[2]), 0.0, 0.0))
+    b.add_probe("tip", body.surface("x+"))
+    return b
+
+
+def run_once(model: Model, *, dt: float, steps: int, tol: float | None) -> tuple[Simulation, list[float], float]:
+    """Simulate from rest: the simulation, seconds of each step, seconds until it was ready."""
+    began = clock.perf_counter()
+    sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol, max_pcg=20000), ledger=False)
+    ready = clock.perf_counter() - began
+    times = []
+    for _ in range(steps):
+        start = clock.perf_counter()
+        sim.step()  # reads its report, and so waits for the device
+        times.append(clock.perf_counter() - start)
+    return sim, times, ready
+
+
+def tip_of(sim: Simulation) -> np.ndarray:
+    """Displacement of the tip along x after each step, m."""
+    return sim.probe("tip").displacement[0, :, 0]
+
+
+def measure(
+    cells: tuple[int, int, int],
+    dtypes: list[str],
+    *,
+    device: Any,
+    steps: int,
+    repeat: int,
+    dt: float,
+    tol: float | None,
+    with_reference: bool,
+) -> list[Row]:
+    """Rows of one mesh, one per precision."""
+    builder = bar(cells)
+    reference = None
+    if with_reference:
+        tight = NewtonPCG(tol=tol).tolerance("float64") / TIGHTER
+        reference = tip_of(run_once(builder.finalize(device=device), dt=dt, steps=steps, tol=tight)[0])
+    rows = []
+    for dtype in dtypes:
+        began = clock.perf_counter()
+        model = builder.finalize(device=device, dtype=dtype)
+        setup = clock.perf_counter() - began
+        times: list[float] = []
+        sim, first, ready = run_once(model, dt=dt, steps=steps, tol=tol)
+        for k in range(repeat):
+            if k:
+                _, first, _ = run_once(model, dt=dt, steps=steps, tol=tol)
+            times += first[min(WARM_UP, steps - 1) :]
+        tip = tip_of(sim)
+        error = None if reference is None else float(np.abs(tip - reference).max() / np.abs(reference).max())
+        info = model.info()
+        rows.append(
+            Row(
+                dtype=dtype,
+                unknowns=info["unknowns"],
+                elements=info["elements"],
+                ms_per_step=1e3 * statistics.median(times),
+                newton_per_step=float(sim.totals["newton"][0]) / steps,
+                pcg_per_step=float(sim.totals["pcg"][0]) / steps,
+                bytes_per_unknown=sum(sim.bytes().values()) / info["unknowns"],
+                residual=float(sim.max_residual),
+                tip=float(tip[-1]),
+                tip_error=error,
+                setup_s=setup,
+                compile_s=ready,
+            )
+        )
+    return rows
+
+
+def bench(options: argparse.Namespace) -> int:
+    """Do `warpfea bench`."""
+    from .cli.console import quiet_warp, write_json
+    from .cli.parser import UsageError
+    from .outputs import check_target
+
+    if options.out is not None:
+        if pathlib.Path(options.out).suffix != ".json":
+            raise UsageError(f"--out {options.out}: the file name must end in .json")
+        check_target(options.out, (".json",))
+    smallest = unknowns_of((3, 2, 1))
+    if min(options.unknowns) < smallest:
+        raise UsageError(f"--unknowns {min(options.unknowns)}: the smallest bar has {smallest}")
+    settings: dict[str, Any] = {
+        "unknowns": options.unknowns,
+        "dtypes": options.dtype or ["float64", "float32"],
+        "steps": options.steps,
+        "repeat": options.repeat,
+        "dt": options.dt,
+        "tol": options.tol,
+        "reference_tolerance_factor": 1.0 / TIGHTER,
+        "reference_up_to": max(options.reference_up_to),
+        "warm_up_steps": min(WARM_UP, options.steps - 1),
+    }
+    rows: list[Row] = []
+    with quiet_warp():
+        print(HEADER, flush=True)
+        for wanted in options.unknowns:
+            found = measure(
+                bar_cells(wanted),
+                settings["dtypes"],
+                device=options.device,
+                steps=options.steps,
+                repeat=options.repeat,
+                dt=options.dt,
+                tol=options.tol,
+                with_reference=wanted <= settings["reference_up_to"],
+            )
+            rows += found
+            for row in found:
+                print(_line(row), flush=True)
+        content = {
+            "schema": SCHEMA,
+            "command": shlex.join(["warpfea", *(options.words or ["bench"])]),
+            "commit": _commit(),
+            "machine": machine(options.device),
+            "versions": _versions(),
+            "settings": settings,
+            "rows": [asdict(row) for row in rows],
+        }
+    if options.out is not None:
+        write_json(options.out, content)
+    return 0
+
+
+HEADER = (
+    f"{'dtype':8} {'unknowns':>9} {'elements':>9} {'ms/step':>10} {'Newton':>7} {'PCG':>7} {'B/unknown':>9} "
+    f"{'residual':>9} {'tip, m':>13} {'tip error':>9} {'set-up, s':>9} {'compile, s':>10}"
+)
+
+
+def _line(r: Row) -> str:
+    error = "-" if r.tip_error is None else f"{r.tip_error:.1e}"
+    return (
+        f"{r.dtype:8} {r.unknowns:9d} {r.elements:9d} {r.ms_per_step:10.2f} {r.newton_per_step:7.1f} "
+        f"{r.pcg_per_step:7.0f} {r.bytes_per_unknown:9.0f} {r.residual:9.1e} {r.tip:13.6e} {error:>9} "
+        f"{r.setup_s:9.1f} {r.compile_s:10.1f}"
+    )
+
+
+def machine(device: Any) -> dict[str, Any]:
+    """The computer: processor, its cores, and the device that was used."""
+    used = wp.get_device(device) if device else wp.get_preferred_device()
+    out = {"cpu": _cpu_name(), "cores": os.cpu_count(), "system": platform.system(), "device": str(used)}
+    if used.is_cuda:
+        out |= {"gpu": used.name, "compute_capability": used.arch, "cuda_driver": str(wp.get_cuda_driver_version())}
+    return out
+
+
+def _cpu_name() -> str:
+    if sys.platform == "linux":
+        for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """Commit of the checkout that this runs from, with + if files differ; None without git or outside a checkout."""
+    root = pathlib.Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        ask = lambda *words: subprocess.run(  # noqa: E731
+            ["git", *words], cwd=root, capture_output=True, text=True, check=True
+        ).stdout.strip()
+        return str(ask("rev-parse", "HEAD")) + ("+" if ask("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _versions() -> dict[str, str]:
+    from .cli.summary import versions
+
+    return versions()

@@ -1,0 +1,307 @@
+"""The options of all commands, and help that teaches by examples."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from ..errors import Error
+
+__all__ = ["UsageError", "parse"]
+
+EXAMPLES = """\
+examples:
+  warpfea run hook --usd hook.usdc --png hook.png       a scene that comes with warpfea
+  warpfea run my_scenes.py:swing --set length=2         a scene of your own
+  warpfea run part.msh --material svk:E=7e8,nu=0.33,density=2700 \\
+      --clamp base --traction tip:0,0,-1e3              a mesh with named groups
+  warpfea scenes hook                                   what can be set in a scene
+  warpfea info hook                                     what a scene costs, before running it
+
+exit codes: 0 done, 2 bad input or usage, 3 not converged, 4 output failed, 130 interrupted (files are valid)
+"""
+
+RUN_EXAMPLES = """\
+examples:
+  warpfea run cantilever --set E=2e9 --set length=1.5 --t-end 1 --gif bend.gif
+  warpfea run twist --device cuda:0 --dtype float32 --usd twist.usdc --json -
+  warpfea run part.msh --scale 1e-3 --material svk:E=7e8,nu=0.33,density=2700 --clamp base --pressure top:2e4
+  warpfea run part.msh --material arm=svk:E=7e8,nu=0.33,density=2700 \
+      --material pad=neo_hookean:mu=4e5,k=1e7,density=1000 --gravity 0,0,-9.81
+  warpfea run hook --checkpoint hook.npz                Ctrl-C at any time, then
+  warpfea run hook --checkpoint hook.npz --resume hook.npz
+
+materials:
+  svk:E=,nu=,density=                                   St. Venant-Kirchhoff
+  neo_hookean:mu=,k=,density=      or  E=,nu=,density=
+  mooney_rivlin:mu10=,mu01=,k=,density=  or  E=,nu=,density=
+  with damping: add eta= and lambda_v= (Pa s), and form=incremental, rate or explicit
+
+A scene file is Python:
+  import warpfea as wf
+
+  @wf.scene(dt=1e-3, t_end=0.5)
+  def swing(*, length: float = 1.0) -> wf.ModelBuilder:
+      ...
+"""
+
+LATER = {
+    "study": "studies of error against run time",
+    "stress": "the suite of stiff and extreme cases",
+    "sweep": "sweeps over parameters on many devices",
+    "profile": "profiles of kernels",
+}
+MATERIAL_HINT = "e.g. svk:E=7e8,nu=0.33,density=2700"
+
+
+class UsageError(Error):
+    """The command line is wrong."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def __init__(self, *args: Any, **options: Any) -> None:
+        defaults: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+        super().__init__(*args, **(defaults | options))
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message} ({self.prog} --help tells more)")
+
+
+def positive(text: str) -> float:
+    """A positive finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive finite number")
+    return value
+
+
+def count(text: str) -> int:
+    """A positive whole number."""
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
+    return int(text)
+
+
+def counts(text: str) -> list[int]:
+    """Positive whole numbers with commas; 1e5 counts as one."""
+    try:
+        values = [float(part) for part in text.split(",")]
+        assert all(math.isfinite(v) and v >= 1 and v == int(v) for v in values)
+    except (ValueError, AssertionError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of positive whole numbers") from None
+    return [int(v) for v in values]
+
+
+def numbers(text: str, size: int) -> tuple[float, ...]:
+    """Finite numbers with commas."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != size or not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not {size} finite numbers with commas")
+    return values
+
+
+def vector(text: str) -> tuple[float, ...]:
+    return numbers(text, 3)
+
+
+def pair(text: str) -> tuple[float, ...]:
+    return numbers(text, 2)
+
+
+def size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT in pixels."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT, such as 960x540")
+    return int(match[1]), int(match[2])
+
+
+def parse(words: Sequence[str]) -> argparse.Namespace:
+    """The arguments, with `command` the function that does them. UsageError; SystemExit after --help."""
+    from .. import __version__
+
+    top = _Parser(
+        prog="warpfea",
+        description="Flexible multibody dynamics with Total Lagrangian finite elements in NVIDIA Warp.",
+        epilog=EXAMPLES,
+    )
+    top.add_argument("--version", action="version", version=f"warpfea {__version__}")
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", parser_class=_Parser)
+    _add_run(commands)
+    _add_scenes(commands)
+    _add_info(commands)
+    _add_render(commands)
+    _add_bench(commands)
+    for name, what in LATER.items():
+        commands.add_parser(name, help=f"{what} (not part of this version)", add_help=False)
+    if words and words[0] in LATER:
+        raise UsageError(f"{words[0]}: {LATER[words[0]]} are not part of this version")
+    arguments = top.parse_args(_join_negative(words))
+    arguments.words = list(words)
+    if not hasattr(arguments, "command"):
+        top.print_help()
+        raise UsageError(f"give a command: run, scenes, info, render, bench ({top.prog} --help tells more)")
+    return arguments
+
+
+def _join_negative(words: Sequence[str]) -> list[str]:
+    """`--gravity -1,0,0` as `--gravity=-1,0,0`: argparse takes a word that begins with - for an option."""
+    out: list[str] = []
+    for word in words:
+        if out and out[-1] in ("--gravity", "--view") and re.match(r"-[\d.]", word):
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from ..bench import bench
+
+    return bench(arguments)
+
+
+def _call(module: str, function: str) -> Any:
+    """The command, imported when it is called."""
+
+    def command(arguments: argparse.Namespace) -> int:
+        import importlib
+
+        return int(getattr(importlib.import_module(f"{__package__}.{module}"), function)(arguments))
+
+    return command
+
+
+def _add_general(to: argparse.ArgumentParser) -> None:
+    group = to.add_argument_group("general")
+    group.add_argument("--quiet", action="store_true", help="no bars and no summary table")
+    group.add_argument("--no-progress", action="store_true", help="no bars; there are none without a terminal")
+    group.add_argument("--debug", action="store_true", help="errors as Python tracebacks")
+
+
+def _add_model(to: argparse.ArgumentParser) -> None:
+    """What is simulated and how: shared by run and info."""
+    to.add_argument("what", metavar="SCENE", help="a scene, file.py or file.py:scene, or a mesh (.msh, .vtu, .inp)")
+    to.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter of the scene")
+    mesh = to.add_argument_group("for a mesh file (vectors are x,y,z; repeat an option for several groups)")
+    mesh.add_argument(
+        "--material", action="append", default=[], metavar="[GROUP=]LAW:NAME=VALUE,...", help=MATERIAL_HINT
+    )
+    mesh.add_argument("--clamp", action="append", default=[], metavar="GROUP", help="hold the nodes of a group")
+    mesh.add_argument(
+        "--traction", action="append", default=[], metavar="GROUP:x,y,z", help="dead load on a surface, Pa"
+    )
+    mesh.add_argument(
+        "--pressure", action="append", default=[], metavar="GROUP:p", help="follower pressure on a surface, Pa"
+    )
+    mesh.add_argument("--gravity", type=vector, metavar="x,y,z", help="m/s^2, by default 9.81 downwards")
+    mesh.add_argument("--scale", type=positive, metavar="S", help="metres per unit of the file, 1e-3 for mm")
+    mesh.add_argument("--up-axis", choices=("Y", "Z"), help="by default Z")
+    mesh.add_argument("--quadrature", metavar="RULE", help="force rule: tet4, tet5_paper, tet14 (T10), tet1, tet4 (T4)")
+    how = to.add_argument_group("simulation (defaults are the scene's)")
+    how.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
+    how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
+    how.add_argument("--dt", type=positive, metavar="S", help="step, s")
+    how.add_argument("--integrator", metavar="NAME", help="backward_euler or bdf2")
+    how.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
+
+
+def _add_run(commands: Any) -> None:
+    to = commands.add_parser(
+        "run",
+        help="simulate a scene or a mesh",
+        description="Simulate a scene, your own scene file, or a mesh.",
+        epilog=RUN_EXAMPLES,
+    )
+    _add_model(to)
+    to.add_argument("--t-end", type=positive, metavar="S", help="end time, s (default: the scene's)")
+    out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
+    out.add_argument("--usd", metavar="FILE", help="animation (.usdc, .usda) with stress and displacement; validated")
+    out.add_argument("--vtu", metavar="FOLDER", help="series of .vtu and a .pvd for ParaView")
+    out.add_argument("--png", metavar="FILE", help="picture")
+    out.add_argument("--png-time", type=float, metavar="S", help="time of the picture")
+    out.add_argument("--gif", metavar="FILE", help="animation")
+    out.add_argument("--fps", type=positive, metavar="N", help="frames per simulated second of --usd and --vtu")
+    out.add_argument("--speed", type=positive, metavar="X", help="simulated seconds per second of --gif")
+    out.add_argument("--json", metavar="FILE", help="summary of the run; - for stdout")
+    out.add_argument("--checkpoint", metavar="FILE", help="state (.npz), written every --every steps and at the end")
+    out.add_argument("--every", type=count, default=100, metavar="N", help="steps between checkpoints (default 100)")
+    out.add_argument("--resume", metavar="FILE", help="go on from a checkpoint, with its dt, integrator and precision")
+    _add_general(to)
+    to.set_defaults(command=_call("run", "run"))
+
+
+def _add_scenes(commands: Any) -> None:
+    to = commands.add_parser("scenes", help="list scenes, or the parameters of one", description="List scenes.")
+    to.add_argument("what", nargs="?", metavar="SCENE", help="a scene, file.py or file.py:scene: show its parameters")
+    _add_general(to)
+    to.set_defaults(command=_call("show", "scenes"))
+
+
+def _add_info(commands: Any) -> None:
+    to = commands.add_parser(
+        "info",
+        help="what a scene uses, leaves out and costs",
+        description="What a scene uses and what was left out, with counts, bytes, kernels and launches per step.",
+    )
+    _add_model(to)
+    to.add_argument("--json", metavar="FILE", help="the same as JSON; - for stdout")
+    _add_general(to)
+    to.set_defaults(command=_call("show", "info"))
+
+
+def _add_render(commands: Any) -> None:
+    to = commands.add_parser(
+        "render",
+        help="draw a USD file written by warpfea",
+        description="Draw a USD file written by warpfea to .png or .gif, on the CPU, without a display.",
+        epilog="examples:\n  warpfea render hook.usdc -o hook.png --time 0.1\n"
+        "  warpfea render hook.usdc -o hook.gif --speed 0.1 --field displacement",
+    )
+    to.add_argument("file", help="the USD file")
+    to.add_argument("-o", "--output", required=True, metavar="FILE", help="picture (.png) or animation (.gif)")
+    to.add_argument("--time", type=float, metavar="S", help="time of a .png (default: the last)")
+    to.add_argument("--field", metavar="NAME", help="field in colour: von_mises, displacement")
+    to.add_argument("--size", type=size, metavar="WxH", help="pixels")
+    to.add_argument("--view", type=pair, metavar="AZIMUTH,ELEVATION", help="of the camera, degrees")
+    to.add_argument("--fps", type=positive, default=20.0, metavar="N", help="frames per second of a .gif (default 20)")
+    to.add_argument("--speed", type=positive, default=1.0, metavar="X", help="simulated seconds per second of a .gif")
+    _add_general(to)
+    to.set_defaults(command=_call("show", "render"))
+
+
+def _add_bench(commands: Any) -> None:
+    to = commands.add_parser(
+        "bench",
+        help="time and error of the solver on a bar",
+        description="A bar of 3 x 2 x 1 m (T10, SVK, E = 7e8 Pa, nu = 0.33, 2700 kg/m^3), clamped at x = 0, "
+        "pulled by 5000 N in +x at x = 3: ms per step, PCG iterations, bytes per unknown, residual, tip error.",
+    )
+    to.add_argument(
+        "--unknowns", type=counts, default=[1000, 10000], metavar="N,N,...", help="sizes (default 1000,10000)"
+    )
+    to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
+    to.add_argument("--dtype", action="append", choices=("float64", "float32"), help="may be repeated; default both")
+    to.add_argument("--steps", type=count, default=10, metavar="N", help="steps that are simulated (default 10)")
+    to.add_argument("--repeat", type=count, default=3, metavar="N", help="runs, of which the median counts (default 3)")
+    to.add_argument("--dt", type=positive, default=1e-3, metavar="S", help="step, s (default 1e-3)")
+    to.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
+    to.add_argument(
+        "--reference-up-to",
+        type=counts,
+        default=[100000],
+        metavar="N",
+        help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
+    )
+    to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")
+    _add_general(to)
+    to.set_defaults(command=_bench)

@@ -1,0 +1,134 @@
+"""`warpfea run`: simulate, write files, sum up."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import sys
+import time as clock
+from collections.abc import Sequence
+from typing import Any
+
+from ..checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
+from ..checkpoint import Checkpoint, load_checkpoint, read_meta
+from ..errors import ConvergenceError, OutputError
+from ..outputs import Output, check_folder, check_target
+from ..simulation import Simulation
+from . import DONE
+from .console import quiet_warp, write_json
+from .parser import UsageError
+from .source import Source, progress, resolve
+from .summary import human, summarize
+
+__all__ = ["run"]
+
+TARGETS: dict[str, Sequence[str]] = {
+    "usd": (".usdc", ".usda", ".usd"),
+    "png": (".png",),
+    "gif": (".gif",),
+    "json": (".json",),
+    "checkpoint": CHECKPOINT_SUFFIXES,
+}
+
+
+def run(options: argparse.Namespace) -> int:
+    """Do `warpfea run`."""
+    check_targets(options)
+    saved = read_meta(options.resume) if options.resume else None
+    began = clock.perf_counter()
+    source = resolve(options, saved)
+    t_end = options.t_end or source.scene.t_end
+    outputs = make_outputs(options, source, t_end)
+    with quiet_warp():
+        sim = source.simulation(source.model(), progress(options))
+        if options.resume:
+            load_checkpoint(sim, options.resume)
+            now = float(sim.time.max())
+            if now >= t_end - 0.5 * sim.dt:
+                raise UsageError(f"{options.resume}: is at t = {now:g} s already, the end is {t_end:g} s; give --t-end")
+        status = "failed"
+        try:
+            sim.run(t_end, outputs=outputs, progress=progress(options))
+            status = "done"
+        except ConvergenceError:
+            status = "not converged"
+            raise
+        except OutputError:
+            status = "output failed"
+            raise
+        except KeyboardInterrupt:
+            status = "interrupted"
+            raise
+        finally:
+            _report(options, source, sim, status, clock.perf_counter() - began)
+    return DONE
+
+
+def _report(options: argparse.Namespace, source: Source, sim: Simulation, status: str, wall_s: float) -> None:
+    """Write the summary, and print it. An output that fails here does not hide what ended the run."""
+    reached = float(sim.time.max())
+    summary = summarize(source, sim, t_end=reached, status=status, wall_s=wall_s)
+    wrote = _written(options) if status != "output failed" else []
+    if options.json:
+        try:
+            write_json(options.json, summary)
+        except OutputError:
+            if status == "done":
+                raise
+    if not options.quiet and options.json != "-":
+        print(human(summary, sim, wrote))
+        sys.stdout.flush()
+
+
+def check_targets(options: argparse.Namespace) -> None:
+    """Before any work: UsageError for a wrong suffix, OutputError for a folder that is not there or not writable."""
+    for name, suffixes in TARGETS.items():
+        value = getattr(options, name, None)
+        if value is None or (name == "json" and value == "-"):
+            continue
+        if pathlib.Path(value).suffix.lower() not in suffixes:
+            raise UsageError(f"--{name} {value}: the file name must end in {' or '.join(suffixes)}")
+        check_target(value, suffixes)
+    if getattr(options, "vtu", None) is not None:
+        folder = pathlib.Path(options.vtu)
+        if folder.exists() and not folder.is_dir():
+            raise OutputError(f"--vtu {folder}: is a file, not a folder")
+        check_folder(folder if folder.is_dir() else folder.parent, folder)
+
+
+def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> list[Output]:
+    """The writers that were asked for; their libraries are imported here."""
+    out: list[Output] = []
+    fps = options.fps or source.scene.fps
+    if options.usd:
+        from ..usd import USDWriter
+
+        out.append(USDWriter(options.usd, fps=fps))
+    if options.vtu:
+        from ..vtk import VTUWriter
+
+        out.append(VTUWriter(options.vtu, fps=fps))
+    if options.png:
+        from ..render import PNGWriter
+
+        time = source.scene.picture if options.png_time is None else options.png_time
+        out.append(PNGWriter(options.png, time=None if time is not None and time > t_end else time))
+    if options.gif:
+        from ..render import GIFWriter
+
+        out.append(GIFWriter(options.gif, speed=options.speed or source.scene.speed, progress=progress(options)))
+    if options.checkpoint:
+        out.append(Checkpoint(options.checkpoint, every=options.every))
+    return out
+
+
+def _written(options: argparse.Namespace) -> list[str]:
+    """The files that are there, with what is known of them."""
+    notes: dict[str, Any] = {"usd": "validated, for usdview, Blender, Omniverse", "vtu": "for ParaView"}
+    names = [name for name in ("usd", "vtu", "png", "gif", "checkpoint", "json") if getattr(options, name)]
+    texts = []
+    for name in names:
+        value = getattr(options, name)
+        if value != "-":
+            texts.append(f"{value}" + (f"  ({notes[name]})" if name in notes else ""))
+    return texts

@@ -1,0 +1,134 @@
+"""`warpfea scenes`, `info` and `render`."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import sys
+from typing import Any
+
+from ..scene import Scene, find, load_file, names
+from . import DONE
+from .console import number, quiet_warp, size, table, write_json
+from .parser import UsageError
+from .run import check_targets
+from .source import find_scene, progress, resolve
+from .summary import plain
+
+__all__ = ["info", "render", "scenes"]
+
+
+def scenes(options: argparse.Namespace) -> int:
+    """Do `warpfea scenes [SCENE]`."""
+    what = options.what
+    if what is None:
+        found = [find(name) for name in names()]
+    elif what.endswith(".py"):
+        found = list(load_file(what).values())
+    else:
+        print(_one_scene(find_scene(what)))
+        return DONE
+    rows = [["scene", "dt", "t_end", ""]]
+    rows += [[s.name, f"{number(s.dt, 3)} s", f"{number(s.t_end, 3)} s", s.description] for s in found]
+    print(table(rows))
+    if not options.quiet:
+        where = f"{what}:NAME" if what else "NAME"
+        print(f"\nwarpfea scenes {where} shows its parameters, warpfea run {where} runs it.")
+    return DONE
+
+
+def _one_scene(found: Scene[Any]) -> str:
+    """Description and parameters of a scene."""
+    parts = [found.description]
+    if found.details:
+        parts.append(found.details)
+    tol = f", tol = {number(found.tol)}" if found.tol else ""
+    parts.append(f"dt = {number(found.dt)} s, t_end = {number(found.t_end)} s, {found.integrator}{tol}")
+    rows = []
+    for p in found.parameters.values():
+        default = "(required)" if p.required else f"= {p.default}"
+        rows.append([f"--set {p.name}", default, p.kind_name, p.doc])
+    parts.append(table(rows) if rows else "It has no parameters.")
+    return "\n\n".join(parts)
+
+
+def info(options: argparse.Namespace) -> int:
+    """Do `warpfea info SCENE`."""
+    check_targets(options)
+    source = resolve(options)
+    with quiet_warp():
+        model = source.model()
+        sim = source.simulation(model, progress(options))
+        launcher = sim.stepper.launch
+        content = {"scene": source.label, "parameters": source.parameters} | model.info()
+        content["integrator"] = sim.integrator.name
+        content["bytes"] = sim.bytes()
+        content["bytes_per_unknown"] = sum(sim.bytes().values()) / max(content["unknowns"], 1)
+        content["kernels"] = sorted(launcher.kernels)
+        content["modules"] = sorted(launcher.modules)
+        content["launches"] = launcher.launches
+    if options.json:
+        write_json(options.json, plain(content))
+    if options.json != "-":
+        print(_info_table(content))
+    return DONE
+
+
+def _info_table(content: dict[str, Any]) -> str:
+    c = content
+    rows = [["scene", c["scene"]], ["device", f"{c['device']}, {c['dtype']}, {c['integrator']}"]]
+    for body in c["bodies"]:
+        rows.append(
+            [
+                f"body {body['name']}",
+                f"{body['elements']} {body['element']} elements, {body['quadrature']}, {body['nodes']} nodes, "
+                + ", ".join(body["materials"]),
+            ]
+        )
+    rows.append(["model", f"{c['unknowns']} unknowns, {number(c['mass'])} kg"])
+    rows.append(["used", ", ".join(c["features"])])
+    rows.append(["left out", ", ".join(c["left_out"])])
+    groups: dict[str, int] = {}
+    for name, count in c["bytes"].items():
+        key = name.partition(".")[0]
+        groups[key] = groups.get(key, 0) + count
+    text = ", ".join(f"{key} {size(count)}" for key, count in groups.items())
+    rows.append(["memory", f"{size(sum(groups.values()))} ({text}), {c['bytes_per_unknown']:.0f} B per unknown"])
+    rows.append(["a step", f"{c['launches']} launches recorded, of {len(c['kernels'])} kernels:"])
+    of_module: dict[str, list[str]] = {}
+    for name in c["kernels"]:
+        module, _, kernel = name.rpartition(".")
+        of_module.setdefault(module, []).append(kernel)
+    rows += [["", f"{module}: {', '.join(kernels)}"] for module, kernels in of_module.items()]
+    return table(rows)
+
+
+def render(options: argparse.Namespace) -> int:
+    """Do `warpfea render`."""
+    from ..render import render_usd
+
+    suffix = pathlib.Path(options.output).suffix.lower()
+    if suffix not in (".png", ".gif"):
+        raise UsageError(f"--output {options.output}: the file name must end in .png or .gif")
+    source = pathlib.Path(options.file)
+    if not source.is_file():
+        raise UsageError(f"{source}: no such file")
+    extra: dict[str, Any] = {}
+    if options.view:
+        extra["view"] = options.view
+    with quiet_warp():
+        render_usd(
+            source,
+            options.output,
+            size=options.size,
+            fps=options.fps,
+            speed=options.speed,
+            field=options.field,
+            time=options.time,
+            progress=progress(options),
+            **extra,
+        )
+    if not options.quiet:
+        print(f"wrote {options.output}")
+        sys.stdout.flush()
+    return DONE

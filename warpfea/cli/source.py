@@ -1,0 +1,109 @@
+"""What SCENE on the command line stands for: a scene, one of a user's file, or a mesh; and its simulation."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import traceback
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import Error, ModelError
+from ..model import Model
+from ..scene import Scene, find, load_file
+from ..simulation import Simulation
+from ..solvers import NewtonPCG
+from .console import compile_bar
+from .parser import UsageError
+from .part import OPTIONS, SUFFIXES, part_scene
+
+__all__ = ["Source", "find_scene", "progress", "resolve"]
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A scene with its parameters and the options of a run.
+
+    Attributes:
+        label: what the user wrote.
+        scene: the scene. values: what it is called with.
+        parameters: what a summary says.
+        dt, integrator, dtype, device, tol: of the run.
+    """
+
+    label: str
+    scene: Scene[Any]
+    values: dict[str, Any]
+    parameters: dict[str, Any]
+    dt: float
+    integrator: str
+    dtype: str
+    device: str | None
+    tol: float | None
+
+    def model(self) -> Model:
+        """Call the scene and finalize; an error of the scene's own code is a ModelError with file and line."""
+        try:
+            builder = self.scene.build(self.values)
+        except (Error, NotImplementedError):
+            raise
+        except Exception as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            raise ModelError(
+                f"scene {self.scene.name!r}: {type(error).__name__}: {error} ({last.filename}:{last.lineno})"
+            ) from error
+        return builder.finalize(device=self.device, dtype=self.dtype)
+
+    def simulation(self, model: Model, show: bool | None) -> Simulation:
+        """The simulation; shows a bar while kernels compile."""
+        solver = NewtonPCG(tol=self.tol)
+        with compile_bar(show) as bar:
+            return Simulation(model, dt=self.dt, integrator=self.integrator, solver=solver, on_compile=bar)
+
+
+def progress(options: argparse.Namespace) -> bool | None:
+    """Whether to show bars; None: when stderr is a terminal."""
+    return False if options.quiet or options.no_progress else None
+
+
+def find_scene(what: str) -> Scene[Any]:
+    """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
+    file, colon, name = what.rpartition(":")
+    if not (colon and file.endswith(".py")):
+        file, name = what, ""
+    if not file.endswith(".py"):
+        return find(what)
+    found = load_file(file)
+    if not name:
+        if len(found) > 1:
+            raise UsageError(f"{file} holds several scenes, give {file}:NAME with one of {', '.join(found)}")
+        return next(iter(found.values()))
+    if name not in found:
+        raise UsageError(f"{file} has no scene {name!r}; it has {', '.join(found)}")
+    return found[name]
+
+
+def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = None) -> Source:
+    """The scene and options of `run` and `info`; dt, integrator and precision of a checkpoint go before the scene's."""
+    saved = checkpoint or {}
+    if pathlib.Path(options.what).suffix.lower() in SUFFIXES:
+        found, parameters = part_scene(options)
+        values: dict[str, Any] = {}
+    else:
+        given = [name for name in OPTIONS if getattr(options, name)]
+        found = find_scene(options.what)
+        if given:
+            raise UsageError(f"--{given[0].replace('_', '-')} is for mesh files; {options.what} is a scene, use --set")
+        values = found.resolve(found.parse(options.set))
+        parameters = values
+    return Source(
+        label=options.what,
+        scene=found,
+        values=values,
+        parameters=parameters,
+        dt=options.dt or saved.get("dt") or found.dt,
+        integrator=options.integrator or saved.get("integrator") or found.integrator,
+        dtype=options.dtype or saved.get("dtype") or "float64",
+        device=options.device,
+        tol=options.tol or found.tol,
+    )

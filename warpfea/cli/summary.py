@@ -1,0 +1,151 @@
+"""The summary of a run: JSON with fixed keys, and a table for people."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..simulation import Simulation
+from .console import number, table
+from .source import Source
+
+__all__ = ["KEYS", "SCHEMA", "human", "summarize", "versions"]
+
+SCHEMA = 1
+KEYS = (
+    "schema",
+    "scene",
+    "parameters",
+    "device",
+    "dtype",
+    "dt",
+    "t_end",
+    "steps",
+    "status",
+    "wall_s",
+    "compile_s",
+    "newton_iterations",
+    "pcg_iterations",
+    "max_residual",
+    "energies",
+    "probes",
+    "violation",
+    "versions",
+    "left_out",
+)
+
+
+def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wall_s: float) -> dict[str, Any]:
+    """The summary of a run of one world, SI units.
+
+    `t_end` is the time that was reached, `wall_s` the seconds from building to the closing of files, `compile_s` those
+    of them in which the simulation was made; energies, probes and the violation of constraints are the last values.
+    """
+    probes = {}
+    for probe in sim.model.probes:
+        record = sim.probe(probe.name)
+        names = ("position", "displacement", "velocity")
+        if record.time.size:
+            probes[probe.name] = {name: getattr(record, name)[0, -1] for name in names}
+    content = {
+        "schema": SCHEMA,
+        "scene": source.label,
+        "parameters": source.parameters,
+        "device": str(sim.model.device),
+        "dtype": sim.model.dtype,
+        "dt": sim.dt,
+        "t_end": t_end,
+        "steps": sim.steps,
+        "status": status,
+        "wall_s": wall_s,
+        "compile_s": sim.compile_s,
+        "newton_iterations": int(sim.totals["newton"].sum()),
+        "pcg_iterations": int(sim.totals["pcg"].sum()),
+        "max_residual": sim.max_residual,
+        "energies": {name: float(values[0]) for name, values in sim.energies().items()},
+        "probes": probes,
+        "violation": 0.0,
+        "versions": versions(),
+        "left_out": sim.model.info()["left_out"],
+    }
+    assert tuple(content) == KEYS
+    return {name: plain(value) for name, value in content.items()}
+
+
+def versions() -> dict[str, str]:
+    """Versions of what made the numbers."""
+    import scipy
+    import warp as wp
+
+    from .. import __version__
+
+    return {
+        "warpfea": __version__,
+        "warp": wp.config.version,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON can hold it: lists for arrays and tuples, null for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    return str(value)
+
+
+def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str:
+    """The summary as a table."""
+    s, info = summary, sim.model.info()
+    steps = max(s["steps"], 1)
+    rows = [
+        ["scene", s["scene"] + "".join(f"  {k}={v}" for k, v in _short(s["parameters"]))],
+        ["model", f"{info['elements']} elements, {info['unknowns']} unknowns, {number(info['mass'])} kg"],
+        ["device", f"{s['device']}, {s['dtype']}, {sim.integrator.name}"],
+        ["status", f"{s['status']} at t = {number(s['t_end'], 6)} s, {s['steps']} steps of {number(s['dt'])} s"],
+        ["time", f"{s['wall_s']:.1f} s, of which {s['compile_s']:.1f} s for kernels and set-up"],
+        [
+            "iterations",
+            f"{s['newton_iterations'] / steps:.1f} Newton and {s['pcg_iterations'] / steps:.0f} PCG per step, "
+            f"residual up to {_text(s['max_residual'], 2)}",
+        ],
+    ]
+    e = s["energies"]
+    parts = [f"{name} {_text(e[name])}" for name in ("kinetic", "strain", "potential", "work", "viscous")]
+    rows.append(["energy", f"{', '.join(parts)} J"])
+    lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
+    rows.append(["", f"lost by the integrator {lost} J, unbalanced {left} J"])
+    for name, values in s["probes"].items():
+        u = ", ".join(_text(x) for x in values["displacement"])
+        rows.append([f"probe {name}", f"displaced by ({u}) m"])
+    rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
+    return table(rows)
+
+
+def _text(value: float | None, digits: int = 4) -> str:
+    return "not finite" if value is None else number(value + 0.0, digits)
+
+
+def _short(parameters: dict[str, Any]) -> list[tuple[str, str]]:
+    """Parameters for one line: numbers short, empty ones left out."""
+    out = []
+    for name, value in parameters.items():
+        if value not in (None, [], ""):
+            text = number(value, 6) if isinstance(value, float) else str(value)
+            out.append((name, text.replace(" ", "")))
+    return out
