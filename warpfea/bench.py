@@ -240,7 +240,7 @@ def _commit() -> str | None:
     """Commit of the checkout that this runs from, with + if files differ; None without git or outside a checkout."""
     root = pathlib.Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
-        return None
+        return os.environ.get("WARPFEA_COMMIT")  # a copy without its history is told which commit it is
     try:
         ask = lambda *words: subprocess.run(  # noqa: E731
             ["git", *words], cwd=root, capture_output=True, text=True, check=True
