@@ -10,13 +10,13 @@ from warpfea.scene import scene
 MESH = pathlib.Path(__file__).with_name("hook.msh")
 
 
-@scene(dt=1.0 / 240.0, t_end=0.26, tol=1e-3, fps=240.0, speed=0.1, picture=0.14)
+@scene(dt=1.0 / 240.0, t_end=0.26, tol=1e-3, fps=240.0, speed=0.1, picture=0.15)
 def hook(
     *,
-    pull: float = 1200.0,
-    hold: float = 0.13,
-    E: float = 2.5e5,
-    nu: float = 0.35,
+    pull: float = 900.0,
+    hold: float = 0.11,
+    E: float = 1.5e5,
+    nu: float = 0.33,
     density: float = 1070.0,
 ) -> wf.ModelBuilder:
     """A crane hook of soft rubber, from a Gmsh mesh, is pulled down by a sling, opens and springs back.

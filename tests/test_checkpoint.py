@@ -36,7 +36,7 @@ def bar(
 def everything(sim):
     """All that a run leaves: state, probe records, totals."""
     record = sim.probe("tip")
-    out = {f"state.{name}": values for name, values in sim.state.numpy().items()}
+    out = {f"state.{name}": values.copy() for name, values in sim.state.numpy().items()}
     out |= {f"probe.{name}": getattr(record, name) for name in ("time", "position", "displacement", "velocity")}
     out |= {f"total.{name}": values for name, values in sim.totals.items()}
     out |= {f"energy.{name}": values for name, values in sim.energies().items()}
@@ -110,6 +110,20 @@ def test_worlds_are_kept_apart(tmp_path):
             np.testing.assert_array_equal(everything(second)[name], values, err_msg=name)
 
 
+def test_a_failure_after_resuming_is_raised(tmp_path):
+    """The status of a failed step is not taken for one that had failed before."""
+    path = tmp_path / "bar.npz"
+    solver = wf.NewtonPCG(max_newton=1, max_halvings=0)
+    sim = wf.Simulation(bar(E=2e5), dt=0.05, solver=solver)
+    with pytest.raises(wf.ConvergenceError):
+        sim.step()
+    save_checkpoint(sim, path)
+    again = wf.Simulation(bar(E=2e5), dt=0.05, solver=solver)
+    again.resume(path)
+    with pytest.raises(wf.ConvergenceError):
+        again.step()
+
+
 def test_registered_arrays_are_kept(tmp_path):
     """A checkpoint loops over the registry: an array of a later feature needs no line here."""
     path = tmp_path / "bar.npz"
@@ -166,7 +180,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(small, options, integrator, w
     path, _ = small
     sim = wf.Simulation(bar(**options), dt=2e-3, integrator=integrator)
     sim.step()
-    before = sim.state.numpy()
+    before = {name: values.copy() for name, values in sim.state.numpy().items()}
     with pytest.raises(wf.CheckpointError) as error:
         sim.resume(path)
     for word in [str(path), *words]:
@@ -226,7 +240,7 @@ def damaged(path, tmp_path, how):
 def test_a_damaged_checkpoint_is_refused(small, tmp_path, how, word):
     path, sim = small
     file = damaged(path, tmp_path, how)
-    before = sim.state.numpy()
+    before = {name: values.copy() for name, values in sim.state.numpy().items()}
     with pytest.raises(wf.CheckpointError) as error:
         load_checkpoint(sim, file)
     assert str(file) in str(error.value)

@@ -100,6 +100,7 @@ RULES = {
     "tet1": (elements.TET_RULES["tet1"], 1, 1),
     "tet4": (elements.TET_RULES["tet4"], 4, 2),
     "tet5_paper": (elements.TET_RULES["tet5_paper"], 5, 3),
+    "tet8": (elements.TET_RULES["tet8"], 8, 3),
     "tet14": (elements.TET_RULES["tet14"], 14, 5),
     "conical2": (quadrature.conical_tet(2), 8, 3),
     "conical3": (quadrature.conical_tet(3), 27, 5),
@@ -130,11 +131,11 @@ def test_rule_is_exact_up_to_its_degree_and_no_further(name):
 def test_default_rules_have_positive_weights():
     for name in ("T4", "T10"):
         family = elements.get(name)
-        for rule in (family.rule(None), family.mass_rule, family.curved_mass_rule, quadrature.triangle_6()):
+        for rule in (family.rule(None), family.curved_rule, family.mass_rule, family.curved_mass_rule, quadrature.triangle_6()):
             assert rule.weights.min() > 0, (name, rule.name)
     assert [elements.get(name).rule(None).name for name in ("T10", "T4")] == ["tet4", "tet1"]
     assert elements.TET_RULES["tet5_paper"].weights.min() == pytest.approx(-0.8 / 6, rel=1e-15)
-    assert list(elements.get("T10").rules) == ["tet4", "tet5_paper", "tet14"]
+    assert list(elements.get("T10").rules) == ["tet4", "tet5_paper", "tet8", "tet14"]
 
 
 # shape functions
@@ -255,7 +256,7 @@ def test_t10_mass_of_one_tetrahedron(data, device):
 COMPACT = {
     "T4": (lambda: wf.mesh.box((1, 1, 1), cells=(1, 1, 1), element="T4"), "tet1"),
     "T10": (lambda: wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), "tet4"),
-    "sphere": (lambda: mesh("sphere"), "tet4"),
+    "sphere": (lambda: mesh("sphere"), None),
     "sphere-tet14": (lambda: mesh("sphere"), "tet14"),
 }
 
@@ -317,6 +318,8 @@ PATCHES = [
     ("T10", "neo_hookean", "tet4"),
     ("sphere", "svk", "tet5_paper"),
     ("sphere", "svk", "tet14"),
+    ("sphere", "svk", None),
+    ("sphere", "mooney_rivlin", None),
     ("sphere", "mooney_rivlin", "tet14"),
     ("bent", "svk", "tet5_paper"),
     ("bent", "mooney_rivlin", "tet14"),
@@ -418,6 +421,7 @@ def hermite():
             node_slots=(KINDS,) * 4,
             shape=hermite_shape,
             rules={"tet14": elements.TET_RULES["tet14"]},
+            curved_rule=elements.TET_RULES["tet14"],
             mass_rule=quadrature.conical_tet(4),
             curved_mass_rule=quadrature.conical_tet(4),
             vertices=elements.get("T4").vertices,

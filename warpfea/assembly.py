@@ -140,15 +140,16 @@ def body_mass(body: Body) -> sp.csr_matrix:
 
 def host_blocks(body: Body, *, tables: bool) -> Iterator[HostBlock]:
     """Split a body's elements by what a kernel must know. `tables`: straight elements take the table path too."""
-    flat = straight(body) & (not tables)
+    flat = straight(body)
     for k, (_, material) in enumerate(body.materials):
         damping = material.damping.form if material.damping else None
         if material.damping and material.damping.eta == 0.0 and material.damping.lambda_v == 0.0:
             damping = None
-        for affine in (True, False):
-            members = np.flatnonzero((body.material_of == k) & (flat == affine))
+        for is_flat, rule in ((True, body.rule), (False, body.curved_rule)):
+            members = np.flatnonzero((body.material_of == k) & (flat == is_flat))
             if len(members):
-                yield HostBlock(BlockKey(body.family.name, body.rule, material.law, damping, affine), body, members)
+                key = BlockKey(body.family.name, rule, material.law, damping, is_flat and not tables)
+                yield HostBlock(key, body, members)
 
 
 def check_orientation(body: Body, rule: Rule) -> None:

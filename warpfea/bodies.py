@@ -102,6 +102,7 @@ class Body:
         materials: distinct materials with the names of their groups.
         material_of: (elements,) index into materials.
         rule: name of the force quadrature rule.
+        curved_rule: the same of elements with curved sides.
         origin: (3,) body origin; device positions are relative to it.
         slots: (used nodes x slots per node) model slots in body order, set at finalize; -1 before.
     """
@@ -112,6 +113,7 @@ class Body:
     materials: list[tuple[str, Material]]
     material_of: np.ndarray
     rule: str
+    curved_rule: str
     initial: np.ndarray | None = None
     index: int = -1
     slot_offset: int = -1

@@ -146,7 +146,8 @@ class ModelBuilder:
             mesh: file (Gmsh .msh, .vtu, Abaqus .inp) or Mesh, m after `scale`.
             material: one law, or laws by element group of the mesh.
             element: element family; by default T4 or T10 as the cells are.
-            quadrature: name of the force rule; T10: "tet4" (default), "tet5_paper", "tet14"; T4: "tet1", "tet4".
+            quadrature: name of the force rule of all elements; T10: "tet4", "tet5_paper", "tet8", "tet14"; T4: "tet1",
+                "tet4". By default T10 takes "tet4" where straight and "tet8" where curved, T4 "tet1".
             scale: factor on the coordinates of the file.
             transform: (4, 4) matrix, or (rotation (3, 3), translation (3,)), applied after `scale`.
             initial: initial positions, (nodes, 3) in m or a function X (nodes, 3) -> (nodes, 3), where they differ from
@@ -172,7 +173,9 @@ class ModelBuilder:
                 f"body {name!r}: element {family.name} needs {family.cell_type} cells, the mesh has {mesh.cell_type}"
             )
         materials, index = _assign_materials(name, mesh, material)
-        body = Body(name, mesh, family, materials, index, family.rule(quadrature).name)
+        rule = family.rule(quadrature).name
+        curved = family.curved_rule.name if quadrature is None else rule
+        body = Body(name, mesh, family, materials, index, rule, curved)
         body.index = len(self.bodies)
         if initial is not None:
             body.initial_displacement = _initial(body, initial)

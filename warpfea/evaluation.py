@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from . import elements
 from .assembly import CHUNK, geometry, gradients
 from .kernels.gather import gather_kernels
 from .kernels.types import precision
@@ -129,14 +130,13 @@ class Evaluation:
         """Cauchy stress at mesh nodes, [world, node, 6], Pa: linear fit per element, volume-weighted mean over elements."""
         m = self.model
         family = body.family
-        rule = family.rules[body.rule]
         nodes = len(body.mesh.points)
         total = np.zeros((m.worlds, nodes, 6))
         weight = np.zeros(nodes)
-        to_nodes = _extrapolation(rule.points, family.node_points)
         volumes = body.mesh.volumes()
         for block, stress in self.stresses(state):
             first = 0
+            to_nodes = _extrapolation(elements.get(block.key.family).rules[block.key.rule].points, family.node_points)
             for part in block.parts:
                 members = slice(first, first + len(part.elements))
                 first += len(part.elements)
@@ -158,7 +158,7 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
         first = block.element_offset
         for part in block.parts:
             body = part.body
-            rule = body.family.rules[body.rule]
+            rule = body.family.rules[block.key.rule]
             points = np.vstack([rule.points, body.family.vertices])
             for k in range(0, len(part.elements), CHUNK):
                 members = part.elements[k : k + CHUNK]

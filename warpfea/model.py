@@ -101,7 +101,8 @@ class Model:
     def _number(self) -> None:
         offset = 0
         for body in self.bodies:
-            assembly.check_orientation(body, body.family.rule(body.rule))
+            for rule in {body.rule, body.curved_rule}:
+                assembly.check_orientation(body, body.family.rules[rule])
             body.slot_offset = offset
             offset += body.slot_count
         self.slots = offset
@@ -312,7 +313,7 @@ class Model:
                 {
                     "name": b.name,
                     "element": b.family.name,
-                    "quadrature": b.rule,
+                    "quadrature": sorted({k.key.rule for k in self.blocks if any(p.body is b for p in k.parts)}),
                     "elements": len(b.mesh.cells),
                     "nodes": len(b.mesh.used_nodes),
                     "materials": [type(m).__name__ + (f" ({g})" if g else "") for g, m in b.materials],

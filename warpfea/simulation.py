@@ -163,12 +163,12 @@ class Simulation:
     @property
     def time(self) -> np.ndarray:
         """[world], s."""
-        return self.state.time.numpy()
+        return self.state.time.numpy().copy()
 
     @property
     def status(self) -> np.ndarray:
         """[world]: 0 running, 1 failed, 2 frozen."""
-        return self.state.status.numpy()
+        return self.state.status.numpy().copy()
 
     def step(self, count: int = 1) -> StepReport:
         """Advance `count` steps of dt; the report is that of the last.

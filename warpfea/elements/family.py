@@ -24,11 +24,12 @@ class Family:
         shape: function (xi (Q, d), nodes (E, n, 3)) -> (s (E or 1, Q, S), ds (E or 1, Q, S, 3)), with ds = ds/dxi. A
             family whose functions do not depend on the element's shape returns one row.
         rules: force quadrature rules by name; the first is the default.
+        curved_rule: default force rule of curved elements; the patch test on a curved T10 needs degree 3.
         mass_rule: rule that integrates s_i s_j rho det J0 exactly on straight elements.
         curved_mass_rule: the same on curved ones.
         vertices: (V, 3) parent coordinates of the vertices, where J is tested beside the points.
         affine: whether an element with straight sides has one J0.
-        nodes_of_points: (n, 3) parent coordinates of the element nodes.
+        node_points: (n, 3) parent coordinates of the element nodes.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Family:
     node_slots: tuple[tuple[int, ...], ...]
     shape: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
     rules: dict[str, Rule]
+    curved_rule: Rule
     mass_rule: Rule
     curved_mass_rule: Rule
     vertices: np.ndarray

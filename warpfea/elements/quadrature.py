@@ -50,6 +50,12 @@ def _orbit6(a: float) -> np.ndarray:
     return out
 
 
+def _tet8() -> Rule:
+    """Eight points, degree 3, positive weights, interior (Jaskowiec and Sukumar, symmetric tetrahedron rules, 2020)."""
+    orbits = [(0.1385279665118621, _orbit4(0.3280546967114266)), (0.1114720334881379, _orbit4(0.1069522739329306))]
+    return _barycentric("tet8", 3, orbits)
+
+
 def _tet14() -> Rule:
     """Walkington's 14 points, degree 5, positive weights (J. N. Walkington, quadrature on simplices, 2000)."""
     return _barycentric(
@@ -68,6 +74,7 @@ TET_RULES: dict[str, Rule] = {
     "tet4": _barycentric("tet4", 2, [(0.25, _orbit4((5.0 - np.sqrt(5.0)) / 20.0))]),
     # Paper I's rule, Eq. (11); its negative weight is why it must not integrate the mass
     "tet5_paper": _barycentric("tet5_paper", 3, [(-0.8, np.full((1, 4), 0.25)), (0.45, _orbit4(1.0 / 6.0))]),
+    "tet8": _tet8(),
     "tet14": _tet14(),
 }
 
