@@ -206,7 +206,9 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     mesh.add_argument("--gravity", type=vector, metavar="x,y,z", help="m/s^2, by default 9.81 downwards")
     mesh.add_argument("--scale", type=positive, metavar="S", help="metres per unit of the file, 1e-3 for mm")
     mesh.add_argument("--up-axis", choices=("Y", "Z"), help="by default Z")
-    mesh.add_argument("--quadrature", metavar="RULE", help="force rule: tet4, tet5_paper, tet14 (T10), tet1, tet4 (T4)")
+    mesh.add_argument(
+        "--quadrature", metavar="RULE", help="force rule: tet4, tet5_paper, tet8, tet14 (T10), tet1, tet4 (T4)"
+    )
     how = to.add_argument_group("simulation (defaults are the scene's)")
     how.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
