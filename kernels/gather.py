@@ -122,7 +122,7 @@ def gather_kernels(dtype: str, nonpotential: bool) -> _types.SimpleNamespace:
         kinetic = T(0.5) * wp.dot(vs - v_tilde[world, slot], a)
         work = wp.dot(held, vs)
         rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
-        rows[1, world, slot] = weighted(wp.cw_mul(f, free), D)
+        rows[1, world, slot] = weighted(f, D)  # reactions count: a held, stressed body has its scale from them
         rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
         rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
         rows[4, world, slot] = f64(kinetic - work)

@@ -94,16 +94,16 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         world = wp.tid()
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
         step.running[world] = alive
+        newton.total_iterations[world] = 0
+        pcg.total[world] = 0
+        step.halvings[world] = 0
         if alive == 0:
             return
         wp.atomic_max(step.any_running, 0, 1)
         step.level[world] = 0
         step.part[world] = 0
-        step.halvings[world] = 0
         step.step_start[world] = step.time[world]
         step.total_J[world] = f64(1.0e30)
-        newton.total_iterations[world] = 0
-        pcg.total[world] = 0
 
     @wp.kernel(module=module)
     def begin_attempt(step: Step, newton: Newton):

@@ -239,15 +239,14 @@ def _cpu_name() -> str:
 def _commit() -> str | None:
     """Commit of the checkout that this runs from, with + if files differ; None without git or outside a checkout."""
     root = pathlib.Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():
-        return os.environ.get("WARPFEA_COMMIT")  # a copy without its history is told which commit it is
+
+    def ask(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+
     try:
-        ask = lambda *words: subprocess.run(  # noqa: E731
-            ["git", *words], cwd=root, capture_output=True, text=True, check=True
-        ).stdout.strip()
-        return str(ask("rev-parse", "HEAD")) + ("+" if ask("status", "--porcelain", "--untracked-files=no") else "")
+        return ask("rev-parse", "HEAD") + ("+" if ask("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):
-        return None
+        return os.environ.get("WARPFEA_COMMIT")  # a copy without its history is told which commit it is
 
 
 def _versions() -> dict[str, str]:

@@ -299,7 +299,16 @@ class Loads:
             h.update(np.ascontiguousarray(values).tobytes())
         for law in self._laws.laws:
             h.update(law.times.tobytes() + law.values.tobytes())
-        h.update(f"{len(self.pressures)} {len(self.fields)}".encode())
+            if law.function is not None:
+                h.update(law.function.key.encode())
+        for conn in self._pushed:
+            h.update(np.ascontiguousarray(conn).tobytes())
+        for force in self.model.description.body_forces:
+            h.update(force.function.key.encode())
+        for drive in (self.moved, self.turned):
+            for values in (drive.slot, drive.components, drive.arm, drive.axis) if drive else ():
+                if values is not None:
+                    h.update(values.numpy().tobytes())
 
 
 def _argument_precision(function: wp.Function, default: str) -> str:

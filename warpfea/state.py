@@ -110,8 +110,8 @@ class State:
                 launch(kernel, b.shape, [flags, a, b])
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """All arrays on the host."""
-        return {name: array.numpy() for name, array in self._arrays.items()}
+        """Copies of all arrays on the host."""
+        return {name: array.numpy().copy() for name, array in self._arrays.items()}
 
     def load(self, values: dict[str, np.ndarray]) -> None:
         """Set all arrays from the host. Raises CheckpointError on a missing name or another shape; nothing is set then."""
