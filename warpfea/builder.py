@@ -162,8 +162,10 @@ class ModelBuilder:
             mesh = meshes.read(mesh, scale=scale, transform=transform)
         elif not isinstance(mesh, Mesh):
             raise ModelError(f"add_solid: mesh must be a file name or a Mesh, got {type(mesh).__name__}")
-        elif scale != 1.0 or transform is not None:
-            mesh = mesh.transformed(scale=scale, transform=transform)
+        else:
+            if scale != 1.0 or transform is not None:
+                mesh = mesh.transformed(scale=scale, transform=transform)
+            meshes.check(mesh)
         name = self._name(name or mesh.name, given=name is not None)
         if len(mesh.cells) == 0:
             raise ModelError(f"body {name!r}: the mesh has no elements")
