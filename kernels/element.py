@@ -71,6 +71,10 @@ def element_kernels(
     vertices = 4
     name = f"element_{dtype}_{law}_{slots}_{points}_{'affine' if affine else 'table'}_{damping}"
     module = kernel_module(name)
+    # what only some scenes or only outputs launch is compiled apart
+    history_module = kernel_module(f"{name}_history")
+    viscous_module = kernel_module(f"{name}_viscous")
+    stress_module = kernel_module(f"{name}_stress")
 
     @wp.func
     def coefficients(block: Block, world: int, elem: int) -> coef:
@@ -182,6 +186,7 @@ def element_kernels(
         contribution: wp.array2d(dtype=vec3),
         energy: wp.array3d(dtype=wp.float64),
         min_J: wp.array(dtype=wp.float64),
+        domain_J: wp.array(dtype=wp.float64),
     ):
         """Internal force contributions, Eqs. (32) and (70), strain energy and viscous potential of each element."""
         world, elem = wp.tid()
@@ -218,6 +223,9 @@ def element_kernels(
         low = wp.float64(J_low)
         if low < min_J[world]:
             wp.atomic_min(min_J, world, low)
+        if wp.static(needs_J):
+            if low < domain_J[world]:
+                wp.atomic_min(domain_J, world, low)
 
     @wp.kernel(module=module)
     def tangent_product(
@@ -288,7 +296,7 @@ def element_kernels(
                 entry = block.contribution_offset + i * block.count + elem
                 contribution[world, entry] = contribution[world, entry] + w * pack(K)
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=history_module)
     def strain_history(
         block: Block,
         u0: wp.array2d(dtype=vec3),
@@ -309,7 +317,7 @@ def element_kernels(
             E = E - T(a1[world]) * t.green(gradient_of(block, U1, q, elem))
             history[world, history_index(block, q, elem)] = pack(E)
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=viscous_module)
     def viscous_force(
         block: Block,
         u: wp.array2d(dtype=vec3),
@@ -338,7 +346,7 @@ def element_kernels(
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
         power[world, block.element_offset + elem] = wp.float64(rate_of_work)
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=stress_module)
     def point_stress(
         block: Block,
         u: wp.array2d(dtype=vec3),

@@ -37,13 +37,13 @@ def topology_struct(dtype: str):
 
 
 @functools.cache
-def gather_kernels(dtype: str, nonpotential: bool) -> _types.SimpleNamespace:
-    """Kernels over slots; `nonpotential` adds the forces that are held inside a line search."""
+def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _types.SimpleNamespace:
+    """Kernels over slots; `nonpotential` adds the forces that are held inside a line search, `pressure` their tangent."""
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
     f64 = wp.float64
-    module = kernel_module(f"gather_{dtype}_{nonpotential}")
+    module = kernel_module(f"gather_{dtype}_{nonpotential}_{pressure}")
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -142,6 +142,9 @@ def gather_kernels(dtype: str, nonpotential: bool) -> _types.SimpleNamespace:
     def product(
         topo: Topology,
         contribution: wp.array2d(dtype=vec3),
+        pushed_start: wp.array(dtype=wp.int32),
+        pushed_entry: wp.array(dtype=wp.int32),
+        pushed_contribution: wp.array2d(dtype=vec3),
         p_in: wp.array2d(dtype=vec3),
         mass_factor: wp.array(dtype=f64),
         dq_dv: wp.array(dtype=f64),
@@ -159,6 +162,9 @@ def gather_kernels(dtype: str, nonpotential: bool) -> _types.SimpleNamespace:
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
+        if wp.static(pressure):
+            for k in range(pushed_start[slot], pushed_start[slot + 1]):
+                f -= pushed_contribution[world, pushed_entry[k]]
         h = wp.cw_mul(T(mass_factor[world]) * a + T(dq_dv[world]) * f, topo.free[slot])
         out[world, slot] = h
         rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))

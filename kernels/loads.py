@@ -8,7 +8,7 @@ import warp as wp
 from .element import block_struct
 from .types import kernel_module, precision
 
-__all__ = ["body_force_kernel", "law_function_kernel", "law_struct", "load_kernels"]
+__all__ = ["body_force_kernel", "facet_struct", "law_function_kernel", "law_struct", "load_kernels"]
 
 
 @functools.cache
@@ -25,15 +25,37 @@ def law_struct():
 
 
 @functools.cache
+def facet_struct(dtype: str):
+    """Shape functions of a facet and their parent derivatives at its points, [point, node]."""
+    T = precision(dtype).T
+
+    @wp.struct
+    class FacetTables:
+        shape: wp.array2d(dtype=T)
+        d_xi: wp.array2d(dtype=T)
+        d_eta: wp.array2d(dtype=T)
+        weight: wp.array(dtype=T)
+
+    return FacetTables
+
+
+@functools.cache
 def load_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels of the loads in one precision."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Laws = law_struct()
-    module = kernel_module(f"loads_{dtype}")
+    Facet = facet_struct(dtype)
+    # a module per kind of load: a scene compiles what it uses
+    laws_module = kernel_module(f"laws_{dtype}")
+    dead_module = kernel_module(f"dead_load_{dtype}")
+    explicit_module = kernel_module(f"explicit_{dtype}")
+    drive_module = kernel_module(f"drive_{dtype}")
+    turn_module = kernel_module(f"drive_rotation_{dtype}")
+    pressure_module = kernel_module(f"pressure_{dtype}")
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=laws_module)
     def evaluate_laws(
         laws: Laws,
         time: wp.array(dtype=f64),
@@ -60,7 +82,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         s = wp.clamp(s, f64(0.0), f64(1.0))
         value[world, law] = (f64(1.0) - s) * laws.values[k] + s * laws.values[k + 1]
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=dead_module)
     def dead_load(
         start: wp.array(dtype=wp.int32),
         law: wp.array(dtype=wp.int32),
@@ -86,7 +108,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         force[world, slot] = f
         magnitude[world, slot] = m
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=explicit_module)
     def work_rows(
         a: wp.array2d(dtype=vec3),
         u: wp.array2d(dtype=vec3),
@@ -99,7 +121,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         if accepted[world] != 0:
             rows[0, world, slot] = f64(wp.dot(a[world, slot], u[world, slot] - u_n[world, slot]))
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=explicit_module)
     def add_explicit(
         explicit_force: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
@@ -110,30 +132,29 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] != 0:
             force[world, slot] = force[world, slot] - explicit_force[world, slot]
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=drive_module)
     def drive_displacement(
         slot: wp.array(dtype=wp.int32),
-        law: wp.array(dtype=wp.int32),
-        components: wp.array(dtype=wp.vec3d),
+        law: wp.array(dtype=wp.vec3i),
         value: wp.array2d(dtype=wp.vec3d),
         q_tilde: wp.array2d(dtype=vec3),
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
         v: wp.array2d(dtype=vec3),
     ):
-        """v = (u(t) - q~)/(dq/dv) on the driven components, u(t) the value of a law."""
+        """v = (u(t) - q~)/(dq/dv) on the driven components, u(t) the value of a law per component (-1: not driven)."""
         world, k = wp.tid()
         if active[world] == 0:
             return
         s = slot[k]
-        target = value[world, law[k]]
         velocity = v[world, s]
         for c in range(3):
-            if components[k][c] != f64(0.0):
-                velocity[c] = T((target[c] - f64(q_tilde[world, s][c])) / dq_dv[world])
+            row = law[k][c]
+            if row >= 0:
+                velocity[c] = T((value[world, row][c] - f64(q_tilde[world, s][c])) / dq_dv[world])
         v[world, s] = velocity
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=turn_module)
     def drive_rotation(
         slot: wp.array(dtype=wp.int32),
         law: wp.array(dtype=wp.int32),
@@ -162,14 +183,11 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
                 velocity[c] = T((target[c] - f64(q_tilde[world, s][c])) / dq_dv[world])
         v[world, s] = velocity
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=pressure_module)
     def follower_pressure(
         conn: wp.array2d(dtype=wp.int32),
         law: wp.array(dtype=wp.int32),
-        shape: wp.array2d(dtype=T),
-        d_xi: wp.array2d(dtype=T),
-        d_eta: wp.array2d(dtype=T),
-        weight: wp.array(dtype=T),
+        tables: Facet,
         reference: wp.array(dtype=vec3),
         u: wp.array2d(dtype=vec3),
         value: wp.array2d(dtype=wp.vec3d),
@@ -187,21 +205,66 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         for i in range(nodes):
             contribution[world, offset + i * count + facet] = vec3()
         first = conn[0, facet]
-        for q in range(shape.shape[0]):
+        for q in range(tables.shape.shape[0]):
             a = vec3()
             b = vec3()
             for i in range(nodes):
                 s = conn[i, facet]
                 x = (reference[s] - reference[first]) + (u[world, s] - u[world, first])
-                a += d_xi[q, i] * x
-                b += d_eta[q, i] * x
-            f = (-pressure * weight[q]) * wp.cross(a, b)
+                a += tables.d_xi[q, i] * x
+                b += tables.d_eta[q, i] * x
+            f = (-pressure * tables.weight[q]) * wp.cross(a, b)
             for i in range(nodes):
                 k = offset + i * count + facet
-                contribution[world, k] = contribution[world, k] + shape[q, i] * f
+                contribution[world, k] = contribution[world, k] + tables.shape[q, i] * f
+
+    @wp.kernel(module=pressure_module)
+    def pressure_product(
+        conn: wp.array2d(dtype=wp.int32),
+        law: wp.array(dtype=wp.int32),
+        tables: Facet,
+        reference: wp.array(dtype=vec3),
+        u: wp.array2d(dtype=vec3),
+        value: wp.array2d(dtype=wp.vec3d),
+        offset: int,
+        active: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """(K + K^T)/2 p with K = df/dq of the pressure force: its symmetric part, all of it on a closed surface."""
+        world, facet = wp.tid()
+        if active[world] == 0:
+            return
+        nodes = conn.shape[0]
+        count = conn.shape[1]
+        pressure = T(value[world, law[facet]][0])
+        for i in range(nodes):
+            contribution[world, offset + i * count + facet] = vec3()
+        first = conn[0, facet]
+        for q in range(tables.shape.shape[0]):
+            a = vec3()
+            b = vec3()
+            da = vec3()
+            db = vec3()
+            p = vec3()
+            for i in range(nodes):
+                s = conn[i, facet]
+                x = (reference[s] - reference[first]) + (u[world, s] - u[world, first])
+                a += tables.d_xi[q, i] * x
+                b += tables.d_eta[q, i] * x
+                da += tables.d_xi[q, i] * direction[world, s]
+                db += tables.d_eta[q, i] * direction[world, s]
+                p += tables.shape[q, i] * direction[world, s]
+            w = T(-0.5) * pressure * tables.weight[q]
+            force = wp.cross(da, b) + wp.cross(a, db)
+            left = wp.cross(b, p)
+            right = wp.cross(p, a)
+            for i in range(nodes):
+                k = offset + i * count + facet
+                f = tables.shape[q, i] * force + tables.d_xi[q, i] * left + tables.d_eta[q, i] * right
+                contribution[world, k] = contribution[world, k] + w * f
 
     return _types.SimpleNamespace(
-        module=module,
         evaluate_laws=evaluate_laws,
         dead_load=dead_load,
         work_rows=work_rows,
@@ -209,6 +272,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         drive_displacement=drive_displacement,
         drive_rotation=drive_rotation,
         follower_pressure=follower_pressure,
+        pressure_product=pressure_product,
     )
 
 
@@ -224,6 +288,7 @@ def law_function_kernel(function: wp.Function, scalar: bool, take_dtype: str):
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=wp.vec3d),
     ):
+        """Value of a law given as a function of t."""
         world = wp.tid()
         if active[world] == 0:
             return
@@ -256,6 +321,7 @@ def body_force_kernel(function: wp.Function, dtype: str, slots: int, points: int
         offset: int,
         contribution: wp.array2d(dtype=vec3),
     ):
+        """f_i = sum_q rho w s_i b(r_q, t) of one element."""
         world, k = wp.tid()
         if active[world] == 0:
             return

@@ -61,6 +61,7 @@ def control_struct():
         reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
         forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
         min_J: wp.array(dtype=wp.float64)
+        domain_J: wp.array(dtype=wp.float64)  # smallest J of the laws that need J > 0
         history: wp.array2d(dtype=wp.float64)  # [world, iteration] norm / scale
         slot_sums: wp.array2d(dtype=wp.float64)  # gather.RESIDUAL_ROWS
         elem_sums: wp.array2d(dtype=wp.float64)  # strain energy, viscous potential
@@ -70,7 +71,6 @@ def control_struct():
         eps: wp.float64
         max_iterations: wp.int32
         components: wp.int32
-        need_positive_J: wp.int32
         nonpotential: wp.int32
 
     return NewtonControl
@@ -168,6 +168,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         world = wp.tid()
         if active[world] != 0:
             ctl.min_J[world] = f64(1.0e30)
+            ctl.domain_J[world] = f64(1.0e30)
 
     @wp.kernel(module=module)
     def begin(ctl: Control):
@@ -180,7 +181,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = magnitude(ctl, world)
         ctl.forcing[world] = f64(0.1)
-        if ctl.need_positive_J != 0 and ctl.min_J[world] <= f64(0.0):
+        if ctl.domain_J[world] <= f64(0.0):
             fail(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
             fail(ctl, world, FAIL_NAN)
@@ -222,9 +223,12 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
                 good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
             else:
                 good = ctl.slot_sums[6, world] <= f64(WOLFE) * wp.abs(ctl.slope[world])
-            if ctl.nonpotential != 0 and norm <= f64(0.5) * old_norm:
-                good = True
-        if ctl.need_positive_J != 0 and ctl.min_J[world] <= f64(0.0):
+            if ctl.nonpotential != 0:
+                # Phi with held forces can't see the skew part of their tangent: close to the solution it would cycle
+                smaller = norm <= (f64(1.0) - f64(0.1) * alpha) * old_norm
+                close = wp.abs(change) <= noise
+                good = smaller or (good and not close)
+        if ctl.domain_J[world] <= f64(0.0):
             good = False
         if good:
             ctl.searching[world] = 0
@@ -246,7 +250,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             ctl.alpha[world] = f64(0.5) * alpha
             if ctl.searches[world] > MAX_SEARCH:
                 why = FAIL_LINE_SEARCH
-                if ctl.need_positive_J != 0 and ctl.min_J[world] <= f64(0.0):
+                if ctl.domain_J[world] <= f64(0.0):
                     why = FAIL_JACOBIAN
                 fail(ctl, world, why)
 

@@ -34,7 +34,7 @@ LEDGER = (
 )
 """Columns of the energy ledger, J, accumulated since the start (the first three: current values)."""
 
-LEDGER_ROWS = 9
+LEDGER_ROWS = 10
 
 
 @functools.cache
@@ -56,6 +56,7 @@ def step_struct():
         step_start: wp.array(dtype=wp.float64)
         h: wp.array(dtype=wp.float64)
         previous_h: wp.array(dtype=wp.float64)  # state of multistep schemes; 0 before the first step
+        previous_end: wp.array(dtype=wp.float64)  # time that the step before ended at
         dt: wp.array(dtype=wp.float64)
         a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1}
         a1: wp.array(dtype=wp.float64)
@@ -66,12 +67,15 @@ def step_struct():
         any_running: wp.array(dtype=wp.int32)
         max_halvings: wp.int32
         total_J: wp.array(dtype=wp.float64)
+        ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
 
     return StepControl
 
 
 @functools.cache
-def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep: bool) -> _types.SimpleNamespace:
+def step_kernels(
+    dtype: str, coefficients: wp.Function, static: bool, multistep: bool, nonpotential: bool
+) -> _types.SimpleNamespace:
     """Kernels of the step loop.
 
     Args:
@@ -79,6 +83,7 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         coefficients: wp.func (h, previous h) -> vec3d(a0, a1, beta) of the time discretisation.
         static: no inertia, v is the displacement increment.
         multistep: the scheme uses the step before the last.
+        nonpotential: forces without a potential act.
     """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -86,7 +91,7 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
     Step = step_struct()
     Newton = control_struct()
     PCG = pcg_struct()
-    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}")
+    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}_{nonpotential}")
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
@@ -94,6 +99,7 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         world = wp.tid()
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
         step.running[world] = alive
+        step.refused[world] = 0
         newton.total_iterations[world] = 0
         pcg.total[world] = 0
         step.halvings[world] = 0
@@ -112,19 +118,24 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         if world == 0:
             step.any_running[0] = 0
         step.accepted[world] = 0
-        step.refused[world] = 0
         step.first_refusal[world] = 0
         newton.active[world] = step.running[world]
         newton.searching[world] = 0
         if step.running[world] == 0:
-            return
+            return  # `refused` keeps the verdict of a world that failed earlier in this step
+        step.refused[world] = 0
         newton.failed[world] = 0
         newton.iterations[world] = 0
         parts = f64(wp.lshift(1, step.level[world]))
         h = step.dt[world] / parts
         step.h[world] = h
         step.new_time[world] = step.step_start[world] + step.dt[world] * (f64(step.part[world] + 1) / parts)
-        c = coefficients(h, step.previous_h[world])
+        previous = f64(0.0)
+        if wp.static(multistep):
+            # a state that was set, reset or advanced by another scheme since has no past
+            if step.previous_end[world] == step.time[world]:
+                previous = step.previous_h[world]
+        c = coefficients(h, previous)
         step.a0[world] = c[0]
         step.a1[world] = c[1]
         if wp.static(static):
@@ -210,7 +221,7 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
 
     @wp.kernel(module=module)
     def failed_now(step: Step, flags: wp.array(dtype=wp.int32)):
-        """Flags of the worlds whose step failed for good after at least one accepted substep may have changed them."""
+        """Flags of the worlds whose step failed for good: accepted substeps of it are taken back."""
         world = wp.tid()
         flags[world] = 0
         if step.status[world] == wp.static(STATUS["failed"]) and step.refused[world] == 1:
@@ -235,6 +246,7 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
             v_before[world, slot] = v_n[world, slot]
             if slot == 0:
                 step.previous_h[world] = step.h[world]
+                step.previous_end[world] = step.new_time[world]
         u_n[world, slot] = u[world, slot]
         if wp.static(not static):
             v_n[world, slot] = v[world, slot]
@@ -254,11 +266,12 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         inertia: wp.array2d(dtype=vec3),
         internal: wp.array2d(dtype=vec3),
         dead: wp.array2d(dtype=vec3),
+        pushed: wp.array2d(dtype=vec3),
         g: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
         """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq,
-        pushed.dq, inertia.dq."""
+        pushed.dq, inertia.dq, gravity.u."""
         world, slot = wp.tid()
         if step.accepted[world] == 0:
             return
@@ -268,7 +281,6 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         dq = u[world, slot] - u_n[world, slot]
         a = inertia[world, slot]
         dv = v[world, slot] - v_n[world, slot]
-        total = a + internal[world, slot] - g[world, slot]
         f = free[slot]
         held = vec3(T(1.0) - f[0], T(1.0) - f[1], T(1.0) - f[2])
         weight = lumped[slot] * vec3(step.gravity[world])
@@ -280,8 +292,11 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
         rows[4, world, slot] = f64(wp.dot(wp.cw_mul(g[world, slot], held), dq))
         rows[5, world, slot] = f64(0.5) * f64(wp.dot(v[world, slot], Mv))
         rows[6, world, slot] = f64(wp.dot(wp.cw_mul(g[world, slot], f), dq))
-        rows[7, world, slot] = f64(wp.dot(total - loads, dq))
+        rows[7, world, slot] = f64(0.0)
+        if wp.static(nonpotential):
+            rows[7, world, slot] = f64(wp.dot(pushed[world, slot], dq))
         rows[8, world, slot] = f64(wp.dot(a, dq))
+        rows[9, world, slot] = f64(wp.dot(weight, u[world, slot]))
 
     @wp.kernel(module=module)
     def ledger_update(
@@ -307,9 +322,10 @@ def step_kernels(dtype: str, coefficients: wp.Function, static: bool, multistep:
             numerical += sums[8, world] - change_K
         else:
             numerical += sums[0, world]
+        step.ledger_time[world] = step.time[world]
         ledger[world, 0] = kinetic
         ledger[world, 1] = strain
-        ledger[world, 2] = ledger[world, 2] - sums[3, world]
+        ledger[world, 2] = -sums[9, world]
         ledger[world, 3] = ledger[world, 3] + loads
         ledger[world, 4] = ledger[world, 4] + sums[4, world]
         ledger[world, 5] = ledger[world, 5] + sums[7, world]

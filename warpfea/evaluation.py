@@ -47,6 +47,7 @@ class Evaluation:
         contribution = self._zeros((m.worlds, m.contributions), m.types.vec3)
         energy = self._zeros((2, m.worlds, m.element_count), wp.float64)
         low = wp.full(m.worlds, 1e30, dtype=wp.float64, device=m.device)
+        domain = wp.full(m.worlds, 1e30, dtype=wp.float64, device=m.device)
         one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
         history = self._zeros((1, 1), m.types.sym)
         for block in m.blocks:
@@ -61,6 +62,7 @@ class Evaluation:
                 contribution,
                 energy,
                 low,
+                domain,
             ]
             self.launch(kernel, (m.worlds, block.count), args)
         return self._gather(contribution), energy.numpy()[0].sum(axis=1), low.numpy()

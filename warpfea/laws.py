@@ -29,10 +29,6 @@ class TimeLaw:
     function: Any = None
     scalar: bool = False
 
-    @property
-    def is_constant(self) -> bool:
-        return self.function is None and len(self.times) == 1
-
 
 def _widen(values: np.ndarray, scalar: bool) -> np.ndarray:
     if not scalar:

@@ -11,7 +11,8 @@ import warp as wp
 from . import assembly
 from .elements import Rule
 from .errors import ModelError
-from .kernels.loads import body_force_kernel, law_function_kernel, law_struct, load_kernels
+from .kernels.gather import gather_kernels, topology_struct
+from .kernels.loads import body_force_kernel, facet_struct, law_function_kernel, law_struct, load_kernels
 from .laws import TimeLaw
 
 if TYPE_CHECKING:
@@ -39,10 +40,7 @@ class PressurePart:
 
     conn: Any
     law: Any
-    shape: Any
-    d_xi: Any
-    d_eta: Any
-    weight: Any
+    tables: Any
     offset: int
     count: int
 
@@ -53,8 +51,8 @@ class Drives:
 
     slot: Any
     law: Any
-    components: Any
     count: int
+    components: Any = None
     arm: Any = None
     axis: Any = None
 
@@ -107,7 +105,8 @@ class Loads:
         start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
         law = np.concatenate(laws) if laws else np.zeros(0)
         weight = np.concatenate(weights) if weights else np.zeros(0)
-        self.has_dead = bool(len(slots)) or bool(np.any(self.gravity_host))
+        explicit = any(b.key.damping == "explicit" for b in m.blocks)  # books its force with the dead loads
+        self.has_dead = bool(len(slots)) or bool(np.any(self.gravity_host)) or explicit
         self.dead_start = m.array("loads", start, wp.int32)
         self.dead_law = m.array("loads", law[order] if len(order) else np.zeros(1), wp.int32)
         table = np.repeat(weight[order][:, None], 3, axis=1) if len(order) else np.zeros((1, 3))
@@ -115,24 +114,54 @@ class Loads:
         self._dead_hash = (slot, law, weight)
 
     def _build_drives(self) -> None:
-        moved: list[tuple[int, int, np.ndarray]] = []
+        """One row per driven slot with a law for each component; two different laws on one component are refused."""
+        taken: dict[tuple[int, int], Any] = {}
+        moved: dict[int, list[int]] = {}
         turned: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
         for support in self.model.description.supports:
             slots = support.body.slot_offset + support.slots
-            if support.rotation is not None:
-                assert support.law is not None
-                index = self._laws.add(support.law)
-                anchor, axis = support.rotation
-                moved_arm = self._arms(support, anchor)
-                turned += [(s, index, support.components, a, axis) for s, a in zip(slots, moved_arm)]
-            elif support.node_laws is not None:
-                moved += [(s, self._laws.add(w), support.components) for s, w in zip(slots, support.node_laws)]
-            elif support.law is not None:
-                index = self._laws.add(support.law)
-                moved += [(s, index, support.components) for s in slots]
-        self.moved = self._upload_drives(moved)
-        self.turned = self._upload_drives(turned)
-        self.has_drives = bool(moved or turned)
+            arms = self._arms(support, support.rotation[0]) if support.rotation else None
+            index = self._laws.add(support.law) if support.law is not None else -1
+            for k, slot in enumerate(slots):
+                node_law = support.node_laws[k] if support.node_laws else None
+                own = index if node_law is None else self._laws.add(node_law)
+                self._claim(taken, support, int(slot), (node_law or support.law, id(support) if arms is not None else 0))
+                if arms is not None:
+                    assert support.rotation is not None
+                    turned.append((slot, own, support.components, arms[k], support.rotation[1]))
+                elif own >= 0:
+                    row = moved.setdefault(int(slot), [-1, -1, -1])
+                    for c in np.flatnonzero(support.components):
+                        row[c] = own
+        m = self.model
+        self.moved = self.turned = None
+        if moved:
+            rows = np.array([[slot, *laws] for slot, laws in moved.items()])
+            slot, law = m.array("drives", rows[:, 0], wp.int32), m.array("drives", rows[:, 1:], wp.vec3i)
+            self.moved = Drives(slot, law, len(rows))
+        if turned:
+            slot, law, components, arm, axis = (np.array(column) for column in zip(*turned))
+            self.turned = Drives(
+                m.array("drives", slot, wp.int32),
+                m.array("drives", law, wp.int32),
+                len(turned),
+                components=m.array("drives", components, wp.vec3d),
+                arm=m.array("drives", arm, wp.vec3d),
+                axis=m.array("drives", axis, wp.vec3d),
+            )
+
+    def _claim(self, taken: dict[tuple[int, int], Any], support: Support, slot: int, kind: Any) -> None:
+        """Note who prescribes a component; equal prescriptions may meet, others may not."""
+        body = support.body
+        for c in np.flatnonzero(support.components):
+            other = taken.setdefault((slot, int(c)), kind)
+            if other is kind or (other[1] == kind[1] and _same_law(other[0], kind[0])):
+                continue
+            node = int(body.slot_node[slot - body.slot_offset])
+            raise ModelError(
+                f"body {body.name!r}: two supports prescribe component {'xyz'[c]} of node {node} differently; let one of "
+                "them leave it out (components=, or a selection without the node)"
+            )
 
     def _arms(self, support: Support, anchor: np.ndarray) -> np.ndarray:
         body = support.body
@@ -141,22 +170,6 @@ class Loads:
         arms[position] += body.origin - anchor
         return arms
 
-    def _upload_drives(self, rows: list[Any]) -> Drives | None:
-        if not rows:
-            return None
-        m = self.model
-        columns = list(zip(*rows))
-        out = Drives(
-            slot=m.array("drives", np.array(columns[0]), wp.int32),
-            law=m.array("drives", np.array(columns[1]), wp.int32),
-            components=m.array("drives", np.array(columns[2]), wp.vec3d),
-            count=len(rows),
-        )
-        if len(columns) > 3:
-            out.arm = m.array("drives", np.array(columns[3]), wp.vec3d)
-            out.axis = m.array("drives", np.array(columns[4]), wp.vec3d)
-        return out
-
     def _build_pressures(self, pressures: list[Pressure]) -> list[PressurePart]:
         m = self.model
         parts = []
@@ -164,15 +177,14 @@ class Loads:
             index = self._laws.add(pressure.law)
             conn, s, a, b, w = assembly.facet_tables(pressure.surface)
             conn = conn + pressure.surface.body.slot_offset
-            T = m.types.T
+            tables = facet_struct(m.dtype)()
+            for name, values in (("shape", s), ("d_xi", a), ("d_eta", b), ("weight", w)):
+                setattr(tables, name, m.array("loads", values, m.types.T))
             parts.append(
                 PressurePart(
                     conn=m.array("loads", conn.T, wp.int32),
                     law=m.array("loads", np.full(len(conn), index), wp.int32),
-                    shape=m.array("loads", s, T),
-                    d_xi=m.array("loads", a, T),
-                    d_eta=m.array("loads", b, T),
-                    weight=m.array("loads", w, T),
+                    tables=tables,
                     offset=self._offset,
                     count=len(conn),
                 )
@@ -240,11 +252,7 @@ class Loads:
         flat = np.concatenate([c.T.ravel() for c in self._pushed])
         order = np.argsort(flat, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=m.slots))])
-        topo = type(m.topology)() if hasattr(m, "topology") else None
-        if topo is None:
-            from .kernels.gather import topology_struct
-
-            topo = topology_struct(m.dtype)()
+        topo = topology_struct(m.dtype)()
         topo.start = m.array("loads", start, wp.int32)
         topo.entry = m.array("loads", order, wp.int32)
         self.pushed_topology = topo
@@ -265,6 +273,20 @@ class Loads:
             if law.function is not None:
                 take = _argument_precision(law.function, m.dtype)
                 self.function_laws.append((law_function_kernel(law.function, law.scalar, take), k))
+
+    def gather_kernels(self) -> Any:
+        """The gather kernels that fit the loads there are."""
+        return gather_kernels(self.model.dtype, self.nonpotential, bool(self.pressures))
+
+    def used_kernels(self) -> list[Any]:
+        """The kernels that a step launches for the loads there are."""
+        k = self.kernels
+        out = [part.kernel for part in self.fields] + [kernel for kernel, _ in self.function_laws]
+        out += [k.evaluate_laws] * bool(self.law_count) + [k.dead_load] * self.has_dead
+        out += [k.drive_displacement] * bool(self.moved) + [k.drive_rotation] * bool(self.turned)
+        out += [k.follower_pressure] * bool(self.pressures)
+        out += [k.add_explicit] * any(b.key.damping == "explicit" for b in self.model.blocks)
+        return out
 
     # use
 
@@ -306,9 +328,15 @@ class Loads:
         for force in self.model.description.body_forces:
             h.update(force.function.key.encode())
         for drive in (self.moved, self.turned):
-            for values in (drive.slot, drive.components, drive.arm, drive.axis) if drive else ():
+            for values in (drive.slot, drive.law, drive.components, drive.arm, drive.axis) if drive else ():
                 if values is not None:
                     h.update(values.numpy().tobytes())
+
+
+def _same_law(a: TimeLaw | None, b: TimeLaw | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return a.function is b.function and np.array_equal(a.times, b.times) and np.array_equal(a.values, b.values)
 
 
 def _argument_precision(function: wp.Function, default: str) -> str:

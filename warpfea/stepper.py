@@ -46,14 +46,16 @@ class Stepper:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
         self.ledger, self.on_compile = ledger, on_compile
         self.launch = Launcher(model.device)
-        self.kernels = step_kernels(model.dtype, integrator.coefficients, integrator.static, integrator.multistep)
+        self.kernels = step_kernels(model.dtype, integrator.coefficients, integrator.static, integrator.multistep, model.loads.nonpotential)
         vec3 = model.types.vec3
         if integrator.multistep:
             state.register("previous_displacement", vec3, (model.slots,))
             state.register("previous_velocity", vec3, (model.slots,))
             state.register("previous_step", wp.float64)
+            state.register("previous_end", wp.float64)
         if ledger:
             state.register("ledger", wp.float64, (len(LEDGER),))
+            state.register("ledger_time", wp.float64)
         state.register("status", wp.int32)
         self.work = Workspace(model, integrator, max_newton=solver.max_newton, ledger=ledger)
         self.newton = NewtonLoop(model, self.work, self.launch, solver, inertia=not integrator.static)
@@ -61,10 +63,12 @@ class Stepper:
         self.running = self.work.any_flag[2:3]
         self._bind()
         self._probe_tables = self._upload_probes() if model.probes else []
+        state.sealed = True
         self.backup = state.like() if solver.max_halvings > 0 else None
         self._load_modules()
         if ledger:
-            self.begin_ledger(~self.state.ledger.numpy().any(axis=1))
+            fresh = ~self.state.ledger.numpy().any(axis=1)
+            self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
         self.graph = self._record() if capture else None
 
     def _bind(self) -> None:
@@ -76,11 +80,14 @@ class Stepper:
         w.step.max_halvings = self.solver.max_halvings
         if self.integrator.multistep:
             w.step.previous_h = state.previous_step
+            w.step.previous_end = state.previous_end
+        if self.ledger:
+            w.step.ledger_time = state.ledger_time
         self.u_before = state.previous_displacement if self.integrator.multistep else state.displacement
         self.v_before = state.previous_velocity if self.integrator.multistep else state.velocity
 
     def begin_ledger(self, mask: np.ndarray) -> None:
-        """Write the energies of the present state into the ledger of the chosen worlds."""
+        """Measure the ledger of the chosen worlds from the present state; what has added up stays."""
         m = self.model
         rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
         kernel = self.newton.residual.gather.mass_product
@@ -91,8 +98,9 @@ class Stepper:
         fresh[:, 1] = m.strain_energy(self.state)
         fresh[:, 2] = -np.einsum("bc,s,bsc->b", m.loads.gravity_host, m.lumped_host, u)
         ledger = self.state.ledger.numpy()
-        ledger[mask] = fresh[mask]
+        ledger[mask, :3] = fresh[mask, :3]
         self.state.ledger.assign(ledger)
+        self.state.ledger_time.assign(self.state.time)
 
     def _record(self) -> wp.Graph:
         with wp.ScopedCapture(device=self.model.device) as capture:
@@ -101,17 +109,21 @@ class Stepper:
 
     def modules(self) -> list[wp.Module]:
         """Modules a step launches, found by recording the launches without doing them."""
-        from .kernels.gather import gather_kernels
         from .kernels.newton import newton_kernels
         from .kernels.pcg import pcg_kernels
         from .kernels.reduce import reduce_kernels
         from .kernels.state import state_kernels
 
         m = self.model
-        out = {b.kernels.module for b in m.blocks} | {self.kernels.module, reduce_kernels().module}
-        out |= {gather_kernels(m.dtype, m.loads.nonpotential).module, newton_kernels(m.dtype).module}
-        out |= {pcg_kernels(m.dtype).module, m.loads.kernels.module, state_kernels().module}
-        out |= {f.kernel.module for f in m.loads.fields} | {k.module for k, _ in m.loads.function_laws}
+        out = {k.module for k in self.newton.residual.block_kernels} | {self.kernels.module, reduce_kernels().module}
+        out |= {m.loads.gather_kernels().module, newton_kernels(m.dtype).module}
+        out.add(pcg_kernels(m.dtype).module)
+        out |= {kernel.module for kernel in m.loads.used_kernels()}
+        if self.backup is not None:
+            out.add(state_kernels().module)
+        if not self.integrator.static:
+            out |= {b.kernels.viscous_force.module for b in m.blocks if b.key.damping == "explicit"}
+            out |= {b.kernels.strain_history.module for b in m.blocks if b.key.damping == "incremental"}
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
@@ -195,7 +207,7 @@ class Stepper:
             launch(k.dead_load, self.dim, [*args, w.step.ramp, active, w.dead, w.dead_magnitude])
         if loads.moved:
             d = loads.moved
-            args = [d.slot, d.law, d.components, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
+            args = [d.slot, d.law, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
             launch(k.drive_displacement, (m.worlds, d.count), args)
         if loads.turned:
             d = loads.turned
@@ -204,24 +216,23 @@ class Stepper:
 
     def _damping(self, active: wp.array) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
-        explicit = False
+        if self.integrator.static:
+            return
+        explicit = any(b.key.damping == "explicit" for b in m.blocks)
+        if explicit:
+            w.contribution.zero_()  # the gather below sums the entries of all blocks
         for block in m.blocks:
             dim = (m.worlds, block.count)
             if block.key.damping == "incremental":
                 args = [block.data, state.displacement, self.u_before, w.step.a0, w.step.a1, active, w.history]
                 launch(block.kernels.strain_history, dim, args)
-            elif block.key.damping == "explicit" and not self.integrator.static:
+            elif block.key.damping == "explicit":
                 args = [block.data, state.displacement, state.velocity, active, w.contribution, w.explicit_power]
                 launch(block.kernels.viscous_force, dim, args)
-                explicit = True
         if explicit:
-            gather = self.newton.residual.gather
-            self._gather_explicit(gather.gather_force, active)
-
-    def _gather_explicit(self, kernel: wp.Kernel, active: wp.array) -> None:
-        m, w, launch = self.model, self.work, self.launch
-        launch(kernel, self.dim, [m.topology, w.contribution, active, w.explicit])
-        launch(m.loads.kernels.add_explicit, self.dim, [w.explicit, active, w.dead])
+            gather = self.newton.residual.gather.gather_force
+            launch(gather, self.dim, [m.topology, w.contribution, active, w.explicit])
+            launch(m.loads.kernels.add_explicit, self.dim, [w.explicit, active, w.dead])
 
     def _book(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
@@ -229,7 +240,7 @@ class Stepper:
         reduce = self.newton.residual.reduce
         topo = m.topology
         args = [w.step, topo.mass_start, topo.mass_column, topo.mass_value, topo.free, m.lumped, w.u, w.v]
-        args += [state.displacement, state.velocity, w.inertia, w.internal, w.dead, w.g, w.rows]
+        args += [state.displacement, state.velocity, w.inertia, w.internal, w.dead, w.pushed, w.g, w.rows]
         launch(self.kernels.ledger_rows, self.dim, args)
         reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
         if any(b.key.damping == "explicit" for b in m.blocks):

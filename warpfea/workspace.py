@@ -13,7 +13,7 @@ from .kernels.newton import COMPONENT_ROWS, LANES, control_struct
 from .kernels.pcg import LANES as GROUP_LANES
 from .kernels.pcg import pcg_struct
 from .kernels.reduce import CHUNK
-from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_struct
+from .kernels.step import LEDGER_ROWS, REPORT, step_struct
 
 if TYPE_CHECKING:
     from .model import Model
@@ -52,6 +52,10 @@ class Workspace:
         self.pushed_contribution = (
             self.array("pushed_contribution", (B, loads.pushed_entries), vec3) if pushed else none
         )
+        pressed = bool(loads.pressures)
+        self.pushed_tangent = (
+            self.array("pushed_tangent", (B, loads.pushed_entries), vec3) if pressed else self.pushed_contribution
+        )
         forms = {b.key.damping for b in model.blocks}
         self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
         self.explicit = field("explicit") if "explicit" in forms else none
@@ -59,11 +63,11 @@ class Workspace:
             "explicit_power", (B, model.element_count) if "explicit" in forms else (1, 1), wp.float64
         )
         self.explicit_work = self.array("explicit_work", (1, B), wp.float64)
-        self.rows = self.array("rows", (RESIDUAL_ROWS, B, n), wp.float64)
+        self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
         longest = max(n, model.element_count)
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
-        self.partial = self.array("partial", (RESIDUAL_ROWS, B, chunks), wp.float64)
+        self.partial = self.array("partial", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, chunks), wp.float64)
         self.law_value = self.array("law_value", (B, max(loads.law_count, 1)), wp.vec3d)
         self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
@@ -80,9 +84,6 @@ class Workspace:
         self.newton.components = C
         self.pcg = self._struct(pcg_struct(), B, sums=(1, B))
         self.step = self._struct(step_struct(), B)
-        self.all_worlds = self.array("all_worlds", (B,), wp.int32)
-        self.all_worlds.fill_(1)
-        assert len(LEDGER)
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Zeroed array; its bytes are counted."""

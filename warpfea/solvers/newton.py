@@ -29,8 +29,9 @@ class NewtonPCG:
     """Newton's method with a line search; linear systems by preconditioned conjugate gradients.
 
     Args:
-        tol: |g| <= tol x max(|f_int|, |f_ext|, |M a|) in the D^-1 norm, above the rounding of the positions. None: 1e-8
-            in float64, 1e-4 in float32.
+        tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D the diagonal of H) and
+            for each connected part of the model apart. f_int counts at supports too, so that a held, stressed body
+            without loads has a scale. None: 1e-8 in float64, 1e-4 in float32.
         max_newton: iterations before a step is refused.
         max_pcg: iterations per linear solve.
         max_halvings: how often a refused step may be halved.
@@ -66,7 +67,7 @@ class NewtonLoop:
     def __init__(self, model: Model, work: Workspace, launch: Launcher, options: NewtonPCG, *, inertia: bool) -> None:
         self.model, self.work, self.launch = model, work, launch
         self.kernels = newton_kernels(model.dtype)
-        self.residual = Residual(model, work, launch)
+        self.residual = Residual(model, work, launch, viscous=inertia)
         self.preconditioner = make(options.preconditioner, model, work, launch, self.residual)
         self.pcg = PCG(
             model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
@@ -77,8 +78,8 @@ class NewtonLoop:
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
         ctl.max_iterations = options.max_newton
-        ctl.need_positive_J = int(model.needs_positive_J)
-        ctl.nonpotential = int(model.loads.nonpotential or any(b.key.damping == "rate" for b in model.blocks))
+        rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
+        ctl.nonpotential = int(model.loads.nonpotential or rate)
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
 
@@ -90,7 +91,7 @@ class NewtonLoop:
         # D is needed to judge the first iterate, so the blocks come first
         self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         self.preconditioner.build(active)
-        self.residual.evaluate(active)
+        self.residual.evaluate(active, hold=True)
         self.launch(self.kernels.begin, self.model.worlds, [w.newton])
         self._any(active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..kernels.gather import RESIDUAL_ROWS, gather_kernels
+from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
 
@@ -42,34 +42,28 @@ class Reducer:
 class Residual:
     """Launches that evaluate g(v), Phi(v), the norms, and H p."""
 
-    def __init__(self, model: Model, work: Workspace, launch: Launcher) -> None:
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, *, viscous: bool) -> None:
         self.model = model
         self.work = work
         self.launch = launch
+        # statics has no rates: the kernels without damping serve there
+        self.block_kernels = [b.kernels if viscous else b.kernels_for(model.dtype, None) for b in model.blocks]
         self.reduce = Reducer(launch, work, model.worlds)
-        self.gather = gather_kernels(model.dtype, model.loads.nonpotential)
+        self.gather = model.loads.gather_kernels()
         self.newton = newton_kernels(model.dtype)
         self.dim = (model.worlds, model.slots)
 
-    def evaluate(self, active: wp.array) -> None:
-        """q, forces, g and all sums at the iterate v."""
+    def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
+        """q, forces, g and all sums at the iterate v; `hold`: Phi holds the non-potential forces of this iterate."""
         m, w, launch = self.model, self.work, self.launch
         launch(self.newton.reset_min_J, m.worlds, [w.newton, active])
         launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
-        for block in m.blocks:
-            args = [
-                block.data,
-                w.u,
-                w.v,
-                w.history,
-                w.step.dq_dv,
-                active,
-                w.contribution,
-                w.energy_rows,
-                w.newton.min_J,
-            ]
-            launch(block.kernels.internal_force, (m.worlds, block.count), args)
+        for block, kernels in zip(m.blocks, self.block_kernels):
+            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, w.contribution, w.energy_rows]
+            launch(kernels.internal_force, (m.worlds, block.count), [*args, w.newton.min_J, w.newton.domain_J])
         self.push(active)
+        if hold:
+            self.hold_pushed(active)
         args = [m.topology, w.contribution, w.v, w.v_tilde, w.dead, w.dead_magnitude, w.pushed, w.pushed_held]
         args += [w.direction, w.diagonal, w.u, w.step.mass_factor, w.step.dq_dv, active]
         launch(self.gather.residual, self.dim, [*args, w.inertia, w.internal, w.g, w.rows])
@@ -88,7 +82,7 @@ class Residual:
         if not loads.nonpotential:
             return
         for part in loads.pressures:
-            args = [part.conn, part.law, part.shape, part.d_xi, part.d_eta, part.weight, m.reference_device, w.u]
+            args = [part.conn, part.law, part.tables, m.reference_device, w.u]
             args += [w.law_value, part.offset, active, w.pushed_contribution]
             launch(loads.kernels.follower_pressure, (m.worlds, part.count), args)
         for field in loads.fields:
@@ -106,17 +100,25 @@ class Residual:
     def blocks(self, active: wp.array) -> None:
         """Diagonal blocks of H at the iterate: D for the norms, inverses for the preconditioner."""
         m, w, launch = self.model, self.work, self.launch
-        for block in m.blocks:
+        for block, kernels in zip(m.blocks, self.block_kernels):
             args = [block.data, w.u, w.step.dq_dv, active, w.block_contribution]
-            launch(block.kernels.diagonal_blocks, (m.worlds, block.count), args)
+            launch(kernels.diagonal_blocks, (m.worlds, block.count), args)
         args = [m.topology, w.block_contribution, w.step.mass_factor, w.step.dq_dv, active, w.diagonal, w.inverse]
         launch(self.gather.gather_blocks, self.dim, args)
 
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate, and p.Hp per slot in rows[0]."""
         m, w, launch = self.model, self.work, self.launch
-        for block in m.blocks:
+        for block, kernels in zip(m.blocks, self.block_kernels):
             args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
-            launch(block.kernels.tangent_product, (m.worlds, block.count), args)
-        args = [m.topology, w.contribution, p, w.step.mass_factor, w.step.dq_dv, active, out, w.rows]
+            launch(kernels.tangent_product, (m.worlds, block.count), args)
+        loads = m.loads
+        start, entry = m.topology.start, m.topology.entry
+        if loads.pressures:
+            start, entry = loads.pushed_topology.start, loads.pushed_topology.entry
+            for part in loads.pressures:
+                args = [part.conn, part.law, part.tables, m.reference_device, w.u, w.law_value, part.offset, active]
+                launch(loads.kernels.pressure_product, (m.worlds, part.count), [*args, p, w.pushed_tangent])
+        args = [m.topology, w.contribution, start, entry, w.pushed_tangent, p]
+        args += [w.step.mass_factor, w.step.dq_dv, active, out, w.rows]
         launch(self.gather.product, self.dim, args)
