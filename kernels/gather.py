@@ -38,7 +38,7 @@ def topology_struct(dtype: str):
 
 @functools.cache
 def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _types.SimpleNamespace:
-    """Kernels over slots; `nonpotential` adds the forces that are held inside a line search, `pressure` their tangent."""
+    """Kernels over slots; `nonpotential` adds forces that are held inside a line search, `pressure` their tangent."""
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)

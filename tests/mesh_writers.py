@@ -121,18 +121,11 @@ def _msh41(parts, form):
     def put(code, *values):
         if binary:
             return struct.pack("=" + code, *values)
-        return (
-            " ".join(repr(float(v)) if c == "d" else str(int(v)) for c, v in zip(code, values)) + "\n"
-        ).encode()
+        return (" ".join(repr(float(v)) if c == "d" else str(int(v)) for c, v in zip(code, values)) + "\n").encode()
 
     dims = [DIMENSION.get(kind, 3) for kind, _, _ in parts.blocks]
     body = [k for k, d in enumerate(dims) if d == 3]
-    out = (
-        _head("4.1", binary)
-        + _names(parts)
-        + b"$Entities\n"
-        + put("QQQQ", *(dims.count(d) for d in range(4)))
-    )
+    out = _head("4.1", binary) + _names(parts) + b"$Entities\n" + put("QQQQ", *(dims.count(d) for d in range(4)))
     for d in range(1, 4):
         for k in [k for k, dim in enumerate(dims) if dim == d]:
             physical = [parts.tag(k)] if parts.tag(k) else []

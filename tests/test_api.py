@@ -114,7 +114,8 @@ def test_the_interface(hook_file, tmp_path, monkeypatch):
     p = sim.probe("tip")
     assert p.time.shape == (10,)
     assert p.position.shape == p.displacement.shape == p.velocity.shape == (1, 10, 3)
-    names = "kinetic strain potential work viscous contact friction integrator ledger_residual".split()
+    names = ["kinetic", "strain", "potential", "work", "viscous", "contact", "friction", "integrator"]
+    names.append("ledger_residual")
     assert all(sim.energies()[name].shape == (1,) for name in names)
     assert sim.field("von_mises", hook).shape == (1, N)
     assert sim.reaction(hook.nodes("fixed")).shape == (1, 3)
@@ -147,7 +148,8 @@ def test_statics_and_worlds():
 
 
 def test_errors_derive_from_one():
-    for name in "MeshError ModelError ConvergenceError ConstraintError PenetrationError CapacityError CheckpointError".split():
+    names = ["MeshError", "ModelError", "ConvergenceError", "ConstraintError", "PenetrationError", "CapacityError"]
+    for name in [*names, "CheckpointError", "OutputError"]:
         assert issubclass(getattr(wf, name), wf.Error)
     for name in ("GROUND", "Rectangle", "HalfSpace"):
         with pytest.raises(NotImplementedError, match=name):

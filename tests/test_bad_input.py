@@ -102,6 +102,15 @@ CASES = {
         lambda: build(lambda b, s: b.set_initial(s, velocity=np.zeros((2, 3)))), wf.ModelError, r"'bar': velocity"),
     "probe twice": (
         lambda: build(lambda b, s: [b.add_probe("p", s.nodes("x+")) for _ in "ab"]), wf.ModelError, r"probe 'p'"),
+    "clamp of a surface": (
+        lambda: build(lambda b, s: b.clamp(s.surface("x-"))), wf.ModelError, r"clamp: expected nodes.*got a surface"),
+    "pressure on nodes": (
+        lambda: build(lambda b, s: b.add_pressure(s.nodes("x-"), 1.0)), wf.ModelError, r"expected a surface.*'bar'"),
+    "supports that differ": (
+        lambda: static_of(lambda b, s: [b.clamp(s.nodes("x-")), b.drive(s.nodes("x-"), displacement=(0, 0, 1))]),
+        wf.ModelError, r"'bar': two supports prescribe component x of node \d+"),
+    "foreign state": (
+        lambda: wf.Simulation(model_of(), model_of(dtype="float32").state(), dt=1.0), wf.ModelError, r"state is of"),
     "empty model": (lambda: wf.ModelBuilder().finalize(device="cpu"), wf.ModelError, r"no body"),
     "device": (lambda: model_of_device("tpu:7"), wf.ModelError, r"device 'tpu:7'.*cpu"),
     "dtype": (lambda: model_of(dtype="float16"), wf.ModelError, r"'float16'"),

@@ -131,7 +131,13 @@ def test_rule_is_exact_up_to_its_degree_and_no_further(name):
 def test_default_rules_have_positive_weights():
     for name in ("T4", "T10"):
         family = elements.get(name)
-        for rule in (family.rule(None), family.curved_rule, family.mass_rule, family.curved_mass_rule, quadrature.triangle_6()):
+        for rule in (
+            family.rule(None),
+            family.curved_rule,
+            family.mass_rule,
+            family.curved_mass_rule,
+            quadrature.triangle_6(),
+        ):
             assert rule.weights.min() > 0, (name, rule.name)
     assert [elements.get(name).rule(None).name for name in ("T10", "T4")] == ["tet4", "tet1"]
     assert elements.TET_RULES["tet5_paper"].weights.min() == pytest.approx(-0.8 / 6, rel=1e-15)

@@ -48,6 +48,39 @@ def test_ledger_residual_is_the_unbalanced_work(damping, integrator):
         assert e["integrator"] > 0.0
 
 
+ROWS = {0: "integrator's inertia", 1: "f_int.dq", 2: "loads", 3: "gravity", 4: "supports", 5: "kinetic", 7: "fields"}
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_a_wrong_sign_on_the_device_shows(row, monkeypatch):
+    """Each sum that the ledger is made of, with its sign turned before it is booked."""
+    from warpfea.kernels.step import LEDGER_ROWS
+
+    from warpfea.solvers.residual import Reducer
+
+    def run(turned):
+        b, _ = scene("incremental")
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=4e-3, solver=wf.NewtonPCG(tol=1e-8), capture=False)
+        if turned is not None:
+            plain = Reducer.__call__
+
+            def wrong(self, rows, count, active, out):
+                plain(self, rows, count, active, out)
+                if count == LEDGER_ROWS:
+                    values = out.numpy()
+                    values[turned] *= -1.0
+                    out.assign(values)
+
+            monkeypatch.setattr(Reducer, "__call__", wrong)
+        sim.step(5)
+        e = {name: values[0] for name, values in sim.energies().items()}
+        size = max(abs(e[name]) for name in COLUMNS)
+        return max(abs(e["ledger_residual"] - e["unbalanced"]), abs(totals(e) - e["unbalanced"])) / size
+
+    assert run(None) < 1e-12
+    assert run(row) > 1e-6
+
+
 def test_columns_have_their_own_definitions():
     b, body = scene("incremental", pressure=False)
     model = b.finalize(device="cpu")

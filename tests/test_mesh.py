@@ -220,11 +220,7 @@ def test_abaqus_keywords(tmp_path):
 @pytest.mark.parametrize("form", FORMATS)
 def test_interior_surface_takes_the_side_its_normal_leaves(form, flip, tmp_path):
     mesh = box((2.0, 1.0, 1.0), cells=(2, 1, 1), element="T4")
-    inner = [
-        f
-        for f in mesh.faces([[e, f] for e in range(6) for f in range(4)])
-        if (mesh.points[f, 0] == 1.0).all()
-    ]
+    inner = [f for f in mesh.faces([[e, f] for e in range(6) for f in range(4)]) if (mesh.points[f, 0] == 1.0).all()]
     assert len(inner) == 2  # seen from the left cell: normals along +x
     triangles = np.array(inner)[:, ::-1] if flip else np.array(inner)
     parts = Parts(mesh.points, [("tetra", mesh.cells, None), ("triangle", triangles, "middle")])
@@ -415,9 +411,7 @@ def test_grid_names_the_missing_feature():
 
 def test_import_loads_no_optional_reader():
     code = "import sys, warpfea.mesh; print([m for m in ('meshio', 'pxr', 'PIL', 'rich') if m in sys.modules])"
-    out = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=SCENES.parent, check=True
-    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=SCENES.parent, check=True)
     assert out.stdout.strip() == "[]"
 
 

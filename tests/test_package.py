@@ -8,6 +8,7 @@ import pathlib
 import re
 import subprocess
 import sys
+import sysconfig
 import tomllib
 
 import pytest
@@ -70,19 +71,22 @@ def test_wheel_runs_a_scene_from_another_folder(tmp_path):
     build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", str(wheels), str(ROOT)]
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = wheels.glob("*.whl")
-    site = tmp_path / "site"
-    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel)]
+    # an empty environment; only the dependencies are borrowed from this one, and its own warpfea is not
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
+    inside = tmp_path / "venv" / "bin" / "python"
+    install = [sys.executable, "-m", "pip", "--python", str(inside), "install", "-q", "--no-deps", str(wheel)]
     subprocess.run(install, check=True, capture_output=True)
-    assert {p.name for p in site.iterdir() if not p.name.endswith(".dist-info")} <= {"warpfea", "bin"}
+    (site,) = (tmp_path / "venv").glob("lib*/python3*/site-packages")
+    assert {p.name for p in site.iterdir() if not p.name.endswith(".dist-info")} == {"warpfea"}
+    (site / "borrowed.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     code = (
-        f"import sys; sys.path.insert(0, {str(site)!r});"
-        "import warpfea; assert warpfea.__file__.startswith(sys.path[0]), warpfea.__file__;"
+        f"import sys, warpfea; assert warpfea.__file__.startswith({str(site)!r}), warpfea.__file__;"
         "from warpfea.cli import main;"
         "sys.exit(main(['run', 'cantilever', '--t-end', '0.01', '--set', 'cells=2', '--json', 'out.json']))"
     )
-    out = python(code, elsewhere)
+    out = subprocess.run([str(inside), "-c", code], cwd=elsewhere, capture_output=True, text=True, check=False)
     assert out.returncode == 0, out.stderr
     assert (elsewhere / "out.json").exists()
 

@@ -1,6 +1,6 @@
 """warpfea: flexible multibody dynamics with Total Lagrangian finite elements in NVIDIA Warp.
 
-    b = wf.ModelBuilder(); body = b.add_solid(...); model = b.finalize(); sim = wf.Simulation(model, dt=...); sim.run(...)
+b = wf.ModelBuilder(); body = b.add_solid(...); model = b.finalize(); sim = wf.Simulation(model, dt=...); sim.run(...)
 """
 
 from __future__ import annotations

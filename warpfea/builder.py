@@ -12,7 +12,7 @@ import warp as wp
 
 from . import elements
 from . import mesh as meshes
-from .bodies import Body, MaterialPoint, NodeSet, SurfaceSet
+from .bodies import Body, ElementSet, MaterialPoint, NodeSet, SurfaceSet
 from .errors import ModelError
 from .laws import TimeLaw, time_law
 from .materials import Material
@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 __all__ = ["ModelBuilder", "Rotation"]
 
 COMPONENTS = {"x": 0, "y": 1, "z": 2}
+HANDLES: dict[type, str] = {
+    Body: "the body",
+    NodeSet: "nodes (body.nodes)",
+    SurfaceSet: "a surface (body.surface)",
+    ElementSet: "elements (body.elements)",
+    MaterialPoint: "a point (body.at)",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +209,7 @@ class ModelBuilder:
             slots: "all", or "position" to leave gradients free.
             components: which of "xyz" to hold.
         """
-        body = self._own(nodes, "clamp")
+        body = self._own(nodes, "clamp", NodeSet)
         self.description.supports.append(
             Support(body, _support_slots(nodes, slots), _components(components, f"clamp on {body.name!r}"))
         )
@@ -220,7 +227,8 @@ class ModelBuilder:
 
         Args:
             nodes: what to move.
-            displacement: time law of the displacement from the reference (3,), m, or (times (n,), values (n, nodes, 3)).
+            displacement: time law of the displacement from the reference (3,), m, or (times (n,), values
+                (n, nodes, 3)).
             rotation: Rotation about an axis, from the reference.
             components: which of "xyz" are prescribed.
             slots: "position", or "all" for gradients too (rotation only).
@@ -228,12 +236,14 @@ class ModelBuilder:
         Raises:
             ModelError: neither or both of displacement and rotation, or a wrong shape.
         """
-        body = self._own(nodes, "drive")
+        body = self._own(nodes, "drive", NodeSet)
         what = f"drive of {nodes.name or 'nodes'!r} on body {body.name!r}"
         if (displacement is None) == (rotation is None):
             raise ModelError(f"{what}: give either displacement or rotation")
         support = Support(body, _support_slots(nodes, slots), _components(components, what))
         if rotation is not None:
+            if not isinstance(rotation, Rotation):
+                raise ModelError(f"{what}: rotation must be a Rotation(anchor, axis, angle), got {rotation!r}")
             axis = _vector(rotation.axis, f"{what}: axis")
             if not np.linalg.norm(axis) > 0.0:
                 raise ModelError(f"{what}: axis is zero")
@@ -253,7 +263,7 @@ class ModelBuilder:
 
     def add_point_load(self, point: MaterialPoint | NodeSet, force: Any) -> None:
         """A force (time law, N) at a material point (Eq. 72), or shared equally by the nodes of a set."""
-        body = self._own(point, "add_point_load")
+        body = self._own(point, "add_point_load", MaterialPoint, NodeSet)
         law = time_law(force, f"point load on {body.name!r}")
         if isinstance(point, NodeSet):
             slots = _support_slots(point, "position")
@@ -268,14 +278,14 @@ class ModelBuilder:
 
     def add_traction(self, surface: SurfaceSet, traction: Any) -> None:
         """A dead traction (time law (3,), N per m^2 of the reference area) on faces."""
-        body = self._own(surface, "add_traction")
+        body = self._own(surface, "add_traction", SurfaceSet)
         law = time_law(traction, f"traction on {surface.name or 'faces'!r} of body {body.name!r}")
         slots, weights = surface_weights(surface)
         self.description.dead_loads.append(DeadLoad(body, slots, weights, law, "traction"))
 
     def add_pressure(self, surface: SurfaceSet, pressure: Any) -> None:
         """A follower pressure (time law, Pa) against the current outward normal of faces."""
-        body = self._own(surface, "add_pressure")
+        body = self._own(surface, "add_pressure", SurfaceSet)
         law = time_law(pressure, f"pressure on {surface.name or 'faces'!r} of body {body.name!r}", scalar=True)
         if not len(surface):
             raise ModelError(f"pressure on body {body.name!r}: the surface has no faces")
@@ -290,9 +300,14 @@ class ModelBuilder:
         """
         if not isinstance(field, wp.Function):
             raise ModelError(f"add_body_force: the field must be a wp.func, got {field!r}")
+        if len(field.input_types) != 2:
+            raise ModelError(
+                f"add_body_force: {field.key} takes {len(field.input_types)} arguments; it must be "
+                "(x: wp.vec3d, t: wp.float64) -> wp.vec3d, or the same in float32"
+            )
         chosen = list(self.bodies if bodies is None else bodies)
         for body in chosen:
-            self._own(body, "add_body_force")
+            self._own(body, "add_body_force", Body)
         self.description.body_forces.append(BodyForce(field, chosen))
 
     def set_initial(
@@ -302,14 +317,16 @@ class ModelBuilder:
 
         Args:
             velocity: (3,) or (nodes, 3), m/s.
-            angular_velocity: (3,) rad/s about the body's centroid of the initial positions' bounding box.
+            angular_velocity: (3,) rad/s about the centre of mass.
             displacement: (nodes, 3) m, or a function X (nodes, 3) -> (nodes, 3).
         """
-        self._own(body, "set_initial")
+        self._own(body, "set_initial", Body)
         N = len(body.mesh.points)
         if displacement is not None:
             values = displacement(body.mesh.points) if callable(displacement) else displacement
             body.initial_displacement = _nodal(values, N, f"body {body.name!r}: initial displacement")
+        if velocity is None and angular_velocity is None:
+            return
         total = np.zeros((N, 3))
         if velocity is not None:
             values = velocity(body.mesh.points) if callable(velocity) else velocity
@@ -326,7 +343,7 @@ class ModelBuilder:
 
     def add_probe(self, name: str, where: MaterialPoint | SurfaceSet | NodeSet) -> None:
         """Record a point at every step; of a surface its area mean, of nodes their mean."""
-        body = self._own(where, "add_probe")
+        body = self._own(where, "add_probe", MaterialPoint, SurfaceSet, NodeSet)
         if any(p.name == name for p in self.description.probes):
             raise ModelError(f"probe {name!r} is there already")
         if isinstance(where, MaterialPoint):
@@ -390,11 +407,14 @@ class ModelBuilder:
             name = f"{name}_{k}"
         return name
 
-    def _own(self, thing: Any, what: str) -> Body:
-        """The body behind a handle, which must be one of this builder's."""
+    def _own(self, thing: Any, what: str, *kinds: type) -> Body:
+        """The body behind a handle, which must be of one of the kinds and of this builder."""
         body = thing if isinstance(thing, Body) else getattr(thing, "body", None)
         if not isinstance(body, Body):
             raise ModelError(f"{what}: expected a handle of a body (such as body.nodes(...)), got {thing!r}")
+        if not isinstance(thing, kinds):
+            wanted = " or ".join(HANDLES[kind] for kind in kinds)
+            raise ModelError(f"{what}: expected {wanted} of body {body.name!r}, got {HANDLES[type(thing)]}")
         if body not in self.bodies:
             raise ModelError(f"{what}: body {body.name!r} belongs to another builder")
         if isinstance(thing, (NodeSet, SurfaceSet)) and len(thing) == 0:
@@ -479,8 +499,8 @@ def _assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[
     bare = np.flatnonzero(index < 0)
     if len(bare):
         raise ModelError(
-            f"body {name!r}: {len(bare)} elements of {mesh.label} have no material, the first is element {int(bare[0])}; "
-            f"groups given: {sorted(material)}"
+            f"body {name!r}: {len(bare)} elements of {mesh.label} have no material, the first is element "
+            f"{int(bare[0])}; groups given: {sorted(material)}"
         )
     return list(material.items()), index
 

@@ -79,7 +79,7 @@ class Evaluation:
         return self._gather(contribution), power.numpy().sum(axis=1)
 
     def tangent_matrix(self, state: State, world: int) -> sp.csr_matrix:
-        """df_int/dq as CSR. Slots are coloured so that no element holds a colour twice: one product per colour and axis."""
+        """df_int/dq as CSR. No element holds two slots of one colour: one product per colour and axis."""
         m = self.model
         one_world = State(1, m.device)
         row = state.displacement.numpy()[world : world + 1]
@@ -97,7 +97,7 @@ class Evaluation:
                 host = np.zeros((1, m.slots, 3), dtype=precision(m.dtype).T._type_)
                 host[0, colour == c, axis] = 1.0
                 direction.assign(host)
-                for block, conn in zip(m.blocks, conns):
+                for block in m.blocks:
                     kernel = block.kernels_for(m.dtype, None).tangent_product
                     args = [block.data, u, u, history, dq, flag, direction, contribution]
                     self.launch(kernel, (1, block.count), args)
@@ -129,7 +129,7 @@ class Evaluation:
         return out
 
     def nodal_stress(self, state: State, body: Any) -> np.ndarray:
-        """Cauchy stress at mesh nodes, [world, node, 6], Pa: linear fit per element, volume-weighted mean over elements."""
+        """Cauchy stress at mesh nodes, [world, node, 6], Pa: linear fit per element, then a volume-weighted mean."""
         m = self.model
         family = body.family
         nodes = len(body.mesh.points)

@@ -15,7 +15,7 @@ __all__ = ["TimeLaw", "time_law"]
 
 @dataclass(frozen=True, eq=False)
 class TimeLaw:
-    """A value over time: samples (n,), (n, width) linear in between and held beyond, one sample for a constant, or a function.
+    """A value over time: samples, linear in between and held beyond; one sample for a constant; or a function.
 
     Attributes:
         times: (n,) s; empty for a function.

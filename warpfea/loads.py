@@ -125,7 +125,9 @@ class Loads:
             for k, slot in enumerate(slots):
                 node_law = support.node_laws[k] if support.node_laws else None
                 own = index if node_law is None else self._laws.add(node_law)
-                self._claim(taken, support, int(slot), (node_law or support.law, id(support) if arms is not None else 0))
+                self._claim(
+                    taken, support, int(slot), (node_law or support.law, id(support) if arms is not None else 0)
+                )
                 if arms is not None:
                     assert support.rotation is not None
                     turned.append((slot, own, support.components, arms[k], support.rotation[1]))
@@ -134,11 +136,13 @@ class Loads:
                     for c in np.flatnonzero(support.components):
                         row[c] = own
         m = self.model
-        self.moved = self.turned = None
+        self.moved: Drives | None = None
+        self.turned: Drives | None = None
         if moved:
             rows = np.array([[slot, *laws] for slot, laws in moved.items()])
-            slot, law = m.array("drives", rows[:, 0], wp.int32), m.array("drives", rows[:, 1:], wp.vec3i)
-            self.moved = Drives(slot, law, len(rows))
+            self.moved = Drives(
+                m.array("drives", rows[:, 0], wp.int32), m.array("drives", rows[:, 1:], wp.vec3i), len(rows)
+            )
         if turned:
             slot, law, components, arm, axis = (np.array(column) for column in zip(*turned))
             self.turned = Drives(
@@ -159,8 +163,8 @@ class Loads:
                 continue
             node = int(body.slot_node[slot - body.slot_offset])
             raise ModelError(
-                f"body {body.name!r}: two supports prescribe component {'xyz'[c]} of node {node} differently; let one of "
-                "them leave it out (components=, or a selection without the node)"
+                f"body {body.name!r}: two supports prescribe component {'xyz'[c]} of node {node} differently; let "
+                "one of them leave it out (components=, or a selection without the node)"
             )
 
     def _arms(self, support: Support, anchor: np.ndarray) -> np.ndarray:
@@ -245,7 +249,7 @@ class Loads:
         """Gather table of the non-potential forces."""
         m = self.model
         self.pushed_entries = self._offset
-        self.pushed_topology = None
+        self.pushed_topology: Any = None
         if not self._offset:
             return
         # each launch lays its entries out as [local, item]

@@ -92,7 +92,8 @@ class SVK(Material):
 
     For large rotations and small to moderate strains. In compression it softens: the uniaxial stress falls again
     below a stretch of 1/sqrt(3) = 0.577 of the length and vanishes under full compression; a mirrored element
-    (F = diag(-1, 1, 1)) has no strain at all. Use a neo-Hookean law where that can happen; a step reports the smallest J.
+    (F = diag(-1, 1, 1)) has no strain at all. Use a neo-Hookean law where that can happen; a step reports its
+    smallest J.
 
     Args:
         E: Young's modulus, Pa.

@@ -115,9 +115,12 @@ class Model:
         if self.description.pressures or self.description.body_forces:
             self.reference_device = self.array("reference", self.reference, vec3)
         self.free_host = np.ones((self.slots, 3))
+        self.clamped_host = np.zeros((self.slots, 3), dtype=bool)
         for support in self.description.supports:
             rows = support.body.slot_offset + support.slots
             self.free_host[rows] *= 1.0 - support.components
+            if support.law is None and support.node_laws is None:
+                self.clamped_host[rows] |= support.components.astype(bool)
         if not self.free_host.any():
             raise ModelError("every component of every node is prescribed: nothing is left to solve for")
 
@@ -263,8 +266,8 @@ class Model:
             if rank < 6:
                 body = next(b for b in self.bodies if b.slot_offset <= slots[0] < b.slot_offset + b.slot_count)
                 raise ModelError(
-                    f"body {body.name!r} is not supported: its supports leave {6 - rank} rigid motions free, and statics "
-                    "has no unique answer; clamp or drive more nodes"
+                    f"body {body.name!r} is not supported: its supports leave {6 - rank} rigid motions free, and "
+                    "statics has no unique answer; clamp or drive more nodes"
                 )
 
     # what users call
@@ -349,7 +352,7 @@ class Model:
                 u[rows] = np.where((body.slot_kind == 0)[:, None], body.initial_displacement[body.slot_node], 0.0)
             if body.velocity is not None:
                 v[rows] = body.velocity
-        v *= self.free_host
+        v[self.clamped_host] = 0.0  # driven components keep what the user says
         out.register("displacement", vec3, (self.slots,), u)
         out.register("velocity", vec3, (self.slots,), v)
         out.register("time", wp.float64)

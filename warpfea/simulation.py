@@ -31,7 +31,7 @@ __all__ = ["ProbeRecord", "Simulation", "StepReport"]
 REASONS = {
     FAIL_ITERATIONS: "Newton's method did not converge",
     FAIL_LINE_SEARCH: "the line search found no decrease",
-    FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined",
+    FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
     FAIL_NAN: "a force or energy was not finite",
     FAIL_CURVATURE: "no descent direction was found",
 }
@@ -133,8 +133,12 @@ class Simulation:
     ) -> None:
         self.model = model
         self.state = model.state() if state is None else state
-        if self.state.worlds != model.worlds:
-            raise ModelError(f"the state has {self.state.worlds} worlds, the model {model.worlds}")
+        got, expected = self.state.displacement, (model.worlds, model.slots)
+        if got.shape != expected or got.dtype != model.types.vec3 or got.device != model.device:
+            raise ModelError(
+                f"the state is of another model: displacement {got.shape} of {got.dtype.__name__} on {got.device}, "
+                f"expected {expected} of {model.types.vec3.__name__} on {model.device}"
+            )
         self.integrator = scheme
         self.solver = solver
         began = clock.perf_counter()
@@ -144,6 +148,7 @@ class Simulation:
         self.last: StepReport | None = None
         self.totals = {"newton": np.zeros(model.worlds, int), "pcg": np.zeros(model.worlds, int)}
         self.max_residual = 0.0
+        self._stepped = np.zeros(model.worlds, dtype=bool)
         self._history: list[np.ndarray] = []
 
     # stepping
@@ -200,6 +205,8 @@ class Simulation:
             failure=column["failure"].astype(int),
         )
         self.steps += 1
+        self._stepped |= self.last.converged
+        self._stepped &= status != STATUS["failed"]
         self.totals["newton"] += self.last.newton
         self.totals["pcg"] += self.last.pcg
         good = self.last.converged
@@ -210,9 +217,10 @@ class Simulation:
         if fresh.any():
             fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
             if fatal:
-                self.steps -= 1
-                if self.model.probes:
-                    self._history.pop()
+                if not good.any():  # no world advanced
+                    self.steps -= 1
+                    if self.model.probes:
+                        self._history.pop()
                 raise self._failure(int(np.flatnonzero(fresh)[0]))
 
     def _failure(self, world: int) -> ConvergenceError:
@@ -227,13 +235,14 @@ class Simulation:
         else:
             element, where = self._worst_element(world)
         time = float(self.last.time[world])
+        halvings = min(int(self.last.halvings[world]), self.solver.max_halvings)
         status = self.state.status.numpy()
         status[status == STATUS["failed"]] = STATUS["running"]
         self.state.status.assign(status)
         self.last = None
         return ConvergenceError(
             f"step from t = {time:.6g} s with dt = {self._dt:g} s was not accepted in world {world}: "
-            f"{REASONS.get(code, 'unknown reason')} after {self.solver.max_halvings} halvings; relative residuals "
+            f"{REASONS.get(code, 'unknown reason')} after {halvings} halvings; relative residuals "
             f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}",
             time=time, world=world, residuals=history, element=element, state=self.state,
         )  # fmt: skip
@@ -277,7 +286,9 @@ class Simulation:
         """
         if not math.isfinite(t_end):
             raise ModelError(f"t_end = {t_end!r} must be finite")
-        total = max(0, round((t_end - float(self.time.min())) / self._dt))
+        alive = self.status == STATUS["running"]
+        now = float(self.time[alive].min()) if alive.any() else t_end
+        total = max(0, round((t_end - now) / self._dt))
         opened: list[Any] = []
         with _interruptible() as interrupted, _bar(total, t_end, progress) as bar:
             try:
@@ -332,6 +343,7 @@ class Simulation:
             spec = self.state.specs[name]
             array[mask] = fresh[name][mask] if name in fresh else np.asarray(spec.initial)
         self.state.load(values)
+        self._stepped[mask] = False
         if self.stepper.ledger:
             self.stepper.begin_ledger(mask)
 
@@ -403,11 +415,16 @@ class Simulation:
         return out
 
     def reaction(self, nodes: NodeSet) -> np.ndarray:
-        """Force of the supports on the prescribed components of nodes at the last step, (B, 3), N."""
+        """Force of the supports on the prescribed components of nodes at the last accepted step, (B, 3), N.
+
+        NaN for a world whose last step was refused, or that was reset or resumed and has not stepped since.
+        """
         g = self.stepper.work.g.numpy() * (1.0 - self.model.free_host)
         first = nodes.body.node_slot[nodes.indices]
         rows = nodes.body.slot_offset + first[first >= 0]
-        return g[:, rows].sum(axis=1)
+        total = g[:, rows].sum(axis=1).astype(float)
+        total[~self._stepped] = np.nan
+        return total
 
     def joint_force(self, joint: Any) -> np.ndarray:
         """Joints are not part of this version."""
@@ -426,6 +443,7 @@ class Simulation:
         from .checkpoint import load_checkpoint
 
         load_checkpoint(self, path)
+        self._stepped[:] = False
 
     def bytes(self) -> dict[str, int]:
         """Bytes on the device: constants, scratch, and each array of the state (twice where steps may be halved)."""

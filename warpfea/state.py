@@ -50,6 +50,7 @@ class State:
         self.device = device
         self.specs: dict[str, ArraySpec] = {}
         self._arrays: dict[str, wp.array] = {}
+        self.sealed = False
 
     def __getattr__(self, name: str) -> wp.array:
         arrays = self.__dict__.get("_arrays", {})
@@ -69,6 +70,10 @@ class State:
             if (old.dtype, old.shape) != (spec.dtype, spec.shape):
                 raise ModelError(f"state array {name!r} is registered as {old.dtype}{old.shape}")
             return self._arrays[name]
+        if self.sealed:
+            raise ModelError(
+                f"state array {name!r}: register it before the Simulation is made, which keeps copies of all"
+            )
         row = int(np.prod(spec.shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
         if row % 4:
             raise ModelError(f"state array {name!r}: a row has {row} bytes, which is no multiple of 4")
@@ -114,7 +119,7 @@ class State:
         return {name: array.numpy().copy() for name, array in self._arrays.items()}
 
     def load(self, values: dict[str, np.ndarray]) -> None:
-        """Set all arrays from the host. Raises CheckpointError on a missing name or another shape; nothing is set then."""
+        """Set all arrays from the host. CheckpointError on a missing name or another shape; nothing is set then."""
         missing = sorted(set(self._arrays) - set(values))
         extra = sorted(set(values) - set(self._arrays))
         if missing or extra:

@@ -24,7 +24,7 @@ class StaticResult:
     """A static solution.
 
     Attributes:
-        state: State at full load.
+        state: State at full load, with time 0: `Simulation(model, static.state, dt=...)` goes on from it.
         report: StepReport of the last load step.
         simulation: the loop that found it: positions, displacements, field, reaction, ...
         newton, pcg: iterations of all load steps, [world].
@@ -68,14 +68,13 @@ def solve_static(
 ) -> StaticResult:
     """Find the static equilibrium.
 
-    A pseudo-time runs from 0 to 1 in `load_steps` equal parts. Constant loads, gravity and constant driven displacements
-    grow in proportion to it; laws over time are taken at it. A load step that fails is halved.
+    A pseudo-time runs from 0 to 1 in `load_steps` equal parts. Constant loads, gravity and drives grow in proportion to it; laws over time are taken at it. A load step that fails is halved.
 
     Args:
         load_steps: number of load steps.
         tol: relative residual, by default the solver's.
         solver: NewtonPCG options; by default with room for slender bodies, max_pcg = 20000.
-        state: start; by default model.state().
+        state: start; by default model.state(). It is copied.
 
     Raises:
         ModelError: a body is not supported, or an option is out of range.
@@ -89,8 +88,10 @@ def solve_static(
         if not (math.isfinite(tol) and 0.0 < tol < 1.0):
             raise ModelError(f"solve_static: tol = {tol!r} must lie between 0 and 1")
         options = replace(options, tol=tol)
-    start = model.state() if state is None else state
+    start = model.state() if state is None else state.like()
+    start.time.zero_()
     sim = Simulation._static(model, start, options, 1.0 / load_steps)
     sim.run(1.0, progress=progress)
     assert sim.last is not None
+    start.time.zero_()  # what starts from the equilibrium starts at t = 0
     return StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"])

@@ -46,8 +46,11 @@ class Stepper:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
         self.ledger, self.on_compile = ledger, on_compile
         self.launch = Launcher(model.device)
-        self.kernels = step_kernels(model.dtype, integrator.coefficients, integrator.static, integrator.multistep, model.loads.nonpotential)
+        self.kernels = step_kernels(
+            model.dtype, integrator.coefficients, integrator.static, integrator.multistep, model.loads.nonpotential
+        )
         vec3 = model.types.vec3
+        state.sealed = False
         if integrator.multistep:
             state.register("previous_displacement", vec3, (model.slots,))
             state.register("previous_velocity", vec3, (model.slots,))

@@ -89,15 +89,9 @@ def read_inp(file: Path) -> RawMesh:
     for keyword, sets, option in (("NSET", node_members, "NSET"), ("ELSET", members, "ELSET")):
         for name, options, lines in ((b[1].get(option, ""), b[1], b[2]) for b in blocks if b[0] == keyword):
             sets.setdefault(name, []).extend(_set_lines(lines, options, sets, f"*{keyword}, {name}"))
-    raw.node_groups = {
-        k: node_ids.index(np.concatenate(v), f"node set {k!r}") for k, v in node_members.items() if v
-    }
+    raw.node_groups = {k: node_ids.index(np.concatenate(v), f"node set {k!r}") for k, v in node_members.items() if v}
     for name, parts in members.items():
-        where = (
-            ids.index(np.concatenate(parts), f"element set {name!r}")
-            if parts
-            else np.empty(0, dtype=np.int64)
-        )
+        where = ids.index(np.concatenate(parts), f"element set {name!r}") if parts else np.empty(0, dtype=np.int64)
         owner = np.searchsorted(starts, where, side="right") - 1
         for k in np.unique(owner):
             raw.groups.append((name, int(k), where[owner == k] - starts[k]))
@@ -116,9 +110,7 @@ def read_inp(file: Path) -> RawMesh:
             wanted = np.concatenate(known) if known else np.array([_integer(who, "*SURFACE")])
             where = ids.index(wanted, f"surface {options.get('NAME')!r}")
             owner = np.searchsorted(starts, where, side="right") - 1
-            rows_of.append(
-                np.column_stack([owner, where - starts[owner], np.full(len(where), int(label[1]) - 1)])
-            )
+            rows_of.append(np.column_stack([owner, where - starts[owner], np.full(len(where), int(label[1]) - 1)]))
         raw.faces[options.get("NAME", "surface")] = (
             np.concatenate(rows_of) if rows_of else np.empty((0, 3), dtype=np.int64)
         )
@@ -169,8 +161,7 @@ def _single_part(blocks: list[Block]) -> list[Block]:
             instances += 1
             if lines:
                 raise MeshError(
-                    f"instance {options.get('NAME')!r} is moved, which is not supported: apply it and save "
-                    "flat"
+                    f"instance {options.get('NAME')!r} is moved, which is not supported: apply it and save flat"
                 )
         elif keyword == "NODE" and inside == "PART" and lines:
             with_nodes.add(part)
@@ -178,9 +169,7 @@ def _single_part(blocks: list[Block]) -> list[Block]:
         elif not (has_parts and inside == "ASSEMBLY" and keyword in ("NODE", "ELEMENT")):
             kept.append(block)
     if instances > 1 or len(with_nodes) > 1:
-        raise MeshError(
-            f"{len(with_nodes)} parts, {instances} instances are not supported: save one flat part"
-        )
+        raise MeshError(f"{len(with_nodes)} parts, {instances} instances are not supported: save one flat part")
     return kept
 
 
@@ -201,9 +190,7 @@ def _cell_type(name: str, lines: int) -> tuple[str, int]:
     raise MeshError(f"unknown element type {name!r} ({lines} lines)")
 
 
-def _set_lines(
-    lines: list[str], options: dict[str, str], sets: dict[str, list[Ints]], where: str
-) -> Iterator[Ints]:
+def _set_lines(lines: list[str], options: dict[str, str], sets: dict[str, list[Ints]], where: str) -> Iterator[Ints]:
     """Id arrays of the lines of a set: numbers, ranges (GENERATE) or names of earlier sets."""
     if "GENERATE" in options:
         for line in lines:
@@ -229,9 +216,7 @@ def _table(lines: list[str], where: str) -> np.ndarray:
 
 
 def _integers(lines: list[str], where: str) -> Ints:
-    return np.array(
-        [_integer(w, where) for line in lines for w in line.split(",") if w.strip()], dtype=np.int64
-    )
+    return np.array([_integer(w, where) for line in lines for w in line.split(",") if w.strip()], dtype=np.int64)
 
 
 def _integer(word: str, where: str) -> int:
@@ -250,16 +235,12 @@ class _Ids:
         self.sorted = ids[self.order]
         twice = np.flatnonzero(self.sorted[1:] == self.sorted[:-1])
         if twice.size:
-            raise MeshError(
-                f"{what} id {self.sorted[twice[0]]} is defined twice (several parts in one file?)"
-            )
+            raise MeshError(f"{what} id {self.sorted[twice[0]]} is defined twice (several parts in one file?)")
 
     def index(self, wanted: Ints, where: str, owners: Ints | None = None) -> Ints:
         """Positions of ids, of any shape; ``owners``: ids to name in the message, one per row."""
         at = np.minimum(np.searchsorted(self.sorted, wanted), max(len(self.sorted) - 1, 0))
-        missing = (
-            np.argwhere(self.sorted[at] != wanted) if len(self.sorted) else np.argwhere(wanted == wanted)
-        )
+        missing = np.argwhere(self.sorted[at] != wanted) if len(self.sorted) else np.argwhere(wanted == wanted)
         if missing.size:
             row = tuple(missing[0])
             place = where.format(owner=owners[row[0]]) if owners is not None else where

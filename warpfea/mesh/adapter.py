@@ -33,9 +33,7 @@ from .mesh import Mesh, transformation
 __all__ = ["read"]
 
 
-def read(
-    path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None, cell_type: str | None = None
-) -> Mesh:
+def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None, cell_type: str | None = None) -> Mesh:
     """Read and check a tetrahedral mesh.
 
     Parameters
@@ -100,13 +98,9 @@ def _quiet(label: str) -> Iterator[io.StringIO]:
         raise
     except (Exception, SystemExit) as error:
         reason = " ".join(said.getvalue().split()) or (
-            f"{type(error).__name__}: {error}"
-            if str(error) and not isinstance(error, SystemExit)
-            else "bad content"
+            f"{type(error).__name__}: {error}" if str(error) and not isinstance(error, SystemExit) else "bad content"
         )
-        raise MeshError(
-            f"{label}: can't be read, the file is damaged or of another format ({reason})"
-        ) from error
+        raise MeshError(f"{label}: can't be read, the file is damaged or of another format ({reason})") from error
 
 
 # Gmsh
@@ -145,24 +139,18 @@ def _read_gmsh(file: Path) -> RawMesh:
             number = re.search(r"index (\d+) is out of bounds for axis 0 with size", str(error))
             if number is None:
                 raise
-            raise MeshError(
-                f"an element refers to node {int(number[1]) + 1}, which $Nodes does not define"
-            ) from None
+            raise MeshError(f"an element refers to node {int(number[1]) + 1}, which $Nodes does not define") from None
         except KeyError as error:
             raise MeshError(f"unknown Gmsh element type {error}") from None
     physical = mesh.cell_data.get("gmsh:physical")
     entity = mesh.cell_data.get("gmsh:geometrical")
     tags_of = _entity_groups(entities, is_ascii, size) if new and entities else {}
-    raw = RawMesh(
-        mesh.points, [(c.type, np.asarray(c.data, dtype=np.int64)) for c in mesh.cells], duplicates=not new
-    )
+    raw = RawMesh(mesh.points, [(c.type, np.asarray(c.data, dtype=np.int64)) for c in mesh.cells], duplicates=not new)
     for k, (kind, cells) in enumerate(raw.blocks):
         dim, every = cell_dimension(kind), np.arange(len(cells))
         if new:
             of_group = (
-                {}
-                if entity is None or not len(cells)
-                else dict.fromkeys(tags_of.get((dim, entity[k][0]), ()), every)
+                {} if entity is None or not len(cells) else dict.fromkeys(tags_of.get((dim, entity[k][0]), ()), every)
             )
         else:
             tags = np.zeros(0) if physical is None else np.abs(physical[k])

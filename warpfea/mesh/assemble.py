@@ -49,17 +49,13 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     held = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "no cells"
     for kind, n in counts.items():
         if kind not in CELL_TYPES and cell_dimension(kind) == 3:
-            raise MeshError(
-                f"{label}: unknown cell type {kind!r} ({n} cells); known are {', '.join(CELL_TYPES)}"
-            )
+            raise MeshError(f"{label}: unknown cell type {kind!r} ({n} cells); known are {', '.join(CELL_TYPES)}")
     solid = [kind for kind in counts if kind in CELL_TYPES]
     if len(solid) > 1:
         raise MeshError(f"{label}: holds {held}; all tetrahedra must be of one type")
     if not solid:
         flat = any(cell_dimension(kind) == 2 for kind in counts)
-        raise MeshError(
-            f"{label}: no tetrahedra, the file holds {held}" + (": is this a 2D mesh?" if flat else "")
-        )
+        raise MeshError(f"{label}: no tetrahedra, the file holds {held}" + (": is this a 2D mesh?" if flat else ""))
     if cell_type is not None and solid[0] != cell_type:
         raise MeshError(f"{label}: holds {held}, but cell_type={cell_type!r} was asked for")
 
@@ -68,9 +64,7 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     offsets = dict(zip(where, np.cumsum([0] + [len(raw.blocks[k][1]) for k in where])))
     number = np.arange(len(cells))
     if raw.duplicates and cells.min() >= 0:  # equal cells: keep the first of each, and all their memberships
-        _, first, inverse = np.unique(
-            row_keys(cells, int(cells.max()) + 1), return_index=True, return_inverse=True
-        )
+        _, first, inverse = np.unique(row_keys(cells, int(cells.max()) + 1), return_index=True, return_inverse=True)
         rank = np.empty(len(first), dtype=np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
         number, cells = rank[inverse], cells[np.sort(first)]
@@ -125,8 +119,7 @@ class _FaceFinder:
         row = mesh.kind
         if not kind.startswith("triangle"):
             raise MeshError(
-                f"{label}: surface {name!r} holds {len(nodes)} cells of type {kind!r}, not faces of "
-                "tetrahedra"
+                f"{label}: surface {name!r} holds {len(nodes)} cells of type {kind!r}, not faces of tetrahedra"
             )
         corners = nodes[:, : row.face_corners]
         check_range(corners, len(mesh.points), f"{label}: surface {name!r}, node")

@@ -121,9 +121,7 @@ def _check_mid_nodes(mesh: Mesh, curved: Ints) -> None:
     middle = 0.5 * (x[:, kind.edges[:, 0]] + x[:, kind.edges[:, 1]])
     distance2 = ((x[:, kind.corners :, None, :] - middle[:, None, :, :]) ** 2).sum(axis=3)
     nearest = distance2.argmin(axis=2)
-    wrong = np.take_along_axis(distance2, nearest[:, :, None], axis=2)[:, :, 0] < np.einsum(
-        "mkk->mk", distance2
-    )
+    wrong = np.take_along_axis(distance2, nearest[:, :, None], axis=2)[:, :, 0] < np.einsum("mkk->mk", distance2)
     if not wrong.any():
         return
     i, k = np.argwhere(wrong)[0]
@@ -166,9 +164,7 @@ def _check_volumes(mesh: Mesh, curved: Ints) -> None:
             "the file numbers its tetrahedra left-handed (swap two corners and their mid-edge nodes), or "
             "is mirrored"
         )
-    shape = (
-        "inverted" if volumes[e] < 0.0 else "inverted at a corner, mid-edge or quadrature point (too curved)"
-    )
+    shape = "inverted" if volumes[e] < 0.0 else "inverted at a corner, mid-edge or quadrature point (too curved)"
     raise MeshError(
         f"{mesh.label}: element {e} is {shape}: smallest det J0 = {lowest[e]:.6g} m^3, volume "
         f"{volumes[e]:.6g} m^3 "

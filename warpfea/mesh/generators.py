@@ -196,9 +196,7 @@ def _disk(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     angle = 0.25 * np.pi * np.where(first, y, x) / safe
     along, across = safe * np.cos(angle), safe * np.sin(angle)
     zero = big == 0.0
-    return np.where(zero, 0.0, np.where(first, along, across)), np.where(
-        zero, 0.0, np.where(first, across, along)
-    )
+    return np.where(zero, 0.0, np.where(first, along, across)), np.where(zero, 0.0, np.where(first, across, along))
 
 
 def _ball(p: Floats) -> Floats:

@@ -57,9 +57,7 @@ class Mesh:
     def __post_init__(self) -> None:
         put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
         if self.cell_type not in CELL_TYPES:
-            raise MeshError(
-                f"{self.label}: unknown cell type {self.cell_type!r}, known are {sorted(CELL_TYPES)}"
-            )
+            raise MeshError(f"{self.label}: unknown cell type {self.cell_type!r}, known are {sorted(CELL_TYPES)}")
         put("points", _frozen(self.points, np.float64))
         put("cells", _frozen(self.cells, np.int64))
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -280,9 +278,7 @@ class Mesh:
             )
         if numbers.dtype == bool:
             if len(numbers) != limit:
-                raise MeshError(
-                    f"{self.label}: the mask for {what} has {len(numbers)} entries, expected {limit}"
-                )
+                raise MeshError(f"{self.label}: the mask for {what} has {len(numbers)} entries, expected {limit}")
             return np.flatnonzero(numbers)
         check_range(numbers, limit, f"{self.label}: {what}")
         return numbers.astype(np.int64)
@@ -332,9 +328,7 @@ def transformation(scale: float, transform: Any, label: str) -> tuple[Floats, Fl
     det = float(np.linalg.det(a))
     if det <= 1e-12 * np.abs(a).max() ** 3:
         kind = "is a reflection" if det < 0.0 else "is singular"
-        raise MeshError(
-            f"{label}: transform {kind} (determinant {det:.6g}); it would invert or flatten every element"
-        )
+        raise MeshError(f"{label}: transform {kind} (determinant {det:.6g}); it would invert or flatten every element")
     return factor * a, t
 
 

@@ -29,7 +29,7 @@ class NewtonPCG:
     """Newton's method with a line search; linear systems by preconditioned conjugate gradients.
 
     Args:
-        tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D the diagonal of H) and
+        tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
             for each connected part of the model apart. f_int counts at supports too, so that a held, stressed body
             without loads has a scale. None: 1e-8 in float64, 1e-4 in float32.
         max_newton: iterations before a step is refused.
