@@ -65,7 +65,6 @@ def test_nothing_else_of_the_checkout_is_importable():
             __import__(f"warpfea.{name}")
 
 
-@pytest.mark.slow
 def test_wheel_runs_a_scene_from_another_folder(tmp_path):
     wheels = tmp_path / "wheels"
     build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", str(wheels), str(ROOT)]
@@ -76,7 +75,7 @@ def test_wheel_runs_a_scene_from_another_folder(tmp_path):
     inside = tmp_path / "venv" / "bin" / "python"
     install = [sys.executable, "-m", "pip", "--python", str(inside), "install", "-q", "--no-deps", str(wheel)]
     subprocess.run(install, check=True, capture_output=True)
-    (site,) = (tmp_path / "venv").glob("lib*/python3*/site-packages")
+    (site,) = (tmp_path / "venv").glob("lib/python3*/site-packages")
     assert {p.name for p in site.iterdir() if not p.name.endswith(".dist-info")} == {"warpfea"}
     (site / "borrowed.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
     elsewhere = tmp_path / "elsewhere"
