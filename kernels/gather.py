@@ -18,6 +18,10 @@ part of Phi and its magnitude; g.p with non-potential forces held; what Phi chan
 squared norm of the rounding of the positions."""
 
 
+REACTION = wp.constant(wp.float64(1.0e-6))
+"""Share of the squared reactions in the squared scale of the residual."""
+
+
 @functools.cache
 def topology_struct(dtype: str):
     """Who contributes to a slot, the scalar mass matrix in CSR, and which components are free."""
@@ -122,7 +126,9 @@ def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _t
         kinetic = T(0.5) * wp.dot(vs - v_tilde[world, slot], a)
         work = wp.dot(held, vs)
         rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
-        rows[1, world, slot] = weighted(f, D)  # reactions count: a held, stressed body has its scale from them
+        # a held, stressed body without loads has no other force than its reactions: a small part of them is its scale
+        reaction = f - wp.cw_mul(f, free)
+        rows[1, world, slot] = weighted(wp.cw_mul(f, free), D) + REACTION * weighted(reaction, D)
         rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
         rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
         rows[4, world, slot] = f64(kinetic - work)

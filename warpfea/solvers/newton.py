@@ -30,8 +30,8 @@ class NewtonPCG:
 
     Args:
         tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
-            for each connected part of the model apart. f_int counts at supports too, so that a held, stressed body
-            without loads has a scale. None: 1e-8 in float64, 1e-4 in float32.
+            for each connected part of the model apart. A thousandth of the reactions counts with f_int, so that a held,
+            stressed body without loads has a scale. None: 1e-8 in float64, 1e-4 in float32.
         max_newton: iterations before a step is refused.
         max_pcg: iterations per linear solve.
         max_halvings: how often a refused step may be halved.
