@@ -223,11 +223,8 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
                 good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
             else:
                 good = ctl.slot_sums[6, world] <= f64(WOLFE) * wp.abs(ctl.slope[world])
-            if ctl.nonpotential != 0:
-                # Phi with held forces can't see the skew part of their tangent: close to the solution it would cycle
-                smaller = norm <= (f64(1.0) - f64(0.1) * alpha) * old_norm
-                close = wp.abs(change) <= noise
-                good = smaller or (good and not close)
+            if ctl.nonpotential != 0 and norm <= f64(0.5) * old_norm:
+                good = True
         if ctl.domain_J[world] <= f64(0.0):
             good = False
         if good:
