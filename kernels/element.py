@@ -36,6 +36,7 @@ def block_struct(dtype: str):
         det_J0: wp.array(dtype=T)  # [elem], affine only
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]
+        frame: wp.array2d(dtype=mat33)  # [point, elem] axes of the law, framed blocks only
         contribution_offset: wp.int32
         element_offset: wp.int32
         history_offset: wp.int32
@@ -46,7 +47,7 @@ def block_struct(dtype: str):
 
 @functools.cache
 def element_kernels(
-    dtype: str, law: str, slots: int, points: int, affine: bool, damping: str | None
+    dtype: str, law: str, slots: int, points: int, affine: bool, damping: str | None, framed: bool = False
 ) -> _types.SimpleNamespace:
     """Kernels of one kind of element block.
 
@@ -56,6 +57,7 @@ def element_kernels(
         slots, points: slots and quadrature points per element.
         affine: parent gradients and one J0 per element, or a table of h.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
+        framed: the law has axes of its own at each point.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
@@ -67,9 +69,10 @@ def element_kernels(
     coef = wp.types.vector(length=NCOEF, dtype=T)
     Local = wp.types.matrix(shape=(slots, 3), dtype=T)
     NS, NQ = slots, points
-    needs_J = law != "svk"
+    needs_J = law not in materials.ANY_J
+    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
     vertices = 4
-    name = f"element_{dtype}_{law}_{slots}_{points}_{'affine' if affine else 'table'}_{damping}"
+    name = f"element_{dtype}_{law}_{slots}_{points}_{'affine' if affine else 'table'}_{damping}{'_framed' if framed else ''}"
     module = kernel_module(name)
     # what only some scenes or only outputs launch is compiled apart
     history_module = kernel_module(f"{name}_history")
@@ -88,8 +91,8 @@ def element_kernels(
     @wp.func
     def damping_coefficients(c: coef, scale: T) -> coef:
         d = coef()
-        d[0] = c[4] * scale
-        d[1] = c[3] * scale
+        d[0] = c[LAMBDA_V] * scale
+        d[1] = c[ETA] * scale
         return d
 
     @wp.func
@@ -142,6 +145,24 @@ def element_kernels(
     @wp.func
     def unpack(a: sym6) -> mat33:
         return mat33(a[0], a[5], a[4], a[5], a[1], a[3], a[4], a[3], a[2])
+
+    @wp.func
+    def into_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
+        """Components in the axes of the law."""
+        if wp.static(framed):
+            R = block.frame[point, elem]
+            return wp.transpose(R) * A * R
+        else:
+            return A
+
+    @wp.func
+    def out_of_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
+        """Components in the body's axes."""
+        if wp.static(framed):
+            R = block.frame[point, elem]
+            return R * A * wp.transpose(R)
+        else:
+            return A
 
     @wp.func
     def history_index(block: Block, point: int, elem: int) -> int:
@@ -208,11 +229,12 @@ def element_kernels(
             G = gradient_of(block, U, q, elem)
             w = weight_of(block, q, elem)
             J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
-            P = m.stress(G, c)
-            psi += w * m.energy(G, c)
+            local = into_axes(block, G, q, elem)
+            P = out_of_axes(block, m.stress(local, c), q, elem)
+            psi += w * m.energy(local, c)
             if wp.static(damping == "incremental" or damping == "rate"):
                 rate = strain_rate(block, G, V, history, dq, world, q, elem)
-                S = t.isotropic(rate, c[4], c[3])
+                S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
                 P = P + S + G * S
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
             f = scatter(block, f, P, q, elem)
@@ -253,11 +275,12 @@ def element_kernels(
         for q in range(NQ):
             G = gradient_of(block, U, q, elem)
             dG = gradient_of(block, dU, q, elem)
-            dP = m.increment(G, dG, c)
+            dP = m.increment(into_axes(block, G, q, elem), into_axes(block, dG, q, elem), c)
+            dP = out_of_axes(block, dP, q, elem)
             if wp.static(damping == "incremental" or damping == "rate"):
                 F = t.identity() + G
-                S = t.isotropic(strain_rate(block, G, V, history, dq, world, q, elem), c[4], c[3])
-                dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[4] / dq, c[3] / dq)
+                S = t.isotropic(strain_rate(block, G, V, history, dq, world, q, elem), c[LAMBDA_V], c[ETA])
+                dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[LAMBDA_V] / dq, c[ETA] / dq)
                 dP = dP + dG * S + F * dS
             f = scatter(block, f, dP, q, elem)
         for i in range(NS):
@@ -290,7 +313,12 @@ def element_kernels(
                     a = wp.transpose(block.J0_inv[elem]) * block.gradient[q, i, 0]
                 else:
                     a = block.gradient[q, i, elem]
-                K = m.block(G, a, c)
+                K = mat33()
+                if wp.static(framed):
+                    R = block.frame[q, elem]
+                    K = out_of_axes(block, m.block(into_axes(block, G, q, elem), wp.transpose(R) * a, c), q, elem)
+                else:
+                    K = m.block(G, a, c)
                 if wp.static(damping == "incremental" or damping == "rate"):
                     K = K + viscous.block(mat33() + G, a, cv)
                 entry = block.contribution_offset + i * block.count + elem
@@ -339,7 +367,7 @@ def element_kernels(
             G = gradient_of(block, U, q, elem)
             F = t.identity() + G
             rate = t.sym(wp.transpose(F) * gradient_of(block, V, q, elem))
-            S = t.isotropic(rate, c[4], c[3])
+            S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
             rate_of_work += weight_of(block, q, elem) * wp.ddot(S, rate)
             f = scatter(block, f, F * S, q, elem)
         for i in range(NS):
@@ -360,7 +388,7 @@ def element_kernels(
         for q in range(NQ):
             G = gradient_of(block, U, q, elem)
             J = T(1.0) + t.volume_change(G)
-            P = m.stress(G, c)
+            P = out_of_axes(block, m.stress(into_axes(block, G, q, elem), c), q, elem)
             stress[world, q, elem] = pack((T(1.0) / J) * (P + P * wp.transpose(G)))
             jacobian[world, q, elem] = J
 

@@ -1,4 +1,4 @@
-"""Loads on the device: time laws, dead loads Eq. (72), body forces Eq. (23), follower pressure, driven nodes."""
+"""Loads on the device: time laws, dead loads Eq. (72), body forces Eq. (23), driven nodes."""
 
 import functools
 import types as _types
@@ -8,7 +8,7 @@ import warp as wp
 from .element import block_struct
 from .types import kernel_module, precision
 
-__all__ = ["body_force_kernel", "facet_struct", "law_function_kernel", "law_struct", "load_kernels"]
+__all__ = ["body_force_kernel", "law_function_kernel", "law_struct", "load_kernels"]
 
 
 @functools.cache
@@ -25,35 +25,18 @@ def law_struct():
 
 
 @functools.cache
-def facet_struct(dtype: str):
-    """Shape functions of a facet and their parent derivatives at its points, [point, node]."""
-    T = precision(dtype).T
-
-    @wp.struct
-    class FacetTables:
-        shape: wp.array2d(dtype=T)
-        d_xi: wp.array2d(dtype=T)
-        d_eta: wp.array2d(dtype=T)
-        weight: wp.array(dtype=T)
-
-    return FacetTables
-
-
-@functools.cache
 def load_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels of the loads in one precision."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Laws = law_struct()
-    Facet = facet_struct(dtype)
     # a module per kind of load: a scene compiles what it uses
     laws_module = kernel_module(f"laws_{dtype}")
     dead_module = kernel_module(f"dead_load_{dtype}")
     explicit_module = kernel_module(f"explicit_{dtype}")
     drive_module = kernel_module(f"drive_{dtype}")
     turn_module = kernel_module(f"drive_rotation_{dtype}")
-    pressure_module = kernel_module(f"pressure_{dtype}")
 
     @wp.kernel(module=laws_module)
     def evaluate_laws(
@@ -183,87 +166,6 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
                 velocity[c] = T((target[c] - f64(q_tilde[world, s][c])) / dq_dv[world])
         v[world, s] = velocity
 
-    @wp.kernel(module=pressure_module)
-    def follower_pressure(
-        conn: wp.array2d(dtype=wp.int32),
-        law: wp.array(dtype=wp.int32),
-        tables: Facet,
-        reference: wp.array(dtype=vec3),
-        u: wp.array2d(dtype=vec3),
-        value: wp.array2d(dtype=wp.vec3d),
-        offset: int,
-        active: wp.array(dtype=wp.int32),
-        contribution: wp.array2d(dtype=vec3),
-    ):
-        """f_i = - int p s_i (x_xi x x_eta): pressure p against the current outward normal of a facet."""
-        world, facet = wp.tid()
-        if active[world] == 0:
-            return
-        nodes = conn.shape[0]
-        count = conn.shape[1]
-        pressure = T(value[world, law[facet]][0])
-        for i in range(nodes):
-            contribution[world, offset + i * count + facet] = vec3()
-        first = conn[0, facet]
-        for q in range(tables.shape.shape[0]):
-            a = vec3()
-            b = vec3()
-            for i in range(nodes):
-                s = conn[i, facet]
-                x = (reference[s] - reference[first]) + (u[world, s] - u[world, first])
-                a += tables.d_xi[q, i] * x
-                b += tables.d_eta[q, i] * x
-            f = (-pressure * tables.weight[q]) * wp.cross(a, b)
-            for i in range(nodes):
-                k = offset + i * count + facet
-                contribution[world, k] = contribution[world, k] + tables.shape[q, i] * f
-
-    @wp.kernel(module=pressure_module)
-    def pressure_product(
-        conn: wp.array2d(dtype=wp.int32),
-        law: wp.array(dtype=wp.int32),
-        tables: Facet,
-        reference: wp.array(dtype=vec3),
-        u: wp.array2d(dtype=vec3),
-        value: wp.array2d(dtype=wp.vec3d),
-        offset: int,
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
-    ):
-        """(K + K^T)/2 p with K = df/dq of the pressure force: its symmetric part, all of it on a closed surface."""
-        world, facet = wp.tid()
-        if active[world] == 0:
-            return
-        nodes = conn.shape[0]
-        count = conn.shape[1]
-        pressure = T(value[world, law[facet]][0])
-        for i in range(nodes):
-            contribution[world, offset + i * count + facet] = vec3()
-        first = conn[0, facet]
-        for q in range(tables.shape.shape[0]):
-            a = vec3()
-            b = vec3()
-            da = vec3()
-            db = vec3()
-            p = vec3()
-            for i in range(nodes):
-                s = conn[i, facet]
-                x = (reference[s] - reference[first]) + (u[world, s] - u[world, first])
-                a += tables.d_xi[q, i] * x
-                b += tables.d_eta[q, i] * x
-                da += tables.d_xi[q, i] * direction[world, s]
-                db += tables.d_eta[q, i] * direction[world, s]
-                p += tables.shape[q, i] * direction[world, s]
-            w = T(-0.5) * pressure * tables.weight[q]
-            force = wp.cross(da, b) + wp.cross(a, db)
-            left = wp.cross(b, p)
-            right = wp.cross(p, a)
-            for i in range(nodes):
-                k = offset + i * count + facet
-                f = tables.shape[q, i] * force + tables.d_xi[q, i] * left + tables.d_eta[q, i] * right
-                contribution[world, k] = contribution[world, k] + w * f
-
     return _types.SimpleNamespace(
         evaluate_laws=evaluate_laws,
         dead_load=dead_load,
@@ -271,8 +173,6 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         add_explicit=add_explicit,
         drive_displacement=drive_displacement,
         drive_rotation=drive_rotation,
-        follower_pressure=follower_pressure,
-        pressure_product=pressure_product,
     )
 
 

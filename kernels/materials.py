@@ -21,8 +21,10 @@ from .types import precision
 
 __all__ = ["LAWS", "law"]
 
-NCOEF = 5
-"""Coefficients per material: up to three of the law, then eta and lambda_v of Kelvin-Voigt damping."""
+NCOEF = 11
+"""Coefficients per material: up to nine of the law, then eta and lambda_v of Kelvin-Voigt damping."""
+ETA = NCOEF - 2
+LAMBDA_V = NCOEF - 1
 
 
 @functools.cache
@@ -223,8 +225,69 @@ def neo_hookean(dtype: str) -> _types.SimpleNamespace:
     return mooney_rivlin(dtype, second_invariant=False)
 
 
-LAWS = {"svk": svk, "mooney_rivlin": mooney_rivlin, "neo_hookean": neo_hookean}
+@functools.cache
+def orthotropic(dtype: str) -> _types.SimpleNamespace:
+    """Psi = E : D : E / 2 with D orthotropic in the axes of G; parts of the SVK law that an element integrates apart.
+
+    c = (D11, D22, D33, D23, D13, D12, G23, G13, G12): S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
+    """
+    p, t = precision(dtype), tensors(dtype)
+    T, mat33, vec3 = p.T, p.mat33, p.vec3
+    coef = wp.types.vector(length=NCOEF, dtype=T)
+
+    @wp.func
+    def stiffness(E: mat33, c: coef) -> mat33:
+        s1 = c[0] * E[0, 0] + c[5] * E[1, 1] + c[4] * E[2, 2]
+        s2 = c[5] * E[0, 0] + c[1] * E[1, 1] + c[3] * E[2, 2]
+        s3 = c[4] * E[0, 0] + c[3] * E[1, 1] + c[2] * E[2, 2]
+        t23 = T(2.0) * c[6] * E[1, 2]
+        t13 = T(2.0) * c[7] * E[0, 2]
+        t12 = T(2.0) * c[8] * E[0, 1]
+        return mat33(s1, t12, t13, t12, s2, t23, t13, t23, s3)
+
+    @wp.func
+    def energy(G: mat33, c: coef) -> T:
+        E = t.green(G)
+        return T(0.5) * wp.ddot(E, stiffness(E, c))
+
+    @wp.func
+    def stress(G: mat33, c: coef) -> mat33:
+        S = stiffness(t.green(G), c)
+        return S + G * S
+
+    @wp.func
+    def increment(G: mat33, dG: mat33, c: coef) -> mat33:
+        F = t.identity() + G
+        return dG * stiffness(t.green(G), c) + F * stiffness(t.sym(wp.transpose(F) * dG), c)
+
+    @wp.func
+    def block(G: mat33, a: vec3, c: coef) -> mat33:
+        # without the couplings D_ij, which may be indefinite alone, and without geometric stiffness
+        F = t.identity() + G
+        x = a[0] * a[0]
+        y = a[1] * a[1]
+        z = a[2] * a[2]
+        M = mat33()
+        M[0, 0] = c[0] * x + c[8] * y + c[7] * z
+        M[1, 1] = c[1] * y + c[8] * x + c[6] * z
+        M[2, 2] = c[2] * z + c[7] * x + c[6] * y
+        M[0, 1] = c[8] * a[0] * a[1]
+        M[0, 2] = c[7] * a[0] * a[2]
+        M[1, 2] = c[6] * a[1] * a[2]
+        M[1, 0] = M[0, 1]
+        M[2, 0] = M[0, 2]
+        M[2, 1] = M[1, 2]
+        return F * M * wp.transpose(F)
+
+    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block)
+
+
+LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, "neo_hookean": neo_hookean}
 """Device laws by name. A new law is one entry here and one class in warpfea/materials.py."""
+
+
+ANY_J = ("svk", "orthotropic", "assumed_shear")
+"""Laws that are defined for any F; the others need J > 0."""
 
 
 def law(name: str, dtype: str) -> _types.SimpleNamespace:

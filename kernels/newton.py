@@ -66,6 +66,7 @@ def control_struct():
         slot_sums: wp.array2d(dtype=wp.float64)  # gather.RESIDUAL_ROWS
         elem_sums: wp.array2d(dtype=wp.float64)  # strain energy, viscous potential
         slope_sum: wp.array2d(dtype=wp.float64)
+        push_sum: wp.array2d(dtype=wp.float64)  # (dq/dv) p.K p of the follower loads, 0 without
         dq_dv: wp.array(dtype=wp.float64)
         tol: wp.float64
         eps: wp.float64
@@ -213,7 +214,9 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         alpha = ctl.alpha[world]
         old_norm = ctl.norm[world]
-        phi = objective(ctl, world)
+        # follower loads are held in the search with their symmetric tangent: Phi is then as curved as H says
+        bend = ctl.push_sum[0, world]
+        phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
         norm = wp.sqrt(ctl.slot_sums[0, world])
         change = phi - ctl.phi[world]
         noise = f64(NOISE) * ctl.eps * (ctl.phi_magnitude[world] + magnitude(ctl, world))
@@ -222,7 +225,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             if wp.abs(change) > noise:
                 good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
             else:
-                good = ctl.slot_sums[6, world] <= f64(WOLFE) * wp.abs(ctl.slope[world])
+                good = ctl.slot_sums[6, world] - alpha * bend <= f64(WOLFE) * wp.abs(ctl.slope[world])
             if ctl.nonpotential != 0 and norm <= f64(0.5) * old_norm:
                 good = True
         if ctl.domain_J[world] <= f64(0.0):
@@ -230,7 +233,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         if good:
             ctl.searching[world] = 0
             measure(ctl, world)
-            ctl.phi[world] = phi + ctl.slot_sums[7, world]
+            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
             ctl.phi_magnitude[world] = magnitude(ctl, world)
             ctl.iterations[world] = ctl.iterations[world] + 1
             ctl.total_iterations[world] = ctl.total_iterations[world] + 1

@@ -149,15 +149,11 @@ def test_bad_input(case, tmp_path, monkeypatch):
 
 
 LATER = {
-    "add_beam": lambda b, s: b.add_beam([(0, 0, 0), (1, 0, 0)]),
-    "add_shell": lambda b, s: b.add_shell(None),
     "add_joint": lambda b, s: b.add_joint("revolute"),
     "add_constraint": lambda b, s: b.add_constraint("DP1"),
     "weld": lambda b, s: b.weld(None, None),
     "add_collider": lambda b, s: b.add_collider(None),
     "add_contact": lambda b, s: b.add_contact(s, None),
-    "add_moment": lambda b, s: b.add_moment(s.at((1, 0, 0)), (0, 0, 1)),
-    "ENMC": lambda b, s: b.add_solid(MESH, material=LAW, element="ENMC"),
     "energy_momentum": lambda b, s: wf.Simulation(b.finalize(device="cpu"), dt=1.0, integrator="energy_momentum"),
     "set_parameter": lambda b, s: b.finalize(device="cpu").set_parameter("bar.E", 1.0),
 }

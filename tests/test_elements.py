@@ -400,7 +400,7 @@ def hermite_basis(xi):
     return np.stack(values, axis=1), np.stack(slopes, axis=1)
 
 
-def hermite_shape(xi, nodes):
+def hermite_shape(xi, nodes, frames):
     """Functions of the nodal values and gradients d/dX in the global frame, one row per element."""
     corners = elements.get("T4").node_points
     at_nodes, slopes_at_nodes = hermite_basis(corners)
@@ -418,6 +418,9 @@ def hermite_shape(xi, nodes):
     return s, ds
 
 
+SHARED_WITH_T4 = ("parent", "faces", "face_rule", "divisions", "node_samples", "lattice")
+
+
 @pytest.fixture(scope="module")
 def hermite():
     family = elements.register(
@@ -432,7 +435,7 @@ def hermite():
             curved_mass_rule=quadrature.conical_tet(4),
             vertices=elements.get("T4").vertices,
             affine=False,
-            node_points=elements.get("T4").node_points,
+            **{key: getattr(elements.get("T4"), key) for key in SHARED_WITH_T4},
         )
     )
     yield family.name

@@ -102,7 +102,7 @@ def repeated(p):
 
 def hexahedron(p):
     p.blocks.append(("hexahedron", np.array([[0, 2, 8, 6, 18, 20, 26, 24]]), None))
-    return r"unknown cell type 'hexahedron' \(1 cells\)"
+    return r"holds 6 tetra10, .*1 hexahedron; all solid cells must be of one type"
 
 
 def wedge(p):
@@ -301,7 +301,8 @@ def test_bad_file(make, pattern, tmp_path):
         ({"transform": np.full((4, 4), np.nan)}, r"transform must be"),
         ({"transform": (np.eye(3), np.zeros(2))}, r"transform must be"),
         ({"cell_type": "tetra"}, r"holds 6 tetra10, .*cell_type='tetra' was asked for"),
-        ({"cell_type": "hexahedron"}, r"unknown cell_type 'hexahedron'"),
+        ({"cell_type": "hexahedron"}, r"holds 6 tetra10, .*cell_type='hexahedron' was asked for"),
+        ({"cell_type": "wedge"}, r"unknown cell_type 'wedge'"),
     ],
 )
 def test_bad_option(options, pattern, tmp_path):

@@ -34,9 +34,11 @@ def _map_checkout() -> None:
 _map_checkout()
 
 from . import mesh  # noqa: E402
+from .beams import Rectangle, spline  # noqa: E402
 from .bodies import Body, ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noqa: E402
-from .builder import ModelBuilder, Rotation  # noqa: E402
+from .builder import ModelBuilder  # noqa: E402
 from .checkpoint import Checkpoint  # noqa: E402
+from .description import Rotation  # noqa: E402
 from .errors import (  # noqa: E402
     CapacityError,
     CheckpointError,
@@ -85,6 +87,7 @@ __all__ = [
     "OutputError",
     "PNGWriter",
     "PenetrationError",
+    "Rectangle",
     "Rotation",
     "Simulation",
     "State",
@@ -95,12 +98,12 @@ __all__ = [
     "mesh",
     "scene",
     "solve_static",
+    "spline",
 ]
 
 
 _LATER = {
     "GROUND": "joints",
-    "Rectangle": "beam sections",
     "HalfSpace": "contact",
     "Sphere": "contact",
     "Box": "contact",

@@ -9,14 +9,37 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from . import elements as families
 from .bodies import Body, SurfaceSet
-from .elements.quadrature import Rule, triangle_6
+from .elements import Part, Rule
+from .elements.family import Tying
 from .errors import MeshError, ModelError
+from .surfaces import element_functions
 
-__all__ = ["BlockKey", "HostBlock", "body_mass", "facet_tables", "gather_table", "host_blocks", "rigid_modes"]
+__all__ = [
+    "BlockKey",
+    "FacetTables",
+    "HostBlock",
+    "body_mass",
+    "facet_tables",
+    "gather_table",
+    "host_blocks",
+    "rigid_modes",
+    "surface_weights",
+]
 
 CHUNK = 20000
-"""Elements handled at once where a table per element would be large."""
+"""Most elements handled at once where a table per element would be large."""
+TABLE = 20_000_000
+"""Most entries (elements x points x slots) of a table that is made at once."""
+
+
+def chunks(body: Body, elements: np.ndarray, points: int) -> Iterator[np.ndarray]:
+    """Elements in runs whose tables stay small."""
+    per_element = points * body.family.slots if body.family.has_gradients else 1
+    size = max(1, min(CHUNK, TABLE // per_element))
+    for first in range(0, len(elements), size):
+        yield elements[first : first + size]
 
 
 @dataclass(frozen=True)
@@ -24,10 +47,27 @@ class BlockKey:
     """What elements must share to be done by one kernel."""
 
     family: str
-    rule: str
+    scheme: str
+    part: int
     law: str
     damping: str | None
     affine: bool
+    framed: bool
+
+    @property
+    def integral(self) -> Part:
+        """The part of the energy."""
+        return families.get(self.family).scheme(self.scheme)[self.part]
+
+    @property
+    def rule(self) -> Rule:
+        """Quadrature of the part."""
+        return self.integral.rule
+
+    @property
+    def tying(self) -> Tying | None:
+        """Assumed shear, of tied parts."""
+        return self.integral.tying
 
 
 @dataclass(eq=False)
@@ -37,14 +77,15 @@ class HostBlock:
     Attributes:
         body: the body.
         elements: (E,) element indices in the body.
-        conn: (E, S) body slots.
-        material: (E,) index into the body's materials.
-        density: (E, Qm) kg/m^3 at the points of the mass rule.
+        material: index into the body's materials.
+        coefficients: of the device law.
     """
 
     key: BlockKey
     body: Body
     elements: np.ndarray
+    material: int
+    coefficients: tuple[float, ...]
 
     @property
     def conn(self) -> np.ndarray:
@@ -64,8 +105,7 @@ def geometry(
     Returns:
         s (E or 1, Q, S), ds (E or 1, Q, S, 3), J0 (E, Q, 3, 3) = sum E_i ds_i^T, det J0 (E, Q).
     """
-    nodes = body.mesh.points[body.mesh.cells[elements]] - body.origin
-    s, ds = body.family.shape(points, nodes)
+    s, ds = element_functions(body, elements, points)
     E = body.reference[body.connectivity[elements]]
     subscripts = "esk,qsl->eqkl" if len(ds) == 1 else "esk,eqsl->eqkl"
     J0 = np.einsum(subscripts, E, ds[0] if len(ds) == 1 else ds, optimize=True)
@@ -123,8 +163,7 @@ def body_mass(body: Body) -> sp.csr_matrix:
     for affine in (True, False):
         chosen = np.flatnonzero(flat == affine)
         rule = mass_rule(body, affine)
-        for first in range(0, len(chosen), CHUNK):
-            part = chosen[first : first + CHUNK]
+        for part in chunks(body, chosen, len(rule.weights)):
             conn = body.connectivity[part]
             s, _, _, det = geometry(body, part, rule.points)
             w = density_at(body, part, s, conn) * det * rule.weights
@@ -148,14 +187,71 @@ def host_blocks(body: Body, *, tables: bool) -> Iterator[HostBlock]:
         for is_flat, rule in ((True, body.rule), (False, body.curved_rule)):
             members = np.flatnonzero((body.material_of == k) & (flat == is_flat))
             if len(members):
-                key = BlockKey(body.family.name, rule, material.law, damping, is_flat and not tables)
-                yield HostBlock(key, body, members)
+                for part, integral in enumerate(body.family.scheme(rule)):
+                    law, values = integral.law(material) if integral.law else (material.law, material.coefficients())
+                    key = BlockKey(
+                        body.family.name,
+                        rule,
+                        part,
+                        law,
+                        damping if part == 0 else None,
+                        is_flat and not tables,
+                        integral.framed,
+                    )
+                    yield HostBlock(key, body, members, k, values)
+
+
+def element_volumes(body: Body) -> np.ndarray:
+    """(E,) m^3, with section and thickness."""
+    rule = body.family.rule(None)
+    every = np.arange(len(body.mesh.cells))
+    parts = [geometry(body, part, rule.points)[3] @ rule.weights for part in chunks(body, every, len(rule.weights))]
+    return np.concatenate(parts)
+
+
+@dataclass(eq=False)
+class TiedTables:
+    """Tables of elements with an assumed shear: ds_i/dxi_k and ds_i/dzeta (E, n, S), X_k and X_zeta (E, n, 3), and
+    A (E, n, n) with Psi = (mu/2) e.A e for the covariant shears e (see kernels/tied.py)."""
+
+    along: np.ndarray
+    through: np.ndarray
+    X_along: np.ndarray
+    X_through: np.ndarray
+    coupling: np.ndarray
+
+
+def tied_tables(body: Body, elements: np.ndarray, part: Part) -> TiedTables:
+    """Tables of a tied part: Psi = (mu/2) int e_a e_b (g^ab g^33 + g^a3 g^b3), e interpolated from the tying points."""
+    tying = part.tying
+    assert tying is not None
+    _, ds, J, _ = geometry(body, elements, tying.points)
+    ties = np.arange(len(tying.points))
+    along = np.moveaxis(ds[:, ties, :, tying.direction], 0, 1)
+    X_along = np.moveaxis(J[:, ties, :, tying.direction], 0, 1)
+    X_through = J[:, :, :, 2]
+    _, _, J, det = geometry(body, elements, part.rule.points)
+    g = np.linalg.inv(np.swapaxes(J, 2, 3) @ J)
+    # the metric's factor of each pair of tying points' directions
+    metric = g[:, :, :2, :2] * g[:, :, 2, 2][:, :, None, None] + g[:, :, :2, 2, None] * g[:, :, None, :2, 2]
+    D = tying.direction
+    N = tying.interpolation(part.rule.points)
+    w = det * part.rule.weights
+    coupling = np.einsum("eq,qs,qt,eqst->est", w, N, N, metric[:, :, D[:, None], D[None, :]], optimize=True)
+    return TiedTables(along, ds[:, :, :, 2], X_along, X_through, coupling)
+
+
+def orthonormal(J0: np.ndarray) -> np.ndarray:
+    """Axes along the first parent line, then by Gram-Schmidt; columns, same shape as J0 (..., 3, 3)."""
+    a = J0[..., 0] / np.linalg.norm(J0[..., 0], axis=-1, keepdims=True)
+    b = J0[..., 1] - np.sum(J0[..., 1] * a, axis=-1, keepdims=True) * a
+    b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+    return np.stack([a, b, np.cross(a, b)], axis=-1)
 
 
 def check_orientation(body: Body, rule: Rule) -> None:
     """Raise MeshError where det J0 <= 0 at a force point."""
-    for first in range(0, len(body.mesh.cells), CHUNK):
-        part = np.arange(first, min(first + CHUNK, len(body.mesh.cells)))
+    for part in chunks(body, np.arange(len(body.mesh.cells)), len(rule.weights)):
         det = geometry(body, part, rule.points)[3]
         bad = np.flatnonzero((det <= 0.0).any(axis=1))
         if len(bad):
@@ -173,30 +269,78 @@ def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.nda
     return start.astype(np.int32), order.astype(np.int32)
 
 
-def facet_tables(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Faces as triangles in their own coordinates.
+def slot_graph(conn: list[np.ndarray], slots: int) -> sp.csr_matrix:
+    """Which slots share an element (the mass alone does not tell: it vanishes between some slots)."""
+    rows = np.concatenate([np.repeat(first + np.arange(len(c)), c.shape[1]) for first, c in _offsets(conn)])
+    columns = np.concatenate([c.ravel() for c in conn])
+    incidence = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(rows.max() + 1, slots))
+    return sp.csr_matrix(incidence.T @ incidence)
 
-    Returns:
-        conn (F, n) body slots, s (Q, n), ds/dxi (Q, n), ds/deta (Q, n), weights (Q,); n = 3 or 6, outward.
+
+def _offsets(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
+    first = 0
+    for c in conn:
+        yield first, c
+        first += len(c)
+
+
+@dataclass(eq=False)
+class FacetTables:
+    """Faces of a surface with the slots that their functions need (the rest of an element's vanish there).
+
+    Attributes:
+        conn: (F, n) body slots; faces with fewer repeat their first with functions of 0.
+        shape, d_a, d_b: (F, Q, n) functions and derivatives along the two sides of the face, outward by the right hand.
+        weights: (Q,).
     """
-    body = surface.body
-    if np.any(body.family.slot_kind > 0):
-        raise NotImplementedError(f"surface loads on element {body.family.name} are not part of this version")
-    conn = body.node_slot[surface.nodes]
-    rule = triangle_6()
-    L = np.column_stack([1.0 - rule.points.sum(axis=1), rule.points])
-    dL = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
-    if conn.shape[1] == 3:
-        s, ds = L, np.broadcast_to(dL, (len(L), 3, 2))
-    else:
-        s = np.empty((len(L), 6))
-        ds = np.empty((len(L), 6, 2))
-        s[:, :3] = L * (2.0 * L - 1.0)
-        ds[:, :3] = (4.0 * L - 1.0)[:, :, None] * dL
-        for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 0)), start=3):
-            s[:, k] = 4.0 * L[:, a] * L[:, b]
-            ds[:, k] = 4.0 * (L[:, a, None] * dL[b] + L[:, b, None] * dL[a])
-    return conn, s, ds[:, :, 0].copy(), ds[:, :, 1].copy(), rule.weights
+
+    conn: np.ndarray
+    shape: np.ndarray
+    d_a: np.ndarray
+    d_b: np.ndarray
+    weights: np.ndarray
+
+
+def facet_tables(surface: SurfaceSet) -> FacetTables:
+    """Functions of the faces of a surface at the points of its family's face rule."""
+    body, faces = surface.body, surface.faces
+    rule = body.family.face_rule
+    Q, S = len(rule.weights), body.family.slots
+    values = np.zeros((3, len(faces), Q, S))
+    used = np.zeros((len(faces), S), dtype=bool)
+    for face in np.unique(faces[:, 1]):
+        rows = np.flatnonzero(faces[:, 1] == face)
+        xi, dxi = body.family.face_points(int(face), rule.points)
+        s, ds = element_functions(body, faces[rows, 0], xi)
+        values[0, rows] = s
+        values[1:, rows] = np.einsum("eqsk,qkd->deqs", ds, dxi)
+        size = np.abs(values[:, rows]).max(axis=(0, 1, 2))
+        used[rows] = size > 1e-12 * size.max()
+    width = int(used.sum(axis=1).max())
+    order = np.argsort(~used, axis=1, kind="stable")[:, :width]
+    real = np.take_along_axis(used, order, axis=1)
+    conn = np.take_along_axis(body.connectivity[faces[:, 0]], order, axis=1)
+    conn = np.where(real, conn, conn[:, :1])
+    table = np.take_along_axis(values, order[None, :, None, :], axis=3) * real[:, None, :]
+    return FacetTables(conn, table[0], table[1], table[2], rule.weights)
+
+
+def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
+    """Integral of each function over faces: body slots and weights (m^2; m^3 for gradients); curved faces too."""
+    body, t = surface.body, facet_tables(surface)
+    x = body.reference[t.conn]
+    normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
+    dA = np.linalg.norm(normal, axis=2) * t.weights
+    weights = np.einsum("fq,fqi->fi", dA, t.shape)
+    slots, inverse = np.unique(t.conn, return_inverse=True)
+    return slots, np.bincount(inverse.ravel(), weights=weights.ravel(), minlength=len(slots))
+
+
+def center_of_mass(body: Body, values: np.ndarray) -> np.ndarray:
+    """Centre of mass (m) of a body with slot values (slots, 3) relative to its origin."""
+    position = (body.slot_kind == 0).astype(float)
+    lumped = body_mass(body) @ position
+    return lumped @ values / (lumped @ position) + body.origin
 
 
 def rigid_modes(x: np.ndarray, kind: np.ndarray) -> np.ndarray:

@@ -1,9 +1,7 @@
-"""`warpfea bench`: time and error of the solver on a bar of 3 x 2 x 1 m that is pulled at its end.
+"""`warpfea bench`: time and error of the solver on the problems of `bench_problems`.
 
-T10, SVK (E = 7e8 Pa, nu = 0.33, 2700 kg/m^3), clamped at x = 0; 5000 N in +x act on the face x = 3 from t = 0, as a
-uniform traction, consistently spread over its nodes; no gravity. Sizes are numbers of unknowns, met as closely as cells
-near the proportion 3 : 2 : 1 allow. The tip is the mean of the face x = 3; its error is measured against the same mesh
-and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
+Sizes are numbers of unknowns, met as closely as the problem allows. The error of the tip is measured against the same
+mesh and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
 """
 
 from __future__ import annotations
@@ -23,19 +21,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from . import mesh as meshes
-from .builder import ModelBuilder
-from .materials import SVK
+from .bench_problems import PROBLEMS, Problem
 from .model import Model
 from .simulation import Simulation
 from .solvers import NewtonPCG
 
-__all__ = ["Row", "bar", "bar_cells", "bench", "machine", "measure"]
+__all__ = ["Row", "bench", "machine", "measure"]
 
 SCHEMA = 1
-SIZE = (3.0, 2.0, 1.0)
-FORCE = 5000.0
-E, NU, DENSITY = 7e8, 0.33, 2700.0
 WARM_UP = 2
 TIGHTER = 100.0
 
@@ -44,6 +37,7 @@ TIGHTER = 100.0
 class Row:
     """A measurement. Times in ms or s, the tip in m; `tip_error` is None where no reference was made."""
 
+    problem: str
     dtype: str
     unknowns: int
     elements: int
@@ -56,29 +50,6 @@ class Row:
     tip_error: float | None
     setup_s: float
     compile_s: float
-
-
-def unknowns_of(cells: tuple[int, int, int]) -> int:
-    """Unknowns of a T10 box whose face x = 0 is clamped."""
-    nx, ny, nz = cells
-    return 3 * (2 * nx) * (2 * ny + 1) * (2 * nz + 1)
-
-
-def bar_cells(unknowns: int) -> tuple[int, int, int]:
-    """Cells close to the proportion 3 : 2 : 1 whose number of unknowns is nearest in ratio."""
-    limit = 2.0 * (unknowns / 72.0) ** (1.0 / 3.0) + 2.0
-    choices = {tuple(max(1, round(k * s)) for k in (3, 2, 1)) for s in np.arange(1.0, limit, 0.05)}
-    return min(sorted(choices), key=lambda cells: abs(np.log(unknowns_of(cells) / unknowns)))  # type: ignore[arg-type, return-value]
-
-
-def bar(cells: tuple[int, int, int]) -> ModelBuilder:
-    """The bar."""
-    b = ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    body = b.add_solid(meshes.box(SIZE, cells=cells), material=SVK(E=E, nu=NU, density=DENSITY), name="bar")
-    b.clamp(body.nodes("x-"))
-    b.add_traction(body.surface("x+"), (FORCE / (SIZE[1] * SIZE[2]), 0.0, 0.0))
-    b.add_probe("tip", body.surface("x+"))
-    return b
 
 
 def run_once(model: Model, *, dt: float, steps: int, tol: float | None) -> tuple[Simulation, list[float], float]:
@@ -94,13 +65,14 @@ def run_once(model: Model, *, dt: float, steps: int, tol: float | None) -> tuple
     return sim, times, ready
 
 
-def tip_of(sim: Simulation) -> np.ndarray:
-    """Displacement of the tip along x after each step, m."""
-    return sim.probe("tip").displacement[0, :, 0]
+def tip_of(sim: Simulation, axis: int) -> np.ndarray:
+    """Displacement of the tip along an axis after each step, m."""
+    return sim.probe("tip").displacement[0, :, axis]
 
 
 def measure(
-    cells: tuple[int, int, int],
+    problem: Problem,
+    size: Any,
     dtypes: list[str],
     *,
     device: Any,
@@ -111,11 +83,11 @@ def measure(
     with_reference: bool,
 ) -> list[Row]:
     """Rows of one mesh, one per precision."""
-    builder = bar(cells)
+    builder = problem.build(size)
     reference = None
     if with_reference:
         tight = NewtonPCG(tol=tol).tolerance("float64") / TIGHTER
-        reference = tip_of(run_once(builder.finalize(device=device), dt=dt, steps=steps, tol=tight)[0])
+        reference = tip_of(run_once(builder.finalize(device=device), dt=dt, steps=steps, tol=tight)[0], problem.axis)
     rows = []
     for dtype in dtypes:
         began = clock.perf_counter()
@@ -127,11 +99,12 @@ def measure(
             if k:
                 _, first, _ = run_once(model, dt=dt, steps=steps, tol=tol)
             times += first[min(WARM_UP, steps - 1) :]
-        tip = tip_of(sim)
+        tip = tip_of(sim, problem.axis)
         error = None if reference is None else float(np.abs(tip - reference).max() / np.abs(reference).max())
         info = model.info()
         rows.append(
             Row(
+                problem=problem.name,
                 dtype=dtype,
                 unknowns=info["unknowns"],
                 elements=info["elements"],
@@ -159,11 +132,12 @@ def bench(options: argparse.Namespace) -> int:
         if pathlib.Path(options.out).suffix != ".json":
             raise UsageError(f"--out {options.out}: the file name must end in .json")
         check_target(options.out, (".json",))
-    smallest = unknowns_of((3, 2, 1))
-    if min(options.unknowns) < smallest:
-        raise UsageError(f"--unknowns {min(options.unknowns)}: the smallest bar has {smallest}")
+    problems = [PROBLEMS[name] for name in options.problem or ["bar"]]
+    for problem in problems:
+        if options.unknowns and min(options.unknowns) < problem.smallest:
+            raise UsageError(f"--unknowns {min(options.unknowns)}: the smallest {problem.name} has {problem.smallest}")
     settings: dict[str, Any] = {
-        "unknowns": options.unknowns,
+        "problems": {p.name: list(options.unknowns or p.defaults) for p in problems},
         "dtypes": options.dtype or ["float64", "float32"],
         "steps": options.steps,
         "repeat": options.repeat,
@@ -176,9 +150,10 @@ def bench(options: argparse.Namespace) -> int:
     rows: list[Row] = []
     with quiet_warp():
         print(HEADER, flush=True)
-        for wanted in options.unknowns:
+        for problem, wanted in ((p, n) for p in problems for n in options.unknowns or p.defaults):
             found = measure(
-                bar_cells(wanted),
+                problem,
+                problem.size_for(wanted),
                 settings["dtypes"],
                 device=options.device,
                 steps=options.steps,
@@ -205,7 +180,7 @@ def bench(options: argparse.Namespace) -> int:
 
 
 HEADER = (
-    f"{'dtype':8} {'unknowns':>9} {'elements':>9} {'ms/step':>10} {'Newton':>7} {'PCG':>7} {'B/unknown':>9} "
+    f"{'problem':8} {'dtype':8} {'unknowns':>9} {'elements':>9} {'ms/step':>10} {'Newton':>7} {'PCG':>7} {'B/unknown':>9} "
     f"{'residual':>9} {'tip, m':>13} {'tip error':>9} {'set-up, s':>9} {'compile, s':>10}"
 )
 
@@ -213,7 +188,7 @@ HEADER = (
 def _line(r: Row) -> str:
     error = "-" if r.tip_error is None else f"{r.tip_error:.1e}"
     return (
-        f"{r.dtype:8} {r.unknowns:9d} {r.elements:9d} {r.ms_per_step:10.2f} {r.newton_per_step:7.1f} "
+        f"{r.problem:8} {r.dtype:8} {r.unknowns:9d} {r.elements:9d} {r.ms_per_step:10.2f} {r.newton_per_step:7.1f} "
         f"{r.pcg_per_step:7.0f} {r.bytes_per_unknown:9.0f} {r.residual:9.1e} {r.tip:13.6e} {error:>9} "
         f"{r.setup_s:9.1f} {r.compile_s:10.1f}"
     )

@@ -1,4 +1,4 @@
-"""Handles that a builder returns: bodies, sets of nodes, faces and elements, material points, drawn surfaces."""
+"""Handles that a builder returns: bodies, sets of nodes, faces and elements, material points."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from . import surfaces
 from .elements import Family
 from .errors import ModelError
 from .materials import Material
 from .mesh import Mesh
 
-__all__ = ["Body", "ElementSet", "MaterialPoint", "NodeSet", "Skin", "SurfaceSet"]
+__all__ = ["Body", "ElementSet", "MaterialPoint", "NodeSet", "SurfaceSet"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class SurfaceSet:
 
     @property
     def nodes(self) -> np.ndarray:
-        """(n, 3 or 6) node indices of each face, outward."""
+        """(n, 3, 4 or 6) node indices of each face of a solid, outward."""
         return self.body.mesh.faces(self.faces)
 
 
@@ -67,28 +67,17 @@ class MaterialPoint:
         slots: (n,) body slots.
         weights: (n,) shape functions at the point.
         X: (3,) reference position, m.
+        gradients: (n, 3) dweights/dX, 1/m: the deformation gradient is sum e_i gradients_i^T.
+        axes: (3, 3) columns: of a beam axis, width, height there; of a shell two tangents and the director; else global.
     """
 
     body: Body
     slots: np.ndarray
     weights: np.ndarray
     X: np.ndarray
+    gradients: np.ndarray
+    axes: np.ndarray
     element: int = -1
-
-
-@dataclass(frozen=True, eq=False)
-class Skin:
-    """The drawn surface of a body.
-
-    Attributes:
-        triangles: (T, 3) indices of skin points, outward.
-        slot_weights: sparse (points, slots): skin positions from slot values.
-        node_weights: sparse (points, mesh nodes): skin fields from nodal fields.
-    """
-
-    triangles: np.ndarray
-    slot_weights: sp.csr_matrix
-    node_weights: sp.csr_matrix
 
 
 @dataclass(eq=False)
@@ -103,6 +92,9 @@ class Body:
         material_of: (elements,) index into materials.
         rule: name of the force quadrature rule.
         curved_rule: the same of elements with curved sides.
+        frames: (elements, n, 3, 3) parent gradients dX/dxi at the element nodes, in the axes of the node, m; of
+            families with gradient slots.
+        node_axes: (nodes, 3, 3) orthonormal axes (columns) of each node's gradient slots; None: the global ones.
         origin: (3,) body origin; device positions are relative to it.
         slots: (used nodes x slots per node) model slots in body order, set at finalize; -1 before.
     """
@@ -114,7 +106,8 @@ class Body:
     material_of: np.ndarray
     rule: str
     curved_rule: str
-    initial: np.ndarray | None = None
+    frames: np.ndarray | None = field(default=None, repr=False)
+    node_axes: np.ndarray | None = field(default=None, repr=False)
     index: int = -1
     slot_offset: int = -1
     velocity: np.ndarray | None = field(default=None, repr=False)
@@ -159,7 +152,7 @@ class Body:
 
     @cached_property
     def slot_kind(self) -> np.ndarray:
-        """(slots,) 0 for positions, 1..3 for gradients d/dX_k."""
+        """(slots,) 0 for positions, 1..3 for gradients along the node's axes."""
         kinds = np.zeros(self.slot_count, dtype=np.int64)
         kinds[self.connectivity] = self.family.slot_kind[None, :]
         return kinds
@@ -173,10 +166,11 @@ class Body:
 
     @cached_property
     def reference(self) -> np.ndarray:
-        """(slots, 3) reference slot values E_i: positions relative to the origin, gradients the unit vectors."""
+        """(slots, 3) reference slot values E_i: positions relative to the origin, gradients the node's axes."""
         E = self.mesh.points[self.slot_node] - self.origin
         for k in (1, 2, 3):
-            E[self.slot_kind == k] = np.eye(3)[k - 1]
+            rows = self.slot_kind == k
+            E[rows] = np.eye(3)[k - 1] if self.node_axes is None else self.node_axes[self.slot_node[rows], :, k - 1]
         return E
 
     @property
@@ -193,8 +187,12 @@ class Body:
         return NodeSet(self, self.mesh.nodes(selection), _label(selection))
 
     def surface(self, selection: Any) -> SurfaceSet:
-        """Faces by group name, predicate of face centroids, or rows (element, local face)."""
-        return SurfaceSet(self, self.mesh.surface(selection), _label(selection))
+        """Faces by group name, predicate of face centroids, or rows (element, local face).
+
+        Beams name "start", "end", "side-", "side+", "normal-", "normal+"; shells "top", "bottom" and the strips over
+        their named edges.
+        """
+        return SurfaceSet(self, surfaces.select_faces(self, selection), _label(selection))
 
     def elements(self, selection: Any) -> ElementSet:
         """Elements by group name, predicate of centroids, or indices."""
@@ -202,79 +200,39 @@ class Body:
 
     def at(self, X: Any) -> MaterialPoint:
         """The material point at the reference position X (3,), m. Raises ModelError if X lies outside of the body."""
-        return locate(self, np.asarray(X, dtype=float))
+        from .locate import locate
 
-    # drawing
+        return locate(self, X)
+
+    @property
+    def start(self) -> NodeSet:
+        """First node of a beam. MeshError for other bodies."""
+        return self.nodes("start")
+
+    @property
+    def end(self) -> NodeSet:
+        """Last node of a beam."""
+        return self.nodes("end")
+
+    def edge(self, name: str) -> NodeSet:
+        """Nodes of a named edge of a shell."""
+        return self.nodes(name)
 
     @cached_property
-    def skin(self) -> Skin:
-        """Drawn surface: the outer faces, quadratic ones as four triangles."""
-        faces = self.mesh.faces(self.mesh.boundary())
-        if faces.shape[1] == 6:
-            parts = [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]
-            triangles = np.concatenate([faces[:, p] for p in parts])
-        else:
-            triangles = faces
-        used, local = np.unique(triangles, return_inverse=True)
-        rows = np.arange(len(used))
-        ones = np.ones(len(used))
-        return Skin(
-            triangles=local.reshape(triangles.shape),
-            slot_weights=sp.csr_matrix((ones, (rows, self.node_slot[used])), shape=(len(used), self.slot_count)),
-            node_weights=sp.csr_matrix((ones, (rows, used)), shape=(len(used), len(self.mesh.points))),
-        )
+    def boundary(self) -> np.ndarray:
+        """(K, 2) all outer faces, rows (element, local face)."""
+        return surfaces.boundary_faces(self)
+
+    @cached_property
+    def skin(self) -> surfaces.Skin:
+        """Drawn surface."""
+        return surfaces.make_skin(self)
+
+    @cached_property
+    def drawing(self) -> surfaces.Drawing:
+        """Drawn cells."""
+        return surfaces.make_drawing(self)
 
 
 def _label(selection: Any) -> str:
     return selection if isinstance(selection, str) else ""
-
-
-def locate(body: Body, X: np.ndarray) -> MaterialPoint:
-    """Find the element that holds X and the parent coordinates there, by Newton's method."""
-    if X.shape != (3,) or not np.all(np.isfinite(X)):
-        raise ModelError(f"body {body.name!r}: a point must be three finite numbers (m), got {X!r}")
-    mesh, family = body.mesh, body.family
-    coords = mesh.points[mesh.cells]
-    low, high = coords.min(axis=1), coords.max(axis=1)
-    size = float(np.max(high - low))
-    near = np.flatnonzero(np.all((low - 0.1 * size <= X) & (high + 0.1 * size >= X), axis=1))
-    tolerance = 1e-9
-    best = (np.inf, -1, np.zeros(3))
-    if len(near):
-        nodes = coords[near]
-        xi = np.full((len(near), 3), 0.25)
-        corner = np.concatenate([1 - xi.sum(1, keepdims=True), xi], axis=1)
-        for _ in range(20):
-            s, ds = _point_functions(family, xi, nodes)
-            residual = np.einsum("en,enk->ek", s, nodes) - X
-            J = np.einsum("enk,enl->ekl", nodes, ds)
-            xi = np.clip(xi - np.linalg.solve(J, residual[:, :, None])[:, :, 0], -1.0, 2.0)
-        corner = np.concatenate([1 - xi.sum(1, keepdims=True), xi], axis=1)
-        s, _ = _point_functions(family, xi, nodes)
-        miss = np.linalg.norm(np.einsum("en,enk->ek", s, nodes) - X, axis=1) / size
-        outside = np.maximum(-corner.min(axis=1), 0.0) + miss
-        k = int(np.argmin(outside))
-        best = (float(outside[k]), int(near[k]), xi[k])
-    if best[0] > max(tolerance, 1e-12 * float(np.abs(X).max()) / size):
-        a, b = mesh.bounding_box()
-        raise ModelError(
-            f"body {body.name!r}: point {X.tolist()} lies outside of it (bounding box {np.asarray(a).tolist()} to "
-            f"{np.asarray(b).tolist()} m)"
-        )
-    elem, xi_e = best[1], best[2]
-    s, _ = family.shape(xi_e[None], coords[elem][None])
-    return MaterialPoint(body, body.connectivity[elem], s[0, 0].copy(), X, elem)
-
-
-def _point_functions(family: Family, xi: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Geometry functions of each element at its own point: the position part of the slots."""
-    position = family.slot_kind == 0
-    s = np.empty((len(xi), int(position.sum())))
-    ds = np.empty((len(xi), int(position.sum()), 3))
-    if len(nodes) and family.shape(xi[:1], nodes[:1])[0].shape[0] == 1:
-        a, b = family.shape(xi, nodes[:1])
-        return a[0][:, position], b[0][:, position]
-    for e in range(len(xi)):
-        a, b = family.shape(xi[e : e + 1], nodes[e : e + 1])
-        s[e], ds[e] = a[0, 0, position], b[0, 0, position]
-    return s, ds

@@ -2,28 +2,44 @@
 
 from __future__ import annotations
 
-import math
 import pathlib
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from . import elements
+from . import elements as element_families
 from . import mesh as meshes
+from .assembly import center_of_mass, surface_weights
+from .beams import Rectangle, beam_geometry
 from .bodies import Body, ElementSet, MaterialPoint, NodeSet, SurfaceSet
+from .description import (
+    BodyForce,
+    DeadLoad,
+    Description,
+    Moment,
+    Pressure,
+    Probe,
+    Rotation,
+    Support,
+    assign_materials,
+    component_mask,
+    slot_field,
+    support_slots,
+    vector,
+)
 from .errors import ModelError
-from .laws import TimeLaw, time_law
+from .laws import time_law
 from .materials import Material
 from .mesh import Mesh
+from .shells import shell_geometry
+from .solids import solid_geometry
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["ModelBuilder", "Rotation"]
+__all__ = ["ModelBuilder"]
 
-COMPONENTS = {"x": 0, "y": 1, "z": 2}
 HANDLES: dict[type, str] = {
     Body: "the body",
     NodeSet: "nodes (body.nodes)",
@@ -31,83 +47,6 @@ HANDLES: dict[type, str] = {
     ElementSet: "elements (body.elements)",
     MaterialPoint: "a point (body.at)",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Rotation:
-    """A prescribed rotation about an axis through an anchor.
-
-    Args:
-        anchor: (3,) m.
-        axis: (3,), any length but zero.
-        angle: time law, rad.
-    """
-
-    anchor: Any
-    axis: Any
-    angle: Any
-
-
-@dataclass(eq=False)
-class DeadLoad:
-    """Force weight_i x value(t) on slots; kept for point loads and tractions alike."""
-
-    body: Body
-    slots: np.ndarray
-    weights: np.ndarray
-    law: TimeLaw
-    name: str
-
-
-@dataclass(eq=False)
-class Pressure:
-    """Follower pressure on faces."""
-
-    surface: SurfaceSet
-    law: TimeLaw
-
-
-@dataclass(eq=False)
-class BodyForce:
-    """Field b(r, t) on bodies, N/kg."""
-
-    function: Any
-    bodies: list[Body]
-
-
-@dataclass(eq=False)
-class Support:
-    """Prescribed components of slots: clamped (no law), moved by a law, or rotated."""
-
-    body: Body
-    slots: np.ndarray
-    components: np.ndarray
-    law: TimeLaw | None = None
-    node_laws: list[TimeLaw] | None = None
-    rotation: tuple[np.ndarray, np.ndarray] | None = None
-
-
-@dataclass(eq=False)
-class Probe:
-    """A recorded point: sum of weights x slot values."""
-
-    name: str
-    body: Body
-    slots: np.ndarray
-    weights: np.ndarray
-    X: np.ndarray
-
-
-@dataclass(eq=False)
-class Description:
-    """All that a builder has collected."""
-
-    bodies: list[Body] = field(default_factory=list)
-    supports: list[Support] = field(default_factory=list)
-    dead_loads: list[DeadLoad] = field(default_factory=list)
-    pressures: list[Pressure] = field(default_factory=list)
-    body_forces: list[BodyForce] = field(default_factory=list)
-    probes: list[Probe] = field(default_factory=list)
 
 
 class ModelBuilder:
@@ -122,7 +61,7 @@ class ModelBuilder:
     """
 
     def __init__(self, gravity: Any = (0.0, 0.0, -9.81), up_axis: str = "Z") -> None:
-        self.gravity = _vector(gravity, "gravity")
+        self.gravity = vector(gravity, "gravity")
         if up_axis not in ("Z", "Y"):
             raise ModelError(f"up_axis = {up_axis!r} is neither 'Z' nor 'Y'")
         self.up_axis = up_axis
@@ -152,52 +91,152 @@ class ModelBuilder:
         Args:
             mesh: file (Gmsh .msh, .vtu, Abaqus .inp) or Mesh, m after `scale`.
             material: one law, or laws by element group of the mesh.
-            element: element family; by default T4 or T10 as the cells are.
+            element: "T4" or "T10", by default as the cells are; "ENMC", "FN" or "FN18", the ANCF tetrahedra, on tetrahedra
+                (of T10 cells the corner nodes stay, and ENMC keeps the curved shape); "H3843", the ANCF brick, on
+                hexahedra.
             quadrature: name of the force rule of all elements; T10: "tet4", "tet5_paper", "tet8", "tet14"; T4: "tet1",
-                "tet4". By default T10 takes "tet4" where straight and "tet8" where curved, T4 "tet1".
+                "tet4"; ENMC, FN, FN18: "tet14", "conical4"; H3843: "3x3x3", "4x4x4". By default T10 takes "tet4" where
+                straight and "tet8" where curved, T4 "tet1", the others their first.
             scale: factor on the coordinates of the file.
             transform: (4, 4) matrix, or (rotation (3, 3), translation (3,)), applied after `scale`.
-            initial: initial positions, (nodes, 3) in m or a function X (nodes, 3) -> (nodes, 3), where they differ from
-                the stress-free reference.
+            initial: initial positions, a function X (nodes, 3) -> (nodes, 3) or, for T4 and T10, (nodes, 3) in m, where
+                they differ from the stress-free reference.
             name: unique name; by default the mesh's.
 
         Raises:
             MeshError: the file or mesh can't be used.
             ModelError: unknown group or rule, elements without material, a name used twice.
         """
+        mesh = self._mesh(mesh, "add_solid", scale, transform)
+        name = self._name(name or mesh.name, given=name is not None)
+        if len(mesh.cells) == 0:
+            raise ModelError(f"body {name!r}: the mesh has no elements")
+        family = element_families.get(element) if element else element_families.for_cell(mesh.cell_type)
+        mesh, frames = solid_geometry(name, mesh, family)
+        rule = family.rule(quadrature).name
+        curved = family.curved_rule.name if quadrature is None else rule
+        return self._add(Body(name, mesh, family, *assign_materials(name, mesh, material), rule, curved, frames), initial)
+
+    def add_beam(
+        self,
+        curve: Any,
+        *,
+        elements: int,
+        section: Rectangle,
+        normal: Any,
+        material: Material,
+        integration: str | None = None,
+        corners: str = "error",
+        initial: Any = None,
+        name: str | None = None,
+    ) -> Body:
+        """Add a beam of ANCF 3243 elements; node sets "start" and "end", also as beam.start and beam.end.
+
+        Args:
+            curve: points (n, 3), m, of a straight line or polyline; or a smooth function of s in [0, 1] that returns
+                (3,), such as wf.spline(points).
+            elements: number of elements, of equal length in s.
+            section: Rectangle(width, height); the height lies along the normal.
+            normal: (3,), or a function of s; made perpendicular to the axis. A turning normal makes a twisted beam.
+            material: one law.
+            integration: "split" (default with SVK; the Poisson part on the axis alone, which removes locking), "full"
+                (5x3x3 points, as Paper I; default with the other laws), or "3x2x2" points of the full law.
+            corners: "error", or "weld": a rigid corner, where both sides share the deformation gradient (Shabana and
+                Mikkola 2003).
+            initial: initial positions, a function X (n, 3) -> (n, 3), where they differ from the stress-free reference.
+            name: unique name.
+
+        Raises:
+            ModelError: a corner, a normal along the axis, an unknown integration, or an argument out of range.
+        """
+        name = self._name(name or "beam", given=name is not None)
+        mesh, axes, frames = beam_geometry(name, curve, elements, section, normal, corners)
+        return self._add_structure(name, mesh, "3243", material, integration, axes, frames, initial)
+
+    def add_shell(
+        self,
+        mesh: str | pathlib.Path | Mesh,
+        *,
+        thickness: float,
+        material: Material | dict[str, Material],
+        integration: str | None = None,
+        normals: Any = None,
+        corners: str = "error",
+        scale: float = 1.0,
+        transform: Any = None,
+        initial: Any = None,
+        name: str | None = None,
+    ) -> Body:
+        """Add a shell of ANCF 3443 elements on the mid-surface of quads.
+
+        Args:
+            mesh: file or Mesh of quads, such as wf.mesh.grid; the director points where the quads turn left-handed
+                about it, (X_1 - X_0) x (X_3 - X_0).
+            thickness: m.
+            material: one law, or laws by element group of the mesh.
+            integration: "split" (default with SVK; remedies against thickness and shear locking, see
+                warpfea.elements.ancf_shell), or "full" (4x4x2 points of the full law; default with the other laws).
+            normals: directors at the nodes, (nodes, 3) or a function X (n, 3) -> (n, 3), of a curved surface known
+                better than by its quads; by default the mean of the quads' normals.
+            corners: "error" where normals differ by more than 30 degrees, or "weld": a rigid corner.
+            scale, transform: as for add_solid.
+            initial: initial positions, a function X (n, 3) -> (n, 3), where they differ from the stress-free reference.
+            name: unique name; by default the mesh's.
+
+        Raises:
+            MeshError: the file or mesh can't be used.
+            ModelError: a mesh that is not of quads, a corner, or an option out of range.
+        """
+        mesh = self._mesh(mesh, "add_shell", scale, transform)
+        name = self._name(name or mesh.name, given=name is not None)
+        axes, frames = shell_geometry(name, mesh, thickness, normals, corners)
+        return self._add_structure(name, mesh, "3443", material, integration, axes, frames, initial)
+
+    def _add_structure(
+        self,
+        name: str,
+        mesh: Mesh,
+        element: str,
+        material: Any,
+        integration: str | None,
+        axes: np.ndarray,
+        frames: np.ndarray,
+        initial: Any,
+    ) -> Body:
+        materials, index = assign_materials(name, mesh, material)
+        family = element_families.get(element)
+        split = all(law.law == "svk" for _, law in materials)
+        scheme = integration or ("split" if split else "full")
+        known = [*family.schemes, *family.rules]
+        if scheme not in known:
+            raise ModelError(f"body {name!r}: integration = {scheme!r} is none of {', '.join(map(repr, known))}")
+        if scheme in family.schemes and not split:
+            bad = next(law for _, law in materials if law.law != "svk")
+            raise ModelError(
+                f"body {name!r}: integration = {scheme!r} splits the St. Venant-Kirchhoff law; use 'full' with "
+                f"{type(bad).__name__}"
+            )
+        return self._add(Body(name, mesh, family, materials, index, scheme, scheme, frames, axes), initial)
+
+    def _mesh(self, mesh: Any, what: str, scale: float, transform: Any) -> Mesh:
         if isinstance(mesh, (str, pathlib.Path)):
             mesh = meshes.read(mesh, scale=scale, transform=transform)
         elif not isinstance(mesh, Mesh):
-            raise ModelError(f"add_solid: mesh must be a file name or a Mesh, got {type(mesh).__name__}")
+            raise ModelError(f"{what}: mesh must be a file name or a Mesh, got {type(mesh).__name__}")
         else:
             if scale != 1.0 or transform is not None:
                 mesh = mesh.transformed(scale=scale, transform=transform)
             meshes.check(mesh)
-        name = self._name(name or mesh.name, given=name is not None)
-        if len(mesh.cells) == 0:
-            raise ModelError(f"body {name!r}: the mesh has no elements")
-        family = elements.get(element) if element else elements.for_cell(mesh.cell_type)
-        if family.cell_type != mesh.cell_type:
-            raise ModelError(
-                f"body {name!r}: element {family.name} needs {family.cell_type} cells, the mesh has {mesh.cell_type}"
-            )
-        materials, index = _assign_materials(name, mesh, material)
-        rule = family.rule(quadrature).name
-        curved = family.curved_rule.name if quadrature is None else rule
-        body = Body(name, mesh, family, materials, index, rule, curved)
+        return mesh
+
+    def _add(self, body: Body, initial: Any) -> Body:
         body.index = len(self.bodies)
         if initial is not None:
-            body.initial_displacement = _initial(body, initial)
+            body.initial_displacement = (
+                slot_field(body, initial, f"body {body.name!r}: initial") - slot_field(body, lambda X: X, "")
+            )
         self.bodies.append(body)
         return body
-
-    def add_beam(self, *args: Any, **options: Any) -> Body:
-        """ANCF beams are not part of this version."""
-        raise NotImplementedError("add_beam: ANCF beams (3243) are not part of this version")
-
-    def add_shell(self, *args: Any, **options: Any) -> Body:
-        """ANCF shells are not part of this version."""
-        raise NotImplementedError("add_shell: ANCF shells (3443) are not part of this version")
 
     # supports
 
@@ -206,12 +245,17 @@ class ModelBuilder:
 
         Args:
             nodes: what to hold.
-            slots: "all", or "position" to leave gradients free.
-            components: which of "xyz" to hold.
+            slots: "all" (built in), or "position" (pinned), "position+axis", or other names joined by "+": "axis" and
+                "section" of beams, "surface" and "director" of shells, "gradients" of ANCF solids. Holding the gradient
+                along the axis at a built-in end adds a little stiffness; "position+section" does not.
+            components: which of "xyz" to hold, global axes.
+
+        Raises:
+            ModelError: an unknown name of slots or components, or nodes of another builder.
         """
         body = self._own(nodes, "clamp", NodeSet)
         self.description.supports.append(
-            Support(body, _support_slots(nodes, slots), _components(components, f"clamp on {body.name!r}"))
+            Support(body, support_slots(nodes, slots), component_mask(components, f"clamp on {body.name!r}"))
         )
 
     def drive(
@@ -231,7 +275,7 @@ class ModelBuilder:
                 (n, nodes, 3)).
             rotation: Rotation about an axis, from the reference.
             components: which of "xyz" are prescribed.
-            slots: "position", or "all" for gradients too (rotation only).
+            slots: as for clamp; gradients move with a rotation, and are held by a displacement.
 
         Raises:
             ModelError: neither or both of displacement and rotation, or a wrong shape.
@@ -240,23 +284,28 @@ class ModelBuilder:
         what = f"drive of {nodes.name or 'nodes'!r} on body {body.name!r}"
         if (displacement is None) == (rotation is None):
             raise ModelError(f"{what}: give either displacement or rotation")
-        support = Support(body, _support_slots(nodes, slots), _components(components, what))
+        support = Support(body, support_slots(nodes, slots), component_mask(components, what))
         if rotation is not None:
             if not isinstance(rotation, Rotation):
                 raise ModelError(f"{what}: rotation must be a Rotation(anchor, axis, angle), got {rotation!r}")
-            axis = _vector(rotation.axis, f"{what}: axis")
+            axis = vector(rotation.axis, f"{what}: axis")
             if not np.linalg.norm(axis) > 0.0:
                 raise ModelError(f"{what}: axis is zero")
             support.law = time_law(rotation.angle, f"{what}: angle", scalar=True)
-            support.rotation = (_vector(rotation.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis))
+            support.rotation = (vector(rotation.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis))
         elif isinstance(displacement, tuple) and len(displacement) == 2 and np.ndim(displacement[1]) == 3:
             times, values = np.asarray(displacement[0], float), np.asarray(displacement[1], float)
             if values.shape != (len(times), len(nodes), 3):
                 raise ModelError(f"{what}: values have shape {values.shape}, expected {(len(times), len(nodes), 3)}")
-            support.slots = _support_slots(nodes, "position")
+            support.slots = support_slots(nodes, "position")
             support.node_laws = [time_law((times, values[:, k]), what) for k in range(len(nodes))]
         else:
             support.law = time_law(displacement, f"{what}: displacement")
+            moved = np.isin(support.slots, support_slots(nodes, "position"))
+            if not moved.all():
+                held = Support(body, support.slots[~moved], support.components)
+                self.description.supports.append(held)
+                support.slots = support.slots[moved]
         self.description.supports.append(support)
 
     # loads
@@ -266,15 +315,38 @@ class ModelBuilder:
         body = self._own(point, "add_point_load", MaterialPoint, NodeSet)
         law = time_law(force, f"point load on {body.name!r}")
         if isinstance(point, NodeSet):
-            slots = _support_slots(point, "position")
+            slots = support_slots(point, "position")
             weights = np.full(len(slots), 1.0 / len(slots))
         else:
             slots, weights = point.slots, point.weights
         self.description.dead_loads.append(DeadLoad(body, slots, weights, law, "point load"))
 
-    def add_moment(self, point: Any, moment: Any) -> None:
-        """Moments act on gradient slots, which solids of this version do not have."""
-        raise NotImplementedError("add_moment: moments act on ANCF nodes, which are not part of this version")
+    def add_moment(self, point: MaterialPoint | NodeSet, moment: Any) -> None:
+        """A moment about fixed directions (time law (3,), N m), at a material point or shared equally by nodes.
+
+        It does the work m . omega on the spin of the section (beams), of the director (shells; the part of the moment
+        along the director does nothing), or of the deformation gradient (ANCF solids, and any solid at a point).
+
+        Raises:
+            ModelError: nodes without gradients to turn (T4, T10).
+        """
+        body = self._own(point, "add_moment", MaterialPoint, NodeSet)
+        law = time_law(moment, f"moment on {body.name!r}")
+        if isinstance(point, MaterialPoint):
+            slots, vectors, axes = point.slots[None], (point.gradients @ point.axes)[None], point.axes[None]
+        else:
+            chosen = support_slots(point, "all")
+            chosen = chosen[body.slot_kind[chosen] > 0]
+            if len(chosen) != 3 * len(point):
+                raise ModelError(
+                    f"add_moment: nodes of body {body.name!r} ({body.family.name}) have no gradients to turn; use a point "
+                    "body.at(...), or add_traction"
+                )
+            slots = chosen.reshape(-1, 3)
+            vectors = np.tile(np.eye(3), (len(slots), 1, 1))
+            axes = np.swapaxes(body.reference[slots], 1, 2)
+        vectors = vectors * (np.arange(3) >= 3 - body.family.spin_vectors)
+        self.description.moments.append(Moment(body, slots, vectors, axes, law))
 
     def add_traction(self, surface: SurfaceSet, traction: Any) -> None:
         """A dead traction (time law (3,), N per m^2 of the reference area) on faces."""
@@ -316,29 +388,25 @@ class ModelBuilder:
         """Initial state of a body.
 
         Args:
-            velocity: (3,) or (nodes, 3), m/s.
+            velocity: (3,) m/s, a function X (n, 3) -> (n, 3), or, for T4 and T10, (nodes, 3).
             angular_velocity: (3,) rad/s about the centre of mass.
-            displacement: (nodes, 3) m, or a function X (nodes, 3) -> (nodes, 3).
+            displacement: a function X (n, 3) -> (n, 3), m, or, for T4 and T10, (nodes, 3).
         """
         self._own(body, "set_initial", Body)
-        N = len(body.mesh.points)
+        label = f"body {body.name!r}"
         if displacement is not None:
-            values = displacement(body.mesh.points) if callable(displacement) else displacement
-            body.initial_displacement = _nodal(values, N, f"body {body.name!r}: initial displacement")
+            body.initial_displacement = slot_field(body, displacement, f"{label}: initial displacement")
         if velocity is None and angular_velocity is None:
             return
-        total = np.zeros((N, 3))
+        slots = np.zeros((body.slot_count, 3))
         if velocity is not None:
-            values = velocity(body.mesh.points) if callable(velocity) else velocity
-            total += _nodal(values, N, f"body {body.name!r}: velocity")
-        spin = np.zeros(3)
+            slots += slot_field(body, velocity, f"{label}: velocity")
         if angular_velocity is not None:
-            spin = _vector(angular_velocity, f"body {body.name!r}: angular_velocity")
-            x = body.mesh.points + (0.0 if body.initial_displacement is None else body.initial_displacement)
-            total += np.cross(spin, x - center_of_mass(body, x))
-        slots = total[body.slot_node]
-        gradient = body.slot_kind > 0
-        slots[gradient] = np.cross(spin, body.reference[gradient])
+            spin = vector(angular_velocity, f"{label}: angular_velocity")
+            x = body.reference + (0.0 if body.initial_displacement is None else body.initial_displacement)
+            position = body.slot_kind == 0
+            arm = np.where(position[:, None], x + body.origin - center_of_mass(body, x), x)
+            slots += np.cross(spin, arm)
         body.velocity = slots
 
     def add_probe(self, name: str, where: MaterialPoint | SurfaceSet | NodeSet) -> None:
@@ -350,9 +418,9 @@ class ModelBuilder:
             slots, weights = where.slots, where.weights
         elif isinstance(where, SurfaceSet):
             slots, weights = surface_weights(where)
-            weights = weights / weights.sum()
+            weights = weights / weights[body.slot_kind[slots] == 0].sum()
         else:
-            slots = _support_slots(where, "position")
+            slots = support_slots(where, "position")
             weights = np.full(len(slots), 1.0 / len(slots))
         X = weights @ (body.reference[slots] + (body.slot_kind[slots] == 0)[:, None] * body.origin)
         self.description.probes.append(Probe(name, body, slots, weights, X))
@@ -424,119 +492,3 @@ class ModelBuilder:
             if len(unused) == len(thing.indices):
                 raise ModelError(f"{what}: no element of body {body.name!r} uses node {int(unused[0])}")
         return body
-
-
-def _vector(value: Any, what: str) -> np.ndarray:
-    try:
-        out = np.asarray(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"{what} = {value!r} is not three numbers") from error
-    if out.shape != (3,) or not np.all(np.isfinite(out)):
-        raise ModelError(f"{what} = {value!r} is not three finite numbers")
-    return out
-
-
-def _nodal(values: Any, nodes: int, what: str) -> np.ndarray:
-    out = np.asarray(values, dtype=float)
-    if out.shape == (3,):
-        out = np.broadcast_to(out, (nodes, 3))
-    if out.shape != (nodes, 3):
-        raise ModelError(f"{what} has shape {out.shape}, expected (3,) or {(nodes, 3)}")
-    bad = np.flatnonzero(~np.isfinite(out).all(axis=1))
-    if len(bad):
-        raise ModelError(f"{what}: node {int(bad[0])} has {out[bad[0]].tolist()}")
-    return out.copy()
-
-
-def _initial(body: Body, initial: Any) -> np.ndarray:
-    values = initial(body.mesh.points) if callable(initial) else initial
-    return _nodal(values, len(body.mesh.points), f"body {body.name!r}: initial") - body.mesh.points
-
-
-def _components(text: str, what: str) -> np.ndarray:
-    out = np.zeros(3)
-    if not text or any(c not in COMPONENTS for c in text):
-        raise ModelError(f"{what}: components = {text!r} must be letters of 'xyz'")
-    for c in text:
-        out[COMPONENTS[c]] = 1.0
-    return out
-
-
-def _support_slots(nodes: NodeSet, which: str) -> np.ndarray:
-    """Body slots of a node set: of all kinds, or positions."""
-    if which not in ("all", "position"):
-        if which == "position+axis":
-            raise NotImplementedError("slots='position+axis': ANCF nodes are not part of this version")
-        raise ModelError(f"slots = {which!r} is none of 'position', 'position+axis', 'all'")
-    body = nodes.body
-    first = body.node_slot[nodes.indices]
-    first = first[first >= 0]
-    if which == "position":
-        return first
-    counts = body.node_slot_count[body.slot_node[first]]
-    return np.concatenate([f + np.arange(c) for f, c in zip(first, counts)]) if len(first) else first
-
-
-def _assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[str, Material]], np.ndarray]:
-    if isinstance(material, Material):
-        _check_density_length(name, "", material, len(mesh.cells), mesh)
-        return [("", material)], np.zeros(len(mesh.cells), dtype=np.int64)
-    if not isinstance(material, dict) or not all(isinstance(m, Material) for m in material.values()):
-        raise ModelError(f"body {name!r}: material must be a law or a dict of group name to law, got {material!r}")
-    index = np.full(len(mesh.cells), -1, dtype=np.int64)
-    for k, (group, law) in enumerate(material.items()):
-        if group not in mesh.element_sets:
-            raise ModelError(
-                f"body {name!r}: material group {group!r} is not an element group of {mesh.label}; there are "
-                f"{sorted(mesh.element_sets)}"
-            )
-        members = mesh.element_sets[group]
-        twice = members[index[members] >= 0]
-        if len(twice):
-            raise ModelError(f"body {name!r}: element {int(twice[0])} is in two material groups, one of them {group!r}")
-        index[members] = k
-        _check_density_length(name, group, law, len(mesh.cells), mesh)
-    bare = np.flatnonzero(index < 0)
-    if len(bare):
-        raise ModelError(
-            f"body {name!r}: {len(bare)} elements of {mesh.label} have no material, the first is element "
-            f"{int(bare[0])}; groups given: {sorted(material)}"
-        )
-    return list(material.items()), index
-
-
-def _check_density_length(name: str, group: str, material: Any, elements_count: int, mesh: Mesh) -> None:
-    density = material.density
-    if callable(density):
-        values = np.asarray(density(mesh.points), dtype=float)
-        if values.shape != (len(mesh.points),) or not np.all(np.isfinite(values) & (values > 0.0)):
-            raise ModelError(f"body {name!r}: density f(X) must give one positive finite value per point")
-    elif np.ndim(density) == 1 and len(density) != elements_count:
-        raise ModelError(
-            f"body {name!r}: density of group {group!r} has {len(density)} values for {elements_count} elements"
-        )
-
-
-def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
-    """Integral of each shape function over faces: body slots and weights (m^2); Gauss points, curved faces too."""
-    from .assembly import facet_tables
-
-    body = surface.body
-    conn, s, a, b, w = facet_tables(surface)
-    x = body.reference[conn]
-    normal = np.cross(np.einsum("qi,fik->fqk", a, x), np.einsum("qi,fik->fqk", b, x))
-    dA = np.linalg.norm(normal, axis=2) * w[None, :]
-    weights = np.einsum("fq,qi->fi", dA, s)
-    slots, inverse = np.unique(conn, return_inverse=True)
-    return slots, np.bincount(inverse.ravel(), weights=weights.ravel(), minlength=len(slots))
-
-
-def center_of_mass(body: Body, x: np.ndarray) -> np.ndarray:
-    """Centre of mass (m) of a body with nodes at x (nodes, 3)."""
-    from .assembly import body_mass
-
-    position = body.slot_kind == 0
-    lumped = body_mass(body) @ position.astype(float)
-    out = (lumped[position] @ x[body.slot_node[position]]) / lumped[position].sum()
-    assert math.isfinite(float(out.sum()))
-    return out

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from . import elements
-from .assembly import CHUNK, geometry, gradients
+from . import assembly
+from .assembly import chunks, geometry, gradients
+from .elements import Rule
 from .kernels.gather import gather_kernels
 from .kernels.types import precision
 from .launch import Launcher
@@ -89,8 +91,8 @@ class Evaluation:
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
         dq = wp.ones(1, dtype=wp.float64, device=m.device)
         history = self._zeros((1, 1), m.types.sym)
-        colour = _colours(m._mass)
         conns = [np.concatenate([p.conn + p.body.slot_offset for p in b.parts]) for b in m.blocks]
+        colour = _colours(m.graph())
         rows, cols, values = [], [], []
         for c in range(int(colour.max()) + 1):
             for axis in range(3):
@@ -116,11 +118,18 @@ class Evaluation:
         data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
         return sp.csr_matrix(data, shape=(n, n))
 
-    def stresses(self, state: State) -> list[tuple[Any, np.ndarray]]:
-        """Per block: Cauchy stress at the points, [world, point, elem, 6] in Voigt order xx yy zz yz xz xy, Pa."""
+    def stresses(self, state: State, body: Any = None) -> list[tuple[Any, np.ndarray]]:
+        """Per block (of a body): Cauchy stress at the points, [world, point, elem, 6] as xx yy zz yz xz xy, Pa.
+
+        Of an energy in parts each block holds its part; they add up.
+        """
         m = self.model
         out = []
         for block in m.blocks:
+            if body is not None and all(part.body is not body for part in block.parts):
+                continue
+            if block.key.tying:
+                continue  # its transverse shear vanishes at the faces, where a shell's stress is wanted
             stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
             J = self._zeros((m.worlds, block.points, block.count), m.types.T)
             kernel = block.kernels_for(m.dtype, None).point_stress
@@ -128,28 +137,33 @@ class Evaluation:
             out.append((block, stress.numpy()))
         return out
 
-    def nodal_stress(self, state: State, body: Any) -> np.ndarray:
-        """Cauchy stress at mesh nodes, [world, node, 6], Pa: linear fit per element, then a volume-weighted mean."""
+    def sample_stress(self, state: State, body: Any) -> np.ndarray:
+        """Cauchy stress at the samples of each mesh node, [world, node x sample, 6], Pa.
+
+        Each part of the energy is fitted per element and evaluated at the samples; parts add up, elements are averaged
+        by volume.
+        """
         m = self.model
         family = body.family
-        nodes = len(body.mesh.points)
-        total = np.zeros((m.worlds, nodes, 6))
-        weight = np.zeros(nodes)
-        volumes = body.mesh.volumes()
-        for block, stress in self.stresses(state):
+        k = family.node_samples.shape[1]
+        total = np.zeros((m.worlds, len(body.mesh.points) * k, 6))
+        weight = np.zeros(total.shape[1])
+        volumes = assembly.element_volumes(body)
+        for block, stress in self.stresses(state, body):
             first = 0
-            to_nodes = _extrapolation(elements.get(block.key.family).rules[block.key.rule].points, family.node_points)
+            to_samples = _extrapolation(block.key.rule, family.node_samples.reshape(-1, 3))
             for part in block.parts:
                 members = slice(first, first + len(part.elements))
                 first += len(part.elements)
                 if part.body is not body:
                     continue
-                at_nodes = np.einsum("nq,bqek->benk", to_nodes, stress[:, :, members].astype(float))
-                cells = body.mesh.cells[part.elements]
+                at_samples = np.einsum("nq,bqek->benk", to_samples, stress[:, :, members].astype(float))
+                rows = (body.mesh.cells[part.elements][:, :, None] * k + np.arange(k)).reshape(len(part.elements), -1)
                 v = volumes[part.elements]
-                np.add.at(weight, cells, v[:, None])
+                if block.key.part == 0:
+                    np.add.at(weight, rows, v[:, None])
                 for b in range(m.worlds):
-                    np.add.at(total[b], cells, at_nodes[b] * v[:, None, None])
+                    np.add.at(total[b], rows, at_samples[b] * v[:, None, None])
         return total / np.where(weight > 0.0, weight, 1.0)[None, :, None]
 
 
@@ -160,28 +174,44 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
         first = block.element_offset
         for part in block.parts:
             body = part.body
-            rule = body.family.rules[block.key.rule]
+            rule = block.key.rule
             points = np.vstack([rule.points, body.family.vertices])
-            for k in range(0, len(part.elements), CHUNK):
-                members = part.elements[k : k + CHUNK]
+            done = 0
+            for members in chunks(body, part.elements, len(points)):
                 _, ds, J0, _ = geometry(body, members, points)
                 U = u[body.slot_offset + body.connectivity[members]]
                 F = np.eye(3) + np.einsum("esk,eqsl->eqkl", U, gradients(ds, J0))
                 J = np.linalg.det(F).min(axis=1)
                 low = int(np.argmin(np.where(np.isnan(J), -np.inf, J)))
                 if not J[low] >= best:
-                    best, index = float(J[low]), first + k + low
+                    best, index = float(J[low]), first + done + low
                     text = f"element {int(members[low])} of body {body.name!r} (J = {best:.3g})"
+                done += len(members)
             first += len(part.elements)
     return index, text
 
 
-def _extrapolation(points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """(nodes, points) least-squares fit of a linear field, a constant where the points can't carry one."""
+def _extrapolation(rule: Rule, at: np.ndarray) -> np.ndarray:
+    """(n, Q) fit of a field known at the points of a rule, evaluated at parent points (n, 3).
+
+    On a box the product of Lagrange's polynomials through the points; on the simplex a linear least-squares fit, a
+    constant where the points can't carry one.
+    """
+    if rule.counts:
+        out = np.ones((len(at), 1))
+        grid = rule.points.reshape(*rule.counts, 3)
+        for axis in range(3):
+            nodes = np.moveaxis(grid[..., axis], axis, 0).reshape(rule.counts[axis], -1)[:, 0]
+            basis = np.ones((len(at), len(nodes)))
+            for j, k in itertools.permutations(range(len(nodes)), 2):
+                basis[:, j] *= (at[:, axis] - nodes[k]) / (nodes[j] - nodes[k])
+            out = (out[:, :, None] * basis[:, None, :]).reshape(len(at), -1)
+        return out
+    points = rule.points
     if len(points) < 4:
-        return np.full((len(nodes), len(points)), 1.0 / len(points))
+        return np.full((len(at), len(points)), 1.0 / len(points))
     A = np.column_stack([np.ones(len(points)), points])
-    return np.column_stack([np.ones(len(nodes)), nodes]) @ np.linalg.pinv(A)
+    return np.column_stack([np.ones(len(at)), at]) @ np.linalg.pinv(A)
 
 
 def von_mises(s: np.ndarray) -> np.ndarray:

@@ -11,15 +11,16 @@ import warp as wp
 from . import assembly
 from .elements import Rule
 from .errors import ModelError
+from .kernels.follower import follower_struct, moment_kernels, pressure_kernels
 from .kernels.gather import gather_kernels, topology_struct
-from .kernels.loads import body_force_kernel, facet_struct, law_function_kernel, law_struct, load_kernels
+from .kernels.loads import body_force_kernel, law_function_kernel, law_struct, load_kernels
 from .laws import TimeLaw
 
 if TYPE_CHECKING:
-    from .builder import BodyForce, Pressure, Support
+    from .description import BodyForce, Moment, Pressure, Support
     from .model import Model
 
-__all__ = ["FieldPart", "Loads", "PressurePart"]
+__all__ = ["FieldPart", "FollowerPart", "Loads"]
 
 
 @dataclass(eq=False)
@@ -35,13 +36,12 @@ class FieldPart:
 
 
 @dataclass(eq=False)
-class PressurePart:
-    """Follower pressure on faces with one number of nodes."""
+class FollowerPart:
+    """A pressure on faces or a moment at points: device data, the force kernel and that of its symmetric tangent."""
 
-    conn: Any
-    law: Any
-    tables: Any
-    offset: int
+    data: Any
+    force: Any
+    product: Any
     count: int
 
 
@@ -85,7 +85,8 @@ class Loads:
         self._build_drives()
         self._pushed: list[np.ndarray] = []
         self._offset = 0
-        self.pressures = self._build_pressures(model.description.pressures)
+        self.followers = [self._build_pressure(p) for p in model.description.pressures]
+        self.followers += [self._build_moment(p) for p in model.description.moments]
         self.fields = [p for f in model.description.body_forces for p in self._build_field(f)]
         self._build_pushed()
         self._upload_laws()
@@ -174,27 +175,40 @@ class Loads:
         arms[position] += body.origin - anchor
         return arms
 
-    def _build_pressures(self, pressures: list[Pressure]) -> list[PressurePart]:
+    def _follower(self, conn: np.ndarray, law: TimeLaw) -> Any:
+        """Device data common to the follower loads; conn (items, local) in the model's slots."""
         m = self.model
-        parts = []
-        for pressure in pressures:
-            index = self._laws.add(pressure.law)
-            conn, s, a, b, w = assembly.facet_tables(pressure.surface)
-            conn = conn + pressure.surface.body.slot_offset
-            tables = facet_struct(m.dtype)()
-            for name, values in (("shape", s), ("d_xi", a), ("d_eta", b), ("weight", w)):
-                setattr(tables, name, m.array("loads", values, m.types.T))
-            parts.append(
-                PressurePart(
-                    conn=m.array("loads", conn.T, wp.int32),
-                    law=m.array("loads", np.full(len(conn), index), wp.int32),
-                    tables=tables,
-                    offset=self._offset,
-                    count=len(conn),
-                )
-            )
-            self._push(conn)
-        return parts
+        data = follower_struct(m.dtype)()
+        data.conn = m.array("loads", conn.T, wp.int32)
+        data.law = m.array("loads", np.full(len(conn), self._laws.add(law)), wp.int32)
+        data.offset, data.count = self._offset, len(conn)
+        self._push(conn)
+        return data
+
+    def _build_pressure(self, pressure: Pressure) -> FollowerPart:
+        m = self.model
+        body = pressure.surface.body
+        t = assembly.facet_tables(pressure.surface)
+        data = self._follower(t.conn + body.slot_offset, pressure.law)
+        position = body.slot_kind[t.conn] == 0
+        value = body.reference[t.conn]
+        value = np.where(position[:, :, None], value - value[:, :1], value)
+        data.reference = m.array("loads", np.swapaxes(value, 0, 1), m.types.vec3)
+        data.is_position = m.array("loads", position.T.astype(float), m.types.T)
+        for name, table in (("shape", t.shape), ("d_a", t.d_a), ("d_b", t.d_b)):
+            setattr(data, name, m.array("loads", np.moveaxis(table, 0, 2), m.types.T))
+        data.weight = m.array("loads", t.weights, m.types.T)
+        k = pressure_kernels(m.dtype)
+        return FollowerPart(data, k.pressure, k.pressure_product, len(t.conn))
+
+    def _build_moment(self, moment: Moment) -> FollowerPart:
+        m = self.model
+        data = self._follower(moment.slots + moment.body.slot_offset, moment.law)
+        data.gradient = m.array("loads", np.swapaxes(moment.vectors, 0, 1), m.types.vec3)
+        data.axes = m.array("loads", moment.axes, m.types.mat33)
+        data.share = m.array("loads", np.full(len(moment.slots), 1.0 / len(moment.slots)), m.types.T)
+        k = moment_kernels(m.dtype, moment.body.family.spin_vectors)
+        return FollowerPart(data, k.moment, k.moment_product, len(moment.slots))
 
     def _build_field(self, force: BodyForce) -> list[FieldPart]:
         m = self.model
@@ -204,7 +218,7 @@ class Loads:
             for part in block.parts:
                 members = np.arange(first, first + len(part.elements))
                 first += len(part.elements)
-                if part.body not in force.bodies:
+                if part.body not in force.bodies or block.key.part:  # one part of an element's energy stands for it
                     continue
                 rule = self._field_tables(block)
                 take = _argument_precision(force.function, m.dtype)
@@ -229,8 +243,7 @@ class Loads:
         if getattr(block, "field_rule", None) is None:
             weights, shapes = [], []
             for part in block.parts:
-                for first in range(0, len(part.elements), assembly.CHUNK):
-                    elems = part.elements[first : first + assembly.CHUNK]
+                for elems in assembly.chunks(part.body, part.elements, len(rule.weights)):
                     s, _, _, det = assembly.geometry(part.body, elems, rule.points)
                     rho = assembly.density_at(part.body, elems, s, part.body.connectivity[elems])
                     weights.append(rho * det * rule.weights)
@@ -280,7 +293,7 @@ class Loads:
 
     def gather_kernels(self) -> Any:
         """The gather kernels that fit the loads there are."""
-        return gather_kernels(self.model.dtype, self.nonpotential, bool(self.pressures))
+        return gather_kernels(self.model.dtype, self.nonpotential, bool(self.followers))
 
     def used_kernels(self) -> list[Any]:
         """The kernels that a step launches for the loads there are."""
@@ -288,7 +301,7 @@ class Loads:
         out = [part.kernel for part in self.fields] + [kernel for kernel, _ in self.function_laws]
         out += [k.evaluate_laws] * bool(self.law_count) + [k.dead_load] * self.has_dead
         out += [k.drive_displacement] * bool(self.moved) + [k.drive_rotation] * bool(self.turned)
-        out += [k.follower_pressure] * bool(self.pressures)
+        out += [kernel for part in self.followers for kernel in (part.force, part.product)]
         out += [k.add_explicit] * any(b.key.damping == "explicit" for b in self.model.blocks)
         return out
 

@@ -16,8 +16,9 @@ from .errors import ModelError
 from .evaluation import Evaluation
 from .kernels.element import block_struct, element_kernels
 from .kernels.gather import topology_struct
-from .kernels.materials import NCOEF
+from .kernels.materials import ANY_J, NCOEF
 from .kernels.pcg import groups_struct
+from .kernels.tied import tied_kernels, tied_struct
 from .kernels.types import precision
 from .loads import Loads
 from .state import State
@@ -45,7 +46,9 @@ class Block:
     def kernels_for(self, dtype: str, damping: str | None) -> Any:
         """The kernels of this kind of element with another form of damping."""
         k = self.key
-        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping)
+        if k.tying:
+            return self.kernels
+        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
 
 
 class Model:
@@ -102,7 +105,8 @@ class Model:
         offset = 0
         for body in self.bodies:
             for rule in {body.rule, body.curved_rule}:
-                assembly.check_orientation(body, body.family.rules[rule])
+                for part in body.family.scheme(rule):
+                    assembly.check_orientation(body, part.rule)
             body.slot_offset = offset
             offset += body.slot_count
         self.slots = offset
@@ -112,7 +116,7 @@ class Model:
         T, vec3 = self.types.T, self.types.vec3
         self.is_position = self.array("slots", self.is_position_host, T)
         self.reference_device = None
-        if self.description.pressures or self.description.body_forces:
+        if self.description.body_forces:
             self.reference_device = self.array("reference", self.reference, vec3)
         self.free_host = np.ones((self.slots, 3))
         self.clamped_host = np.zeros((self.slots, 3), dtype=bool)
@@ -132,20 +136,20 @@ class Model:
 
     def _build_blocks(self, tables: bool) -> None:
         groups: dict[assembly.BlockKey, list[assembly.HostBlock]] = {}
-        materials: list[tuple[Body, str, Any]] = []
-        self._material_offset: dict[int, int] = {}
+        rows: list[np.ndarray] = []
+        self._row: dict[int, int] = {}
+        self.materials = [(body, group, material) for body in self.bodies for group, material in body.materials]
         for body in self.bodies:
-            self._material_offset[body.index] = len(materials)
-            materials += [(body, group, material) for group, material in body.materials]
             for host in assembly.host_blocks(body, tables=tables):
                 groups.setdefault(host.key, []).append(host)
-        rows = np.zeros((1, len(materials), NCOEF))
-        for k, (_, _, material) in enumerate(materials):
-            rows[0, k, :3] = material.coefficients()
-            if material.damping:
-                rows[0, k, 3:] = material.damping.eta, material.damping.lambda_v
-        self.materials = materials
-        self.coefficients = self.array("materials", rows, self.types.T)
+                row = np.zeros(NCOEF)
+                row[: len(host.coefficients)] = host.coefficients
+                damping = body.materials[host.material][1].damping
+                if damping:
+                    row[-2:] = damping.eta, damping.lambda_v
+                self._row[id(host)] = len(rows)
+                rows.append(row)
+        self.coefficients = self.array("materials", np.array(rows)[None], self.types.T)
         self.blocks: list[Block] = []
         contribution, element, history = 0, 0, 0
         for key, parts in groups.items():
@@ -160,25 +164,46 @@ class Model:
     def _build_block(
         self, key: assembly.BlockKey, parts: list[assembly.HostBlock], contribution: int, element: int, history: int
     ) -> Block:
-        T, vec3, mat33 = self.types.T, self.types.vec3, self.types.mat33
         family = elements.get(key.family)
-        rule = family.rules[key.rule]
-        S, Q = family.slots, len(rule.weights)
-        data = block_struct(self.dtype)()
         conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
+        data = (tied_struct if key.tying else block_struct)(self.dtype)()
         data.conn = self.array("elements", conn.T, wp.int32)
-        data.is_position = self.array("elements", (family.slot_kind == 0).astype(float), T)
-        data.material = self.array(
-            "elements",
-            np.concatenate([p.body.material_of[p.elements] + self._material_offset[p.body.index] for p in parts]),
-            wp.int32,
-        )
+        data.is_position = self.array("elements", (family.slot_kind == 0).astype(float), self.types.T)
+        rows = [np.full(len(p.elements), self._row[id(p)]) for p in parts]
+        data.material = self.array("elements", np.concatenate(rows), wp.int32)
         data.coefficients = self.coefficients
+        data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
+        data.count = len(conn)
+        if key.tying:
+            self._tied_tables(data, key, parts)
+            points = len(key.tying.points)
+            kernels = tied_kernels(self.dtype, family.slots, points)
+        else:
+            self._point_tables(data, key, parts)
+            points = len(key.rule.weights)
+            kernels = element_kernels(self.dtype, key.law, family.slots, points, key.affine, key.damping, key.framed)
+        return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element)
+
+    def _tied_tables(self, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
+        T, vec3 = self.types.T, self.types.vec3
+        tables = [
+            assembly.tied_tables(part.body, members, key.integral)
+            for part in parts
+            for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
+        ]
+        for name, dtype in (("along", T), ("through", T), ("X_along", vec3), ("X_through", vec3), ("coupling", T)):
+            table = np.concatenate([getattr(t, name) for t in tables])
+            axis = 1 if dtype is vec3 else 2
+            setattr(data, name, self.array("elements", np.moveaxis(table, 0, axis), dtype))
+
+    def _point_tables(self, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
+        T, vec3, mat33 = self.types.T, self.types.vec3, self.types.mat33
+        family, rule = elements.get(key.family), key.rule
+        Q = len(rule.weights)
         points = np.vstack([rule.points, family.vertices])
-        h, w, J0 = [], [], []
+        h, w, J0, axes = [], [], [], []
         for part in parts:
-            for first in range(0, len(part.elements), assembly.CHUNK):
-                members = part.elements[first : first + assembly.CHUNK]
+            for members in assembly.chunks(part.body, part.elements, len(points)):
                 if key.affine:
                     _, _, J, det = assembly.geometry(part.body, members, family.vertices[:1])
                     J0.append(np.linalg.inv(J[:, 0]))
@@ -187,8 +212,10 @@ class Model:
                     _, ds, J, det = assembly.geometry(part.body, members, points)
                     h.append(assembly.gradients(ds, J))
                     w.append(det[:, :Q] * rule.weights)
+                    if key.framed:
+                        axes.append(assembly.orthonormal(J[:, :Q]))
         if key.affine:
-            _, ds = family.shape(points, np.zeros((1, 10, 3)))
+            _, ds = family.shape(points, np.zeros((1, len(family.node_slots), 3)))
             table = ds[0][:, :, None, :]
             data.J0_inv = self.array("elements", np.concatenate(J0), mat33)
             data.det_J0 = self.array("elements", np.concatenate(w), T)
@@ -197,12 +224,10 @@ class Model:
             table = np.moveaxis(np.concatenate(h), 0, 2)
             data.weight = self.array("elements", np.concatenate(w).T, T)
         data.gradient = self.array("elements", table[:Q], vec3)
-        if key.law != "svk":
+        if key.law not in ANY_J:
             data.vertex_gradient = self.array("elements", table[Q:], vec3)
-        data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
-        data.count = len(conn)
-        kernels = element_kernels(self.dtype, key.law, S, Q, key.affine, key.damping)
-        return Block(key, data, kernels, parts, len(conn), Q, S, contribution, element)
+        if key.framed:
+            data.frame = self.array("elements", np.moveaxis(np.concatenate(axes), 0, 1), mat33)
 
     def _build_topology(self) -> None:
         T, vec3 = self.types.T, self.types.vec3
@@ -217,10 +242,14 @@ class Model:
         topo.free = self.array("slots", self.free_host, vec3)
         self.topology = topo
 
+    def graph(self) -> sp.csr_matrix:
+        """Which slots share an element."""
+        return assembly.slot_graph([p.conn + p.body.slot_offset for b in self.blocks for p in b.parts], self.slots)
+
     def _build_groups(self) -> None:
         """Bodies, or separate parts of one, that no support holds in some direction (DESIGN 5)."""
         T, vec3 = self.types.T, self.types.vec3
-        label = assembly.components_of(self._mass)
+        label = assembly.components_of(self.graph())
         count = int(label.max()) + 1
         free = np.ones((count, 3))
         for c in range(3):
@@ -280,7 +309,7 @@ class Model:
     @property
     def needs_positive_J(self) -> bool:
         """Whether a law of the model is defined for J > 0 only."""
-        return any(b.key.law != "svk" for b in self.blocks)
+        return any(b.key.law not in ANY_J for b in self.blocks)
 
     @property
     def features(self) -> dict[str, bool]:
@@ -297,6 +326,7 @@ class Model:
             "dead loads": bool(d.dead_loads),
             "body forces": bool(d.body_forces),
             "follower pressure": bool(d.pressures),
+            "moments": bool(d.moments),
             "driven nodes": any(s.law or s.node_laws for s in d.supports),
             "free groups": self.group_count > 0,
             "separate components": self.component_count > 1,
@@ -316,7 +346,7 @@ class Model:
                 {
                     "name": b.name,
                     "element": b.family.name,
-                    "quadrature": sorted({k.key.rule for k in self.blocks if any(p.body is b for p in k.parts)}),
+                    "quadrature": sorted({k.key.scheme for k in self.blocks if any(p.body is b for p in k.parts)}),
                     "elements": len(b.mesh.cells),
                     "nodes": len(b.mesh.used_nodes),
                     "materials": [type(m).__name__ + (f" ({g})" if g else "") for g, m in b.materials],
@@ -328,13 +358,20 @@ class Model:
             "device": str(self.device),
             "slots": self.slots,
             "unknowns": int(self.free_slots.sum()),
-            "elements": self.element_count,
+            "elements": sum(len(body.mesh.cells) for body in self.bodies),
             "mass": float(self.lumped_host[self.slot_kind == 0].sum()),
             "features": [k for k, on in features.items() if on],
             "left_out": [k for k, on in features.items() if not on]
             + ["constraints", "contact", "friction", "per-world parameters"],
             "blocks": [
-                {"law": b.key.law, "elements": b.count, "points": b.points, "affine": b.key.affine} for b in self.blocks
+                {
+                    "element": b.key.family,
+                    "law": b.key.law,
+                    "elements": b.count,
+                    "points": b.points,
+                    "affine": b.key.affine,
+                }
+                for b in self.blocks
             ],
             "bytes": self.bytes | {"total": sum(self._memory.values())},
             "kernels": sorted({b.kernels.module.name.removeprefix("warpfea.kernels.") for b in self.blocks}),
@@ -349,7 +386,7 @@ class Model:
         for body in self.bodies:
             rows = body.slots
             if body.initial_displacement is not None:
-                u[rows] = np.where((body.slot_kind == 0)[:, None], body.initial_displacement[body.slot_node], 0.0)
+                u[rows] = body.initial_displacement
             if body.velocity is not None:
                 v[rows] = body.velocity
         v[self.clamped_host] = 0.0  # driven components keep what the user says

@@ -22,6 +22,7 @@ from .kernels.step import LEDGER, REPORT, STATUS
 from .solvers import NewtonPCG
 from .state import State
 from .stepper import Stepper
+from .surfaces import reference_points
 
 if TYPE_CHECKING:
     from .model import Model
@@ -368,24 +369,55 @@ class Simulation:
         """(B, nodes, 3) m/s."""
         return self._rows(body, self.state.velocity.numpy())
 
+    def placed(self, body: Body, weights: Any) -> np.ndarray:
+        """(B, P, 3) m: present places of material points given by sparse weights (P, slots of the body)."""
+        u = self.state.displacement.numpy()[:, body.slots].astype(float)
+        return reference_points(body, weights) + np.stack([weights @ row for row in u])
+
     def skin_points(self, body: Body) -> np.ndarray:
         """(B, skin points, 3) m: the drawn surface."""
-        u = self.state.displacement.numpy()[:, body.slots].astype(float)
-        W = body.skin.slot_weights
-        X = W @ body.reference + np.asarray(W @ (body.slot_kind == 0))[:, None] * body.origin
-        return X + np.stack([W @ row for row in u])
+        return self.placed(body, body.skin.slot_weights)
 
     def skin_field(self, name: str, body: Body) -> np.ndarray:
         """(B, skin points) scalars of a field at the drawn surface."""
-        return np.stack([body.skin.node_weights @ row for row in self.field(name, body)])
+        return self.field_on(name, body, body.skin)
+
+    def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
+        """(B, P) scalars of a field at the points of a Skin or Drawing of the body."""
+        if name == "displacement":
+            moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
+            return np.linalg.norm(moved, axis=2)
+        return np.stack([drawn.node_weights @ row for row in self._samples(name, body)])
 
     def field(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress) or "displacement" (m, magnitude)."""
+        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress) or "displacement" (m, magnitude).
+
+        The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
+        """
         if name == "displacement":
             return np.linalg.norm(self.displacements(body), axis=2)
-        if name == "von_mises":
-            return von_mises(self.model.evaluation.nodal_stress(self.state, body))
-        raise ModelError(f"field {name!r} is unknown; there are von_mises, displacement")
+        samples = self._samples(name, body)
+        return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
+
+    def _samples(self, name: str, body: Body) -> np.ndarray:
+        """(B, nodes x samples) of a field that is taken at the nodes' samples."""
+        if name != "von_mises":
+            raise ModelError(f"field {name!r} is unknown; there are von_mises, displacement")
+        return von_mises(self.model.evaluation.sample_stress(self.state, body))
+
+    def node_gradients(self, body: Body) -> np.ndarray:
+        """(B, nodes, 3, 3) deformation gradient F at the nodes of a body with gradient slots; NaN at others.
+
+        Of a beam or shell, F turns the node's axes (body.node_axes) into the present ones.
+        """
+        if not body.family.has_gradients:
+            raise ModelError(f"body {body.name!r}: element {body.family.name} has no gradients at its nodes")
+        out = np.full((self.model.worlds, len(body.mesh.points), 3, 3), np.nan)
+        u = self.state.displacement.numpy()[:, body.slots].astype(float)
+        nodes = np.flatnonzero(body.node_slot_count == 4)
+        rows = body.node_slot[nodes][:, None] + np.arange(1, 4)
+        out[:, nodes] = np.eye(3) + np.einsum("bnkc,nkd->bncd", u[:, rows], body.reference[rows])
+        return out
 
     def probe(self, name: str) -> ProbeRecord:
         """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from warpfea.errors import OutputError
 from warpfea.outputs import FrameClock, Output, check_folder, time_of, write_whole
+from warpfea.surfaces import reference_points
 
 __all__ = ["VTUWriter"]
 
@@ -101,15 +102,11 @@ class VTUWriter(Output):
         for body, name in zip(sim.model.bodies, self._names, strict=True):
             if getattr(body, "mesh", None) is None:
                 continue
-            positions = np.asarray(sim.positions(body), dtype=np.float64)
-            data = {"displacement": np.asarray(sim.displacements(body), dtype=np.float64)}
-            if hasattr(sim, "velocities"):
-                data["velocity"] = np.asarray(sim.velocities(body), dtype=np.float64)
-            data |= {field: np.asarray(sim.field(field, body), dtype=np.float64) for field in self.fields}
+            points, data, cells = _frame_data(sim, body, self.fields)
             for world in range(int(sim.model.worlds)):
                 file = f"{name}_{world:04d}_{frame:06d}.vtu"
                 of_world = {key: np.ascontiguousarray(value[world]) for key, value in data.items()}
-                write_whole(self.folder / file, functools.partial(_write_vtu, body, positions[world], of_world))
+                write_whole(self.folder / file, functools.partial(_write_vtu, cells, points[world], of_world))
                 files.append(file)
         if frame + 1 >= self._listed + max(1, self._listed // 10):
             self._write_series()
@@ -148,20 +145,48 @@ class VTUWriter(Output):
         self._open = False
 
 
-def _write_vtu(body: Any, points: np.ndarray, data: dict[str, np.ndarray], path: pathlib.Path) -> None:
+Cells = tuple[str, np.ndarray, dict[str, np.ndarray]]
+
+
+def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray, dict[str, np.ndarray], Cells]:
+    """Points and point data (worlds first) of a body, and its cells with their groups.
+
+    T4 and T10 are written as their mesh; the other elements as the cells that draw them, with section and thickness.
+    """
+    mesh = body.mesh
+    family = getattr(body, "family", None)
+    if family is None or not family.has_gradients:
+        points = np.asarray(sim.positions(body), dtype=np.float64)
+        data = {"displacement": np.asarray(sim.displacements(body), dtype=np.float64)}
+        if hasattr(sim, "velocities"):
+            data["velocity"] = np.asarray(sim.velocities(body), dtype=np.float64)
+        data |= {field: np.asarray(sim.field(field, body), dtype=np.float64) for field in fields}
+        return points, data, (mesh.cell_type, mesh.cells, _groups(mesh, np.arange(len(mesh.cells))))
+    drawn = body.drawing
+    points = sim.placed(body, drawn.slot_weights)
+    v = sim.state.velocity.numpy()[:, body.slots].astype(float)
+    data = {
+        "displacement": points - reference_points(body, drawn.slot_weights),
+        "velocity": np.stack([drawn.slot_weights @ row for row in v]),
+    }
+    data |= {field: sim.field_on(field, body, drawn) for field in fields}
+    return points, data, (drawn.cell_type, drawn.cells, _groups(mesh, drawn.element))
+
+
+def _groups(mesh: Any, element: np.ndarray) -> dict[str, np.ndarray]:
+    """0/1 flags of the cells of each element group; `element`: the element of each cell."""
+    sets = getattr(mesh, "element_sets", None) or {}
+    return {f"set:{name}": np.isin(element, np.asarray(members)).astype(np.int32) for name, members in sets.items()}
+
+
+def _write_vtu(cells: Cells, points: np.ndarray, data: dict[str, np.ndarray], path: pathlib.Path) -> None:
     """One VTU file. meshio changes what it is given, so everything passed is a copy."""
     import meshio
 
-    cells = np.array(body.mesh.cells)
-    groups = {}
-    for group, members in (getattr(body.mesh, "element_sets", None) or {}).items():
-        flags = np.zeros(len(cells), dtype=np.int32)
-        flags[np.asarray(members)] = 1
-        groups[f"set:{group}"] = [flags]
     mesh = meshio.Mesh(
         np.array(points),
-        [(body.mesh.cell_type, cells)],
+        [(cells[0], np.array(cells[1]))],
         point_data={name: np.array(value) for name, value in data.items()},
-        cell_data=groups,
+        cell_data={name: [np.array(flags)] for name, flags in cells[2].items()},
     )
     mesh.write(path, file_format="vtu")

@@ -52,9 +52,9 @@ class Workspace:
         self.pushed_contribution = (
             self.array("pushed_contribution", (B, loads.pushed_entries), vec3) if pushed else none
         )
-        pressed = bool(loads.pressures)
+        turning = bool(loads.followers)
         self.pushed_tangent = (
-            self.array("pushed_tangent", (B, loads.pushed_entries), vec3) if pressed else self.pushed_contribution
+            self.array("pushed_tangent", (B, loads.pushed_entries), vec3) if turning else self.pushed_contribution
         )
         forms = {b.key.damping for b in model.blocks}
         self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
@@ -94,7 +94,7 @@ class Workspace:
     def _struct(self, kind: Any, worlds: int, **shapes: tuple[int, ...]) -> Any:
         """A control struct with an array [world] for each array field, unless a shape is given."""
         out = kind()
-        special = {"elem_sums": (2, worlds), "slope_sum": (1, worlds), "any_active": (1,), "any_running": (1,)} | shapes
+        special = {"elem_sums": (2, worlds), "slope_sum": (1, worlds), "push_sum": (1, worlds), "any_active": (1,), "any_running": (1,)} | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array):
                 setattr(out, name, self.array(f"{kind.key}.{name}", special.get(name, (worlds,)), var.type.dtype))

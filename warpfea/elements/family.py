@@ -1,16 +1,85 @@
-"""What an element family is: slots per node, shape functions, rules. Nothing else in the code knows families."""
+"""What an element family is: slots per node, shape functions, rules, faces. Nothing else in the code knows families."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from ..errors import ModelError
 from .quadrature import Rule
 
-__all__ = ["Family", "families", "get", "register"]
+__all__ = ["Family", "Lattice", "Parent", "Part", "Tying", "families", "for_cell", "get", "register"]
+
+
+@dataclass(frozen=True, eq=False)
+class Tying:
+    """Assumed natural transverse shear: 2 E_(k zeta), k = xi or eta, at tying points, and how it is interpolated.
+
+    Attributes:
+        points: (n, 3) parent coordinates.
+        direction: (n,) 0 for xi, 1 for eta.
+        interpolation: function xi (Q, 3) -> (Q, n): weights of the tying points in the shear of their direction.
+    """
+
+    points: np.ndarray
+    direction: np.ndarray
+    interpolation: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One integral of an element's strain energy; most elements have one, a remedy against locking splits it.
+
+    Attributes:
+        name: for reports.
+        rule: quadrature.
+        law: function Material -> (device law, coefficients), or None for the material's own.
+        framed: the law has axes along the element (first parent line, then the rest made orthonormal).
+        tying: the energy is of an assumed transverse shear (law: its coefficient mu); None: of the strain at the points.
+    """
+
+    name: str
+    rule: Rule
+    law: Callable[[Any], tuple[str, tuple[float, ...]]] | None = None
+    framed: bool = False
+    tying: Tying | None = None
+
+
+@dataclass(frozen=True)
+class Parent:
+    """The parent domain: the unit tetrahedron, or a box.
+
+    Attributes:
+        low, high: corners of the box; None for the tetrahedron.
+    """
+
+    low: tuple[float, float, float] | None = None
+    high: tuple[float, float, float] | None = None
+
+    @property
+    def center(self) -> np.ndarray:
+        """(3,)."""
+        return np.full(3, 0.25) if self.low is None else 0.5 * (np.array(self.low) + np.array(self.high))
+
+    def outside(self, xi: np.ndarray) -> np.ndarray:
+        """How far points (..., 3) lie outside, in parent units; 0 inside."""
+        if self.low is None:
+            least = np.minimum(xi.min(axis=-1), 1.0 - xi.sum(axis=-1))
+            return np.maximum(-least, 0.0)
+        return np.maximum(np.maximum(np.array(self.low) - xi, xi - np.array(self.high)).max(axis=-1), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """How one element is drawn as cells of VTK: parent points (P, 3), a meshio cell type, cells (C, n)."""
+
+    points: np.ndarray
+    cell_type: str
+    cells: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,29 +89,54 @@ class Family:
     Attributes:
         name: how users select it, e.g. "T10".
         cell_type: mesh cell it is built on, e.g. "tetra10".
-        node_slots: slot kinds of each element node; kind 0 is a position, 1..3 a gradient d/dX_k.
-        shape: function (xi (Q, d), nodes (E, n, 3)) -> (s (E or 1, Q, S), ds (E or 1, Q, S, 3)), with ds = ds/dxi. A
-            family whose functions do not depend on the element's shape returns one row.
+        node_slots: slot kinds of each element node; kind 0 is a position, 1..3 a gradient along the node's axes.
+        shape: function (xi (Q, 3), nodes (E, n, 3)[, frames (E, n, 3, 3)]) -> (s (E or 1, Q, S),
+            ds (E or 1, Q, S, 3)), ds = ds/dxi. A family whose functions do not depend on the element's shape returns
+            one row.
         rules: force quadrature rules by name; the first is the default.
         curved_rule: default force rule of curved elements; the patch test on a curved T10 needs degree 3.
         mass_rule: rule that integrates s_i s_j rho det J0 exactly on straight elements.
         curved_mass_rule: the same on curved ones.
-        vertices: (V, 3) parent coordinates of the vertices, where J is tested beside the points.
+        vertices: (4, 3) parent coordinates of the vertices where J is tested beside the points.
         affine: whether an element with straight sides has one J0.
-        node_points: (n, 3) parent coordinates of the element nodes.
+        parent: the parent domain.
+        faces: parent corners of each face, (3, 3) triangles or (4, 3) quadrilaterals, outward; mesh cells of solids
+            count their faces in the same order.
+        face_rule: rule on the unit triangle or square, exact for a pressure on a plane face.
+        divisions: parts (a, b) that each face is drawn with along its two sides; triangles take the first.
+        node_samples: (n, k, 3) parent points at each element node where fields are taken for drawing.
+        lattice: how an element is drawn.
+        schemes: integrations of several parts by name, beside the rules.
+        slot_sets: names of slot kinds that supports may hold.
+        spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis or
+            a shell's surface can kink at a point for next to nothing, and must not carry it.
+        solid: the mesh cell is the body itself; beams and shells have a section or thickness beside it.
     """
 
     name: str
     cell_type: str
     node_slots: tuple[tuple[int, ...], ...]
-    shape: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    shape: Callable[..., tuple[np.ndarray, np.ndarray]]
     rules: dict[str, Rule]
     curved_rule: Rule
     mass_rule: Rule
     curved_mass_rule: Rule
     vertices: np.ndarray
     affine: bool
-    node_points: np.ndarray
+    parent: Parent
+    faces: tuple[np.ndarray, ...]
+    face_rule: Rule
+    divisions: tuple[tuple[int, int], ...]
+    node_samples: np.ndarray
+    lattice: Lattice
+    schemes: dict[str, tuple[Part, ...]] = field(default_factory=dict)
+    slot_sets: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    spin_vectors: int = 3
+    solid: bool = True
+
+    def scheme(self, name: str) -> tuple[Part, ...]:
+        """The parts of an integration."""
+        return self.schemes[name] if name in self.schemes else (Part(name, self.rules[name]),)
 
     @property
     def slots(self) -> int:
@@ -58,6 +152,59 @@ class Family:
     def slot_kind(self) -> np.ndarray:
         """(S,) kind of each slot."""
         return np.array([k for kinds in self.node_slots for k in kinds])
+
+    @property
+    def has_gradients(self) -> bool:
+        """Whether nodes carry gradient slots."""
+        return any(k > 0 for kinds in self.node_slots for k in kinds)
+
+    def kinds(self, names: str) -> set[int]:
+        """Slot kinds of names joined by "+", e.g. "position+axis". Raises ModelError listing the names."""
+        known = {"position": (0,), **self.slot_sets, "all": (0, 1, 2, 3)}
+        out: set[int] = set()
+        for name in str(names).split("+"):
+            if name not in known:
+                raise ModelError(
+                    f"slots = {names!r}: element {self.name} knows {', '.join(map(repr, known))}, and several of them "
+                    "joined by '+'"
+                )
+            out |= set(known[name])
+        return out
+
+    def face_points(self, face: int, ab: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Parent points (Q, 3) of a face at (a, b) of the unit triangle or square (Q, 2), and dxi/d(a, b) (Q, 3, 2)."""
+        c = self.faces[face]
+        a, b = ab.T
+        if len(c) == 3:
+            xi = c[0] + a[:, None] * (c[1] - c[0]) + b[:, None] * (c[2] - c[0])
+            return xi, np.broadcast_to(np.stack([c[1] - c[0], c[2] - c[0]], axis=1), (len(ab), 3, 2))
+        N = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
+        da = np.stack([b - 1, 1 - b, b, -b], axis=1)
+        db = np.stack([a - 1, -a, a, 1 - a], axis=1)
+        return N @ c, np.stack([da @ c, db @ c], axis=2)
+
+    @property
+    def node_points(self) -> np.ndarray:
+        """(n, 3) parent coordinates of the element nodes."""
+        return self.node_samples.mean(axis=1)
+
+    def sample_weights(self, xi: np.ndarray) -> np.ndarray:
+        """(Q, n k) interpolation of fields from the nodes' samples: linear between corners, exact at a sample."""
+        samples = self.node_samples.reshape(-1, 3)
+        out = np.zeros((len(xi), len(samples)))
+        if self.parent.low is None:
+            out[:, :4] = np.column_stack([1.0 - xi.sum(axis=1), xi])
+        else:
+            low, high = np.array(self.parent.low), np.array(self.parent.high)
+            t = (xi - low) / (high - low)
+            for corner in itertools.product((0.0, 1.0), repeat=3):
+                at = int(np.argmin(np.abs(samples - (low + np.array(corner) * (high - low))).sum(axis=1)))
+                out[:, at] = np.prod(np.where(corner, t, 1.0 - t), axis=1)
+        distance = np.abs(xi[:, None, :] - samples).max(axis=2)
+        for row in np.flatnonzero(distance.min(axis=1) < 1e-12):
+            out[row] = 0.0
+            out[row, int(np.argmin(distance[row]))] = 1.0
+        return out
 
     def rule(self, name: str | None) -> Rule:
         """Force rule by name (None: the default). Raises ModelError listing the names."""
@@ -85,17 +232,15 @@ def families() -> Sequence[str]:
 
 
 def get(name: str) -> Family:
-    """The family `name`. Raises ModelError listing the names, or NotImplementedError for a planned one."""
+    """The family `name`. Raises ModelError listing the names."""
     if name in _families:
         return _families[name]
-    if name in ("ENMC", "FN", "FN18", "H3843", "3243", "3443"):
-        raise NotImplementedError(f"element {name!r}: ANCF elements are not part of this version")
     raise ModelError(f"element {name!r} is unknown; there are {', '.join(_families)}")
 
 
 def for_cell(cell_type: str) -> Family:
-    """The first family that is built on a cell type."""
-    for family in _families.values():
-        if family.cell_type == cell_type:
-            return family
-    raise ModelError(f"no element family for mesh cells of type {cell_type!r}")
+    """The solid family that a cell type gives by default: the one with the fewest slots."""
+    fits = [f for f in _families.values() if f.cell_type == cell_type and f.solid]
+    if fits:
+        return min(fits, key=lambda f: f.slots)
+    raise ModelError(f"no solid element for mesh cells of type {cell_type!r}")

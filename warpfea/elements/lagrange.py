@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from ..mesh.cells import TET_EDGES, barycentric, tet4_gradients, tet10_gradients
-from .family import Family, register
-from .quadrature import TET_RULES, conical_tet
+from .family import Family, Lattice, Parent, register
+from .quadrature import TET_RULES, conical_tet, triangle_6
 
-__all__ = ["T4", "T10"]
+__all__ = ["CORNERS", "FACES", "T4", "T10"]
 
-_CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+MIDDLES = np.array([(CORNERS[a] + CORNERS[b]) / 2 for a, b in TET_EDGES])
+FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+"""Corners of each face, outward, in the order of the mesh's local faces."""
+TET_SIDES = tuple(CORNERS[list(face)] for face in FACES)
+QUADRATIC = Lattice(np.vstack([CORNERS, MIDDLES]), "tetra10", np.arange(10)[None])
 
 
 def _shape4(xi: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -33,9 +38,14 @@ T10 = register(
         curved_rule=TET_RULES["tet8"],
         mass_rule=TET_RULES["tet14"],
         curved_mass_rule=conical_tet(4),
-        vertices=_CORNERS,
+        vertices=CORNERS,
         affine=True,
-        node_points=np.vstack([_CORNERS, [(_CORNERS[a] + _CORNERS[b]) / 2 for a, b in TET_EDGES]]),
+        parent=Parent(),
+        faces=TET_SIDES,
+        face_rule=triangle_6(),
+        divisions=((2, 2),) * 4,
+        node_samples=QUADRATIC.points[:, None],
+        lattice=QUADRATIC,
     )
 )
 
@@ -49,8 +59,13 @@ T4 = register(
         curved_rule=TET_RULES["tet1"],
         mass_rule=TET_RULES["tet4"],
         curved_mass_rule=conical_tet(3),
-        vertices=_CORNERS,
+        vertices=CORNERS,
         affine=True,
-        node_points=_CORNERS,
+        parent=Parent(),
+        faces=TET_SIDES,
+        face_rule=triangle_6(),
+        divisions=((1, 1),) * 4,
+        node_samples=CORNERS[:, None],
+        lattice=Lattice(CORNERS, "tetra", np.arange(4)[None]),
     )
 )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import roots_jacobi
 
-__all__ = ["TET_RULES", "Rule", "conical_tet", "conical_triangle", "tet_rule", "triangle_6"]
+__all__ = ["TET_RULES", "Rule", "box_rule", "conical_tet", "conical_triangle", "square_rule", "tet_rule", "triangle_6"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +20,14 @@ class Rule:
         points: (Q, 3) or (Q, 2) parent coordinates.
         weights: (Q,), with sum equal to the parent's volume or area.
         degree: total degree of the polynomials integrated exactly.
+        counts: points along each direction of a product rule on a box (all points in "ij" order), else empty.
     """
 
     name: str
     points: np.ndarray
     weights: np.ndarray
     degree: int
+    counts: tuple[int, ...] = ()
 
 
 def _barycentric(name: str, degree: int, orbits: list[tuple[float, np.ndarray]]) -> Rule:
@@ -118,3 +120,31 @@ def triangle_6() -> Rule:
             rows.append((*p, w / 2.0))
     table = np.array(rows)
     return Rule("triangle6", table[:, :2], table[:, 2], 4)
+
+
+Ranges = tuple[tuple[float, float], ...]
+
+
+def _product(name: str, counts: tuple[int, ...], ranges: Ranges) -> Rule:
+    points, weights = [], []
+    for n, (low, high) in zip(counts, ranges):
+        x, w = np.polynomial.legendre.leggauss(n)
+        points.append(0.5 * (high - low) * x + 0.5 * (high + low))
+        weights.append(0.5 * (high - low) * w)
+    grid = np.stack(np.meshgrid(*points, indexing="ij"), axis=-1).reshape(-1, len(counts))
+    product = weights[0]
+    for w in weights[1:]:
+        product = np.multiply.outer(product, w)
+    return Rule(name, grid, product.ravel(), 2 * min(counts) - 1, counts)
+
+
+@functools.cache
+def box_rule(counts: tuple[int, int, int], ranges: Ranges) -> Rule:
+    """Product Gauss rule on a box, named e.g. "3x2x2"; one point is the mid-point, with the length as its weight."""
+    return _product("x".join(map(str, counts)), counts, ranges)
+
+
+@functools.cache
+def square_rule(n: int) -> Rule:
+    """Product Gauss rule of n^2 points on the unit square."""
+    return _product(f"square{n}", (n, n), ((0.0, 1.0), (0.0, 1.0)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import MeshError
 from .assemble import RawMesh
-from .cells import Ints
+from .cells import CELL_TYPES, Ints, cell_dimension
 
 __all__ = ["read_inp"]
 
@@ -34,13 +34,14 @@ def read_inp(file: Path) -> RawMesh:
     """Read *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE of type ELEMENT.
 
     Messages name ids as the file has them. Any number of *NODE and *ELEMENT blocks is fine; reference nodes
-    of the assembly are left out. Face labels S1 .. S4 are the local faces 0 .. 3.
+    of the assembly are left out. Face labels S1, S2, .. of solids and edge labels E1 .. E4 of shells are the
+    local faces 0, 1, ...
 
     Raises
     ------
     MeshError
         Several parts, instances with a translation, generated nodes or elements, unknown element types, ids
-        that are defined twice or not at all, bad numbers.
+        that are defined twice or not at all, unknown face labels, bad numbers.
     """
     blocks = list(_blocks(file.read_text(encoding="utf-8", errors="replace")))
     for keyword, _, _ in blocks:
@@ -96,15 +97,18 @@ def read_inp(file: Path) -> RawMesh:
         for k in np.unique(owner):
             raw.groups.append((name, int(k), where[owner == k] - starts[k]))
 
+    labels = _face_labels([kind for kind, _ in raw.blocks])
     for keyword, options, lines in blocks:
         if keyword != "SURFACE" or options.get("TYPE", "ELEMENT").upper() != "ELEMENT":
             continue
         rows_of: list[Ints] = []
         for line in lines:
             who, _, label = (part.strip() for part in line.partition(","))
-            if not re.fullmatch(r"[Ss][1-4]", label):
+            if label.upper() not in labels:
                 raise MeshError(
-                    f"*SURFACE, NAME={options.get('NAME')}: unknown face label {label!r}, known are S1 .. S4"
+                    f"*SURFACE, NAME={options.get('NAME')}: unknown face label {label!r}, known are "
+                    f"{labels[0]} .. {labels[-1]}"
+                    + (" (edges); name whole shells by *ELSET" if labels[0] == "E1" else "")
                 )
             known = members.get(who)
             wanted = np.concatenate(known) if known else np.array([_integer(who, "*SURFACE")])
@@ -188,6 +192,15 @@ def _cell_type(name: str, lines: int) -> tuple[str, int]:
     if beam:
         return ("line3", 3) if beam[1] == "2" else ("line", 2)
     raise MeshError(f"unknown element type {name!r} ({lines} lines)")
+
+
+def _face_labels(kinds: list[str]) -> list[str]:
+    """The labels that a *SURFACE may use: E1 .. E4 if there are no solids, else S1, S2, ... of their faces."""
+    solids = [kind for kind in kinds if cell_dimension(kind) == 3]
+    if not solids:
+        return ["E1", "E2", "E3", "E4"]
+    most = max(len(CELL_TYPES[kind].faces) if kind in CELL_TYPES else 6 for kind in solids)
+    return [f"S{k + 1}" for k in range(most)]
 
 
 def _set_lines(lines: list[str], options: dict[str, str], sets: dict[str, list[Ints]], where: str) -> Iterator[Ints]:

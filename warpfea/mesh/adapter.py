@@ -26,7 +26,7 @@ import numpy as np
 from ..errors import MeshError
 from . import abaqus
 from .assemble import RawMesh, assemble
-from .cells import CELL_TYPES, cell_dimension
+from .cells import FILE_CELLS, cell_dimension
 from .checks import check
 from .mesh import Mesh, transformation
 
@@ -34,30 +34,34 @@ __all__ = ["read"]
 
 
 def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None, cell_type: str | None = None) -> Mesh:
-    """Read and check a tetrahedral mesh.
+    """Read and check a mesh of tetrahedra, hexahedra or quads.
+
+    The cells of the highest dimension are the body. Next to solids, surface cells are boundary faces; a file with
+    no solids but quads only is a surface in space, for shells.
 
     Parameters
     ----------
     path : Gmsh .msh (2.2, 4.1; ASCII, binary), VTK .vtu or Abaqus .inp
     scale : metres per unit of the file
     transform : 4x4 matrix or (3x3, 3): X' = A (scale X) + t, in metres; no reflection
-    cell_type : "tetra" or "tetra10" to insist on one
+    cell_type : "tetra", "tetra10", "hexahedron" or "quad" to insist on one
 
     Sets
     ----
-    Gmsh: a physical group of dimension 3 becomes an element and a node set, of dimension 2 a surface and a
-    node set, lower ones a node set; unnamed groups are called "physical_<dim>_<tag>". Abaqus: *NSET, *ELSET,
-    and *SURFACE of type ELEMENT. VTU: an integer cell or point array with values 0 and 1 only is the set of
-    its ones under its own name; another one gives a set "<name>_<value>" per positive value
+    Gmsh: a physical group of the body's cells becomes an element and a node set, of faces of solids a surface
+    and a node set, lower ones (edges and points of a shell too) a node set; unnamed groups are called
+    "physical_<dim>_<tag>". Abaqus: *NSET, *ELSET, and *SURFACE of type ELEMENT, labels S1 .. S4 of tetrahedra,
+    S1 .. S6 of hexahedra, E1 .. E4 (edges) of shells. VTU: an integer cell or point array with values 0 and 1
+    only is the set of its ones under its own name; another one gives a set "<name>_<value>" per positive value
     ("physical_<dim>_<value>" for "gmsh:physical"); float arrays, vectors, and arrays with more than 256
-    values are left out. A boundary cell has to be the face of a tetrahedron; one between two tetrahedra
-    belongs to the one out of which the boundary cell's own normal points.
+    values are left out. A boundary cell has to be the face of a solid cell; one between two belongs to the one
+    out of which the boundary cell's own normal points.
 
     Raises
     ------
     MeshError
-        The file is missing or can't be read, holds cells other than tetrahedra (points, lines and surfaces
-        are boundary cells), or fails a check of :func:`warpfea.mesh.check`.
+        The file is missing or can't be read, holds solids of other types or of two types, or no solids and
+        surface cells other than quads, or fails a check of :func:`warpfea.mesh.check`.
 
     Warns
     -----
@@ -67,8 +71,8 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
     file = Path(path)
     label = str(file)
     matrix, shift = transformation(scale, transform, label)
-    if cell_type is not None and cell_type not in CELL_TYPES:
-        raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(CELL_TYPES)}")
+    if cell_type is not None and cell_type not in FILE_CELLS:
+        raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(FILE_CELLS)}")
     if not file.exists():
         raise MeshError(f"{label}: no such mesh file")
     readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}

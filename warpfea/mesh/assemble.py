@@ -8,11 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import MeshError
-from .cells import CELL_TYPES, Floats, Ints, cell_dimension, row_keys
+from .cells import FILE_CELLS, Floats, Ints, cell_dimension, row_keys
 from .checks import check_topology
 from .mesh import Mesh, check_range
 
 __all__ = ["RawMesh", "assemble"]
+
+_WORDS = {
+    "tetra": ("tetrahedron", "tetrahedra"),
+    "tetra10": ("tetrahedron", "tetrahedra"),
+    "hexahedron": ("hexahedron", "hexahedra"),
+    "quad": ("quad", "quads"),
+}
+_BOUNDARY = {"tetra": "triangle", "tetra10": "triangle", "hexahedron": "quad"}
+"""What the type of a boundary cell begins with."""
 
 
 @dataclass
@@ -38,28 +47,12 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     Raises
     ------
     MeshError
-        Cells that are not tetrahedra or of two types, boundary cells that are no face, and
-        :func:`check_topology`'s.
+        Solid cells of unknown or of two types, no solids and surface cells other than quads, boundary cells
+        that are no face, and :func:`check_topology`'s.
     """
     label = str(file)
-    counts: dict[str, int] = {}
-    for kind, cells in raw.blocks:
-        counts[kind] = counts.get(kind, 0) + len(cells)
-    counts = {kind: n for kind, n in counts.items() if n}
-    held = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "no cells"
-    for kind, n in counts.items():
-        if kind not in CELL_TYPES and cell_dimension(kind) == 3:
-            raise MeshError(f"{label}: unknown cell type {kind!r} ({n} cells); known are {', '.join(CELL_TYPES)}")
-    solid = [kind for kind in counts if kind in CELL_TYPES]
-    if len(solid) > 1:
-        raise MeshError(f"{label}: holds {held}; all tetrahedra must be of one type")
-    if not solid:
-        flat = any(cell_dimension(kind) == 2 for kind in counts)
-        raise MeshError(f"{label}: no tetrahedra, the file holds {held}" + (": is this a 2D mesh?" if flat else ""))
-    if cell_type is not None and solid[0] != cell_type:
-        raise MeshError(f"{label}: holds {held}, but cell_type={cell_type!r} was asked for")
-
-    where = [k for k, (kind, _) in enumerate(raw.blocks) if kind == solid[0]]
+    body = _body_type(raw, label, cell_type)
+    where = [k for k, (kind, _) in enumerate(raw.blocks) if kind == body]
     cells = np.concatenate([raw.blocks[k][1] for k in where])
     offsets = dict(zip(where, np.cumsum([0] + [len(raw.blocks[k][1]) for k in where])))
     number = np.arange(len(cells))
@@ -68,20 +61,20 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
         rank = np.empty(len(first), dtype=np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
         number, cells = rank[inverse], cells[np.sort(first)]
-    check_topology(raw.points, cells, solid[0], label)
-    mesh = Mesh(raw.points, cells, solid[0], name=file.stem, path=label)
+    check_topology(raw.points, cells, body, label)
+    mesh = Mesh(raw.points, cells, body, name=file.stem, path=label)
 
     element_sets: dict[str, list[Ints]] = {}
     surface_sets: dict[str, list[Ints]] = {}
     node_sets: dict[str, list[Ints]] = {}
-    triangles = _FaceFinder(mesh)
+    faces = _FaceFinder(mesh)
     for name, k, numbers in raw.groups:
         kind, block = raw.blocks[k]
         nodes = block[numbers]
         if k in offsets:
             element_sets.setdefault(name, []).append(number[offsets[k] + numbers])
         elif cell_dimension(kind) == 2:
-            table = triangles.find(kind, nodes, name)
+            table = faces.find(kind, nodes, name)
             surface_sets.setdefault(name, []).append(table)
             nodes = mesh.faces(table)
         else:
@@ -90,7 +83,7 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     for name, rows in raw.faces.items():
         table = np.array([(number[offsets[b] + e], f) for b, e, f in rows if b in offsets], dtype=np.int64)
         if len(table) != len(rows) or not len(rows):
-            raise MeshError(f"{label}: surface {name!r} holds faces of cells that are not tetrahedra")
+            raise MeshError(f"{label}: surface {name!r} holds faces of cells that are not {_WORDS[body][1]}")
         surface_sets.setdefault(name, []).append(table)
         node_sets.setdefault(name, []).append(mesh.faces(table).ravel())
     node_sets.update({name: [nodes] for name, nodes in raw.node_groups.items()})
@@ -106,6 +99,34 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     )
 
 
+def _body_type(raw: RawMesh, label: str, cell_type: str | None) -> str:
+    """The cell type of the body: that of the solids, of one known type, or else quads."""
+    counts: dict[str, int] = {}
+    for kind, cells in raw.blocks:
+        if len(cells):
+            counts[kind] = counts.get(kind, 0) + len(cells)
+    held = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "no cells"
+    solids = [kind for kind in counts if cell_dimension(kind) == 3]
+    surfaces = [kind for kind in counts if cell_dimension(kind) == 2]
+    for kind in solids:
+        if kind not in FILE_CELLS:
+            raise MeshError(
+                f"{label}: unknown cell type {kind!r} ({counts[kind]} cells); known are {', '.join(FILE_CELLS)}"
+            )
+    if len(solids) > 1:
+        what = "solid cells" if "hexahedron" in solids else "tetrahedra"
+        raise MeshError(f"{label}: holds {held}; all {what} must be of one type")
+    if not solids and surfaces != ["quad"]:
+        if "quad" in surfaces:
+            raise MeshError(f"{label}: holds {held}; a shell needs quads of 4 nodes only: recombine the others")
+        hint = ": is this a 2D mesh? A shell needs quads of 4 nodes (recombine)" if surfaces else ""
+        raise MeshError(f"{label}: no quads, no hexahedra and no tetrahedra, the file holds {held}{hint}")
+    body = solids[0] if solids else "quad"
+    if cell_type is not None and body != cell_type:
+        raise MeshError(f"{label}: holds {held}, but cell_type={cell_type!r} was asked for")
+    return body
+
+
 class _FaceFinder:
     """Finds boundary cells among the faces of a mesh by their corners."""
 
@@ -116,10 +137,10 @@ class _FaceFinder:
     def find(self, kind: str, nodes: Ints, name: str) -> Ints:
         """Rows (element, local face) of boundary cells (K, n)."""
         mesh, label = self.mesh, self.mesh.label
-        row = mesh.kind
-        if not kind.startswith("triangle"):
+        row, boundary, (solid, solids) = mesh.kind, _BOUNDARY[mesh.cell_type], _WORDS[mesh.cell_type]
+        if not kind.startswith(boundary):
             raise MeshError(
-                f"{label}: surface {name!r} holds {len(nodes)} cells of type {kind!r}, not faces of tetrahedra"
+                f"{label}: surface {name!r} holds {len(nodes)} cells of type {kind!r}, not faces of {solids}"
             )
         corners = nodes[:, : row.face_corners]
         check_range(corners, len(mesh.points), f"{label}: surface {name!r}, node")
@@ -136,17 +157,16 @@ class _FaceFinder:
         lost = np.flatnonzero(low == high)
         if lost.size:
             raise MeshError(
-                f"{label}: surface {name!r}: triangle {lost[0]} with nodes {corners[lost[0]].tolist()} is "
-                "not the face of a "
-                f"tetrahedron ({lost.size} such)"
+                f"{label}: surface {name!r}: {boundary} {lost[0]} with nodes {corners[lost[0]].tolist()} is "
+                f"not the face of a {solid} ({lost.size} such)"
             )
         face = order[low]
-        inside = np.flatnonzero(high - low == 2)  # between two elements: the one the triangle's normal leaves
+        inside = np.flatnonzero(high - low == 2)  # between two elements: the one its normal leaves
         for other in (order[low[inside]], order[high[inside] - 1]):
             element, side = np.divmod(other, len(local))
             own = mesh.cells[element[:, None], local[side]]
             start = (own == corners[inside, :1]).argmax(axis=1)
-            following = np.take_along_axis(own, ((start + 1) % 3)[:, None], axis=1)[:, 0]
+            following = np.take_along_axis(own, ((start + 1) % row.face_corners)[:, None], axis=1)[:, 0]
             agrees = following == corners[inside, 1]
             face[inside[agrees]] = other[agrees]
         return np.column_stack(np.divmod(face, len(local)))

@@ -1,9 +1,9 @@
 """The table of cell types (nodes, corners, edges, faces) and the geometry of one cell.
 
-A new cell type (say "hexahedron") is one more row of :data:`CELL_TYPES`, with its shape functions. Node
-order is meshio's. A local face lists its corners so that their right-hand normal points out of a cell with
-det J0 > 0, then its mid-edge nodes in the order of its edges (01, 12, 20); face k holds the nodes of
-Abaqus's label S(k+1).
+A new cell type is one more row of :data:`CELL_TYPES`, with its shape functions. Node order is meshio's. A local
+face of a solid lists its corners so that their right-hand normal points out of a cell with det J0 > 0, then its
+mid-edge nodes in the order of its edges (01, 12, 20); the "faces" of a quad are its edges, in the sense in which it
+runs through them. Face k holds the nodes of Abaqus's label S(k+1), or E(k+1) for quads.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ Ints = NDArray[np.int64]
 __all__ = [
     "CELL_TYPES",
     "ELEMENT_CELLS",
+    "FILE_CELLS",
     "CellType",
     "cell_dimension",
     "det_j0",
@@ -34,9 +35,9 @@ class CellType:
 
     ``nodes``: nodes per cell; ``corners``: the first so many are corners; ``edges``: corner pairs, the
     mid-edge node of edge k is ``corners + k`` if the type has any; ``faces``: local node numbers, outward;
-    ``face_corners``: how many of each face are corners; ``gradients(xi)``: (P, nodes, 3) shape derivatives
-    at xi (P, 3); ``rule``: points (P, 3) and weights (P,) exact for the volume of a curved cell;
-    ``checked``: points (P, 3) where det J0 has to be positive.
+    ``face_corners``: how many of each face are corners; ``gradients(xi)``: (P, nodes, d) shape derivatives
+    at xi (P, d), d the dimension; ``rule``: points (P, d) and weights (P,) exact for the volume of a curved
+    cell; ``checked``: points (P, d) where det J0 has to be positive.
     """
 
     name: str
@@ -51,8 +52,13 @@ class CellType:
 
     @property
     def has_mid_nodes(self) -> bool:
-        """True for second-order cells."""
-        return self.nodes > self.corners
+        """True for second-order cells: one node per edge after the corners."""
+        return self.nodes == self.corners + len(self.edges)
+
+    @property
+    def dimension(self) -> int:
+        """1 for lines, 2 for surfaces, 3 for solids."""
+        return cell_dimension(self.name)
 
 
 TET_EDGES = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)], dtype=np.int64)
@@ -111,12 +117,83 @@ _CHECKED = np.array(
     + _edge_orbit(0.045503704125649649492)
 )
 
-CELL_TYPES: dict[str, CellType] = {
-    "tetra": CellType("tetra", 4, 4, TET_EDGES, _TET_FACES, 3, tet4_gradients, _RULE1, _RULE1[0]),
-    "tetra10": CellType("tetra10", 10, 4, TET_EDGES, _TET10_FACES, 3, tet10_gradients, _RULE5, _CHECKED),
+_TET_FACE_NODES = np.column_stack([_TET_FACES, np.arange(4, 8)])  # node 4 + k is the centroid of face k
+
+
+def tet_faces_gradients(xi: Floats) -> Floats:
+    """ds_i/dxi of T4 with four more nodes at the face centroids, which carry no geometry: (P, 8, 3)."""
+    return np.concatenate([tet4_gradients(xi), np.zeros((len(xi), 4, 3))], axis=1)
+
+
+# corners, edges and faces of the unit line, square and cube
+
+_LINE = np.array([(0.0,), (1.0,)])
+_LINE_EDGES = np.array([(0, 1)], dtype=np.int64)
+_LINE_FACES = np.empty((0, 2), dtype=np.int64)
+_QUAD = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+_QUAD_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0)], dtype=np.int64)
+_HEX = np.array([(*corner, z) for z in (0.0, 1.0) for corner in _QUAD])
+_HEX_EDGES = np.array(
+    [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)], dtype=np.int64
+)
+_HEX_FACES = np.array(
+    [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)], dtype=np.int64
+)
+
+
+def _multilinear_gradients(corners: Floats, xi: Floats) -> Floats:
+    """ds_i/dxi of s_i = product over the axes of xi or 1 - xi, whichever is 1 at corner i: (P, corners, d)."""
+    sign = 2.0 * corners - 1.0
+    factor = 1.0 - corners + sign * xi[:, None, :]
+    others = [np.prod(np.delete(factor, k, axis=2), axis=2) for k in range(corners.shape[1])]
+    return sign * np.stack(others, axis=2)
+
+
+def line_gradients(xi: Floats) -> Floats:
+    """ds_i/dxi of the linear line on the unit interval: (P, 2, 1)."""
+    return _multilinear_gradients(_LINE, xi)
+
+
+def quad_gradients(xi: Floats) -> Floats:
+    """ds_i/dxi of the bilinear quadrilateral on the unit square: (P, 4, 2)."""
+    return _multilinear_gradients(_QUAD, xi)
+
+
+def hex_gradients(xi: Floats) -> Floats:
+    """ds_i/dxi of the trilinear hexahedron on the unit cube: (P, 8, 3)."""
+    return _multilinear_gradients(_HEX, xi)
+
+
+def _gauss(dimension: int) -> tuple[Floats, Floats]:
+    """Two Gauss points per axis of the unit line, square or cube; exact for det J0 of a hexahedron."""
+    one = 0.5 + np.array([-0.5, 0.5]) / 3.0**0.5
+    points = np.stack(np.meshgrid(*(dimension * [one]), indexing="ij"), axis=-1).reshape(-1, dimension)
+    return points, np.full(len(points), 1.0 / len(points))
+
+
+_LINE_RULE, _QUAD_RULE, _HEX_RULE = _gauss(1), _gauss(2), _gauss(3)
+_HEX_CHECKED = np.concatenate([_HEX, [(0.5, 0.5, 0.5)], _HEX_RULE[0]])
+
+_ROWS = (
+    CellType("tetra", 4, 4, TET_EDGES, _TET_FACES, 3, tet4_gradients, _RULE1, _RULE1[0]),
+    CellType("tetra10", 10, 4, TET_EDGES, _TET10_FACES, 3, tet10_gradients, _RULE5, _CHECKED),
+    CellType("hexahedron", 8, 8, _HEX_EDGES, _HEX_FACES, 4, hex_gradients, _HEX_RULE, _HEX_CHECKED),
+    CellType("quad", 4, 4, _QUAD_EDGES, _QUAD_EDGES, 2, quad_gradients, _QUAD_RULE, _QUAD_RULE[0]),
+    CellType("line", 2, 2, _LINE_EDGES, _LINE_FACES, 2, line_gradients, _LINE_RULE, _LINE_RULE[0]),
+    CellType("tetra_faces", 8, 4, TET_EDGES, _TET_FACE_NODES, 3, tet_faces_gradients, _RULE1, _RULE1[0]),
+)
+CELL_TYPES: dict[str, CellType] = {row.name: row for row in _ROWS}
+FILE_CELLS = ("tetra", "tetra10", "hexahedron", "quad")
+"""The cell types a file can hold; "line" (beams) and "tetra_faces" (ENMC) are made by the code."""
+ELEMENT_CELLS = {
+    "T4": "tetra",
+    "T10": "tetra10",
+    "ENMC": "tetra",
+    "FN": "tetra",
+    "FN18": "tetra",
+    "H3843": "hexahedron",
 }
-ELEMENT_CELLS = {"T4": "tetra", "T10": "tetra10"}
-"""Element name in the API -> cell type."""
+"""Name of a solid element in the API -> cell type that its mesh comes with."""
 
 _DIMENSION_PREFIXES = {
     0: ("vertex", "empty"),
@@ -143,17 +220,24 @@ def cell_dimension(name: str) -> int:
 
 
 def det_j0(points: Floats, cells: Ints, kind: CellType, xi: Floats) -> Floats:
-    """det J0 (m^3) of every cell at every parent point: (M, P)."""
+    """det J0 of every cell at every parent point, (M, P): m^3; |X_xi x X_eta| (m^2) of quads, |X_xi| (m) of lines."""
     out = np.empty((len(cells), len(xi)))
     coordinates = points[cells]
     for p, gradient in enumerate(kind.gradients(xi)):
         j = np.einsum("mik,il->mkl", coordinates, gradient)
-        out[:, p] = np.einsum("mk,mk->m", j[:, :, 0], np.cross(j[:, :, 1], j[:, :, 2]))
+        if kind.dimension == 3:
+            out[:, p] = np.einsum("mk,mk->m", j[:, :, 0], np.cross(j[:, :, 1], j[:, :, 2]))
+        else:
+            out[:, p] = np.linalg.norm(j[:, :, 0] if kind.dimension == 1 else np.cross(j[:, :, 0], j[:, :, 1]), axis=1)
     return out
 
 
 def element_volumes(points: Floats, cells: Ints, kind: CellType) -> Floats:
-    """Volume (m^3) of every cell, (M,), exact for curved sides too; negative for an inverted cell."""
+    """Volume (m^3), area (m^2) or length (m) of every cell, (M,); negative for an inverted solid.
+
+    Exact for curved sides of solids too; of a quad whose corners don't lie in a plane, that of the bilinear
+    surface by 2 x 2 points.
+    """
     xi, weights = kind.rule
     return det_j0(points, cells, kind, xi) @ weights
 

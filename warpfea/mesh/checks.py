@@ -1,4 +1,4 @@
-"""Checks of a tetrahedral mesh. Each failure names the file, the element or node (0-based) and the value."""
+"""Checks of a mesh. Each failure names the file, the element or node (0-based) and the value."""
 
 from __future__ import annotations
 
@@ -7,15 +7,22 @@ import warnings
 import numpy as np
 
 from ..errors import MeshError, MeshWarning
-from .cells import CELL_TYPES, CellType, Floats, Ints, det_j0, element_volumes, row_keys
+from .cells import CELL_TYPES, CellType, Floats, Ints, det_j0, row_keys
 from .mesh import Mesh
 
-__all__ = ["check", "check_topology"]
+__all__ = ["COINCIDENT", "check", "check_topology", "check_volumes"]
 
 COINCIDENT = 1e-10
 """Two used nodes closer than this part of the mesh's size are taken for one node that was not merged."""
 FLAT = 1e-12
-"""An element with a volume, or 6 det J0, below this part of its longest edge cubed has none."""
+"""An element with a volume, or det J0, below this part of its longest edge cubed (area: squared) has none."""
+_LEFT_HANDED = {
+    "tetra": "swap two corners",
+    "tetra10": "swap two corners and their mid-edge nodes",
+    "hexahedron": "swap the nodes 0 .. 3 and 4 .. 7",
+    "tetra_faces": "swap two corners and their face nodes",
+}
+_TOO_CURVED = {"hexahedron": "a corner, centre or quadrature point (too distorted)"}
 
 
 def check(mesh: Mesh) -> Mesh:
@@ -25,7 +32,8 @@ def check(mesh: Mesh) -> Mesh:
     ------
     MeshError
         No elements, NaN or infinite coordinates, a repeated node in an element, duplicate elements,
-        coincident nodes, mid-edge nodes out of order, zero-volume or inverted elements.
+        coincident nodes, mid-edge nodes out of order, zero-volume or inverted elements. Of quads: zero area,
+        corners that don't turn one way, an edge of more than two quads, neighbours whose normals disagree.
 
     Warns
     -----
@@ -43,10 +51,14 @@ def check(mesh: Mesh) -> Mesh:
             stacklevel=2,
         )
     _check_coincident(mesh)
+    if mesh.cell_type == "quad":
+        _check_quads(mesh)
+        _check_sheet(mesh)
+        return mesh
     curved = np.flatnonzero(~mesh.straight_sided(1e-12))
     if mesh.kind.has_mid_nodes:
         _check_mid_nodes(mesh, curved)
-    _check_volumes(mesh, curved)
+    check_volumes(mesh)
     return mesh
 
 
@@ -64,7 +76,7 @@ def check_topology(points: Floats, cells: Ints, cell_type: str, label: str) -> N
         width = points.shape[-1] if points.size else 0
         raise MeshError(f"{label}: the nodes have {width} coordinates, expected 3: is this a 2D mesh?")
     if not len(cells):
-        raise MeshError(f"{label}: no tetrahedra (0 elements of type {cell_type})")
+        raise MeshError(f"{label}: no elements (0 of type {cell_type})")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise MeshError(
@@ -82,7 +94,8 @@ def check_topology(points: Floats, cells: Ints, cell_type: str, label: str) -> N
     repeated = np.argwhere(ordered[:, 1:] == ordered[:, :-1])
     if repeated.size:
         e, k = repeated[0]
-        raise MeshError(f"{label}: element {e} holds node {ordered[e, k]} twice: {cells[e].tolist()}")
+        hint = "; a cell can't be collapsed to one of fewer corners" if cell_type in ("hexahedron", "quad") else ""
+        raise MeshError(f"{label}: element {e} holds node {ordered[e, k]} twice: {cells[e].tolist()}{hint}")
     keys = row_keys(np.sort(cells[:, : kind.corners], axis=1), len(points))
     order = np.argsort(keys, kind="stable")
     same = np.flatnonzero(keys[order][1:] == keys[order][:-1])
@@ -137,39 +150,108 @@ def _check_mid_nodes(mesh: Mesh, curved: Ints) -> None:
     )
 
 
-def _check_volumes(mesh: Mesh, curved: Ints) -> None:
+def check_volumes(mesh: Mesh) -> None:
+    """Check that solids (and lines) have a volume (length) and det J0 > 0 at all checked points.
+
+    Raises
+    ------
+    MeshError
+        Zero-volume or inverted elements.
+    """
     kind: CellType = mesh.kind
-    edges = mesh.points[mesh.cells[:, kind.edges[:, 0]]] - mesh.points[mesh.cells[:, kind.edges[:, 1]]]
-    longest3 = (edges**2).sum(axis=2).max(axis=1) ** 1.5
-    volumes = element_volumes(mesh.points, mesh.cells, kind)
-    flat = np.flatnonzero(np.abs(volumes) <= FLAT * longest3)
+    longest = _longest_edges(mesh)
+    scale = longest**kind.dimension
+    volumes = mesh.volumes()
+    flat = np.flatnonzero(np.abs(volumes) <= FLAT * scale)
+    if flat.size:
+        e = flat[0]
+        what, unit = {1: ("length", "m"), 3: ("volume", "m^3")}[kind.dimension]
+        raise MeshError(
+            f"{mesh.label}: element {e} has zero {what} ({volumes[e]:.3g} {unit}, longest edge "
+            f"{longest[e]:.3g} m; {flat.size} such element{_s(flat)})"
+        )
+    lowest = volumes / kind.rule[1].sum()  # mean det J0, which is its value everywhere in a straight simplex
+    simplex = kind.corners == kind.dimension + 1
+    bent = np.flatnonzero(~mesh.straight_sided(1e-12)) if simplex else np.arange(len(mesh.cells))
+    if bent.size:
+        at = det_j0(mesh.points, mesh.cells[bent], kind, kind.checked)
+        lowest[bent] = np.minimum(lowest[bent], at.min(axis=1))
+    inverted = np.flatnonzero(lowest <= FLAT * scale)
+    if not inverted.size:
+        return
+    e = inverted[np.argmin(lowest[inverted] / scale[inverted])]
+    if len(inverted) == len(mesh.cells) and (volumes < 0.0).all():
+        raise MeshError(
+            f"{mesh.label}: all {len(inverted)} elements are inverted (element 0 has det J0 = {lowest[0]:.6g} m^3): "
+            f"they are numbered left-handed ({_LEFT_HANDED[mesh.cell_type]}), or the mesh is mirrored"
+        )
+    where = _TOO_CURVED.get(mesh.cell_type, "a corner, mid-edge or quadrature point (too curved)")
+    raise MeshError(
+        f"{mesh.label}: element {e} is inverted{'' if volumes[e] < 0.0 else f' at {where}'}: smallest det J0 = "
+        f"{lowest[e]:.6g} m^3, volume {volumes[e]:.6g} m^3 "
+        f"({inverted.size} such element{_s(inverted)}, first: {_first(inverted)})"
+    )
+
+
+def _longest_edges(mesh: Mesh) -> Floats:
+    ends = mesh.points[mesh.cells[:, mesh.kind.edges]]
+    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2).max(axis=1)
+
+
+def _check_quads(mesh: Mesh) -> None:
+    """Each quad has an area, and its corners all turn the way of its mean normal."""
+    longest = _longest_edges(mesh)
+    areas = mesh.volumes()
+    flat = np.flatnonzero(areas <= FLAT * longest**2)
     if flat.size:
         e = flat[0]
         raise MeshError(
-            f"{mesh.label}: element {e} has zero volume ({volumes[e]:.3g} m^3, longest edge "
-            f"{np.cbrt(longest3[e]):.3g} m; {flat.size} such element{_s(flat)})"
+            f"{mesh.label}: quad {e} has zero area ({areas[e]:.3g} m^2, longest edge {longest[e]:.3g} m; "
+            f"{flat.size} such quad{_s(flat)})"
         )
-    lowest = 6.0 * volumes
-    if curved.size:
-        at = det_j0(mesh.points, mesh.cells[curved], kind, kind.checked)
-        lowest[curved] = np.minimum(lowest[curved], at.min(axis=1))
-    inverted = np.flatnonzero(lowest <= FLAT * longest3)
-    if not inverted.size:
-        return
-    e = inverted[np.argmin(lowest[inverted] / longest3[inverted])]
-    if len(inverted) == len(mesh.cells) and (volumes < 0.0).all():
+    x = mesh.points[mesh.cells]
+    normals = np.cross(np.roll(x, -1, axis=1) - x, np.roll(x, 1, axis=1) - x)
+    mean = normals.mean(axis=1)
+    size = np.linalg.norm(mean, axis=1)
+    along = np.einsum("mki,mi->mk", normals, mean / np.where(size > 0.0, size, 1.0)[:, None])
+    bad = np.flatnonzero(along.min(axis=1) <= FLAT * longest**2)
+    if bad.size:
+        e = bad[0]
+        k = int(along[e].argmin())
         raise MeshError(
-            f"{mesh.label}: all {len(inverted)} elements are inverted (element 0 has det J0 = "
-            f"{lowest[0]:.6g} m^3): "
-            "the file numbers its tetrahedra left-handed (swap two corners and their mid-edge nodes), or "
-            "is mirrored"
+            f"{mesh.label}: quad {e} is not convex: at corner {k} (node {mesh.cells[e, k]}) the edges span "
+            f"{along[e, k]:.3g} m^2 along the mean normal, which must be positive at all four "
+            f"({bad.size} such quad{_s(bad)}); move the node, or put the nodes in the order of a walk around"
         )
-    shape = "inverted" if volumes[e] < 0.0 else "inverted at a corner, mid-edge or quadrature point (too curved)"
-    raise MeshError(
-        f"{mesh.label}: element {e} is {shape}: smallest det J0 = {lowest[e]:.6g} m^3, volume "
-        f"{volumes[e]:.6g} m^3 "
-        f"({inverted.size} such element{_s(inverted)}, first: {_first(inverted)})"
-    )
+
+
+def _check_sheet(mesh: Mesh) -> None:
+    """An edge belongs to at most two quads, which run through it in opposite directions."""
+    sides = len(mesh.kind.edges)
+    edges = mesh.cells[:, mesh.kind.edges].reshape(-1, 2)
+    keys = row_keys(np.sort(edges, axis=1), len(mesh.points))
+    order = np.argsort(keys, kind="stable")
+    first = np.flatnonzero(np.r_[True, keys[order][1:] != keys[order][:-1]])
+    count = np.diff(np.r_[first, len(keys)])
+    many = first[count > 2]
+    if many.size:
+        start = many[np.argmin(order[many])]
+        rows = order[start : start + count[first == start][0]]
+        a, b = edges[rows[0]]
+        raise MeshError(
+            f"{mesh.label}: the edge between nodes {a} and {b} is shared by {len(rows)} quads "
+            f"({_first(rows // sides)}; {many.size} such edge{_s(many)}): a shell can't branch, use one body per sheet"
+        )
+    one, other = order[first[count == 2]], order[first[count == 2] + 1]
+    same = np.flatnonzero(edges[one, 0] == edges[other, 0])
+    if same.size:
+        i = same[np.argmin(one[same])]
+        a, b = edges[one[i]]
+        raise MeshError(
+            f"{mesh.label}: quads {one[i] // sides} and {other[i] // sides} both run from node {a} to node {b} through "
+            f"the edge they share, so that their normals disagree ({same.size} such edge{_s(same)}): flip one of "
+            "them (reverse the order of its nodes)"
+        )
 
 
 def _first(numbers: Ints, count: int = 5) -> str:

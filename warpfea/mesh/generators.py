@@ -1,21 +1,22 @@
 """Structured meshes of a box, a cylinder and a sphere, deterministic, with named sides.
 
-Each cell of a grid is cut into six tetrahedra around its diagonal (Kuhn), so that face diagonals match.
-Cylinder and sphere are the box of the parent square or cube, mapped shell by shell; their cells are mirrored
-about the centre, so that the diagonals run outward and no tetrahedron has two faces on the curved side (its
-corner would be flat).
+Each cell of a grid is a hexahedron, or cut into six tetrahedra around its diagonal (Kuhn), so that face
+diagonals match. Cylinder and sphere are the box of the parent square or cube, mapped shell by shell; their cells
+are mirrored about the centre, so that the diagonals run outward and no tetrahedron has two faces on the curved
+side (its corner would be flat).
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
 from ..errors import MeshError
-from .cells import CELL_TYPES, ELEMENT_CELLS, Floats, Ints
+from .arguments import PointMap, cell_type_of, counts, even, finite, mapped, positive
+from .cells import CELL_TYPES, Floats, Ints
+from .checks import check
 from .mesh import Mesh
 
 __all__ = ["box", "cylinder", "sphere"]
@@ -29,24 +30,38 @@ def box(
     cells: Sequence[int],
     element: str = "T10",
     origin: Sequence[float] = (0.0, 0.0, 0.0),
+    map: PointMap | None = None,
     name: str = "box",
 ) -> Mesh:
-    """A box of ``cells`` = (nx, ny, nz) cells, six tetrahedra each, from ``origin`` to ``origin + size`` (m).
+    """A box of ``cells`` = (nx, ny, nz) cells from ``origin`` to ``origin + size`` (m).
 
     Surface and node sets "x-", "x+", "y-", "y+", "z-", "z+". Nodes are numbered with x running fastest.
+
+    Parameters
+    ----------
+    element : {"T4", "T10", "ENMC", "FN", "FN18", "H3843"}
+        T10: six tetrahedra of 10 nodes per cell; H3843: one hexahedron; the others: six tetrahedra of 4 nodes.
+    map : function X (n, 3) -> (n, 3), or None
+        Moves the nodes (m), mid-edge nodes too; the mesh is then checked. Sides keep their names, and must stay
+        apart.
 
     Raises
     ------
     MeshError
-        Non-positive size, fewer than one cell, unknown element.
+        Non-positive size, fewer than one cell, unknown element; a map that returns no (n, 3) finite numbers, or
+        whose mesh fails :func:`warpfea.mesh.check`, for instance because it mirrors.
     """
-    lengths = _positive("box: size", size, 3)
-    counts = _counts("box: cells", cells, 3)
-    low = _finite("box: origin", origin, 3)
-    lattice, corners, kind = _kuhn(counts, element, (False, False, False), "box")
-    top = lattice[-1]
-    points = low + lengths * (lattice / top)
-    return _assemble(points, corners, kind, _grid_sides(lattice, corners, kind), name)
+    lengths = positive("box: size", size, 3)
+    numbers = counts("box: cells", cells, 3)
+    low = finite("box: origin", origin, 3)
+    kind = cell_type_of("box", element)
+    if kind == "hexahedron":
+        lattice, corners = _bricks(numbers)
+    else:
+        lattice, corners = _kuhn(numbers, kind, (False, False, False))
+    points = mapped("box: map", low + lengths * (lattice / lattice[-1]), map)
+    mesh = _assemble(points, corners, kind, _grid_sides(lattice, corners, kind), name)
+    return mesh if map is None else check(mesh)
 
 
 def cylinder(
@@ -64,7 +79,7 @@ def cylinder(
     ----------
     cells : (n, nz)
         n cells across the diameter (even), nz along the axis; 6 n n nz elements.
-    element : {"T4", "T10"}
+    element : {"T4", "T10", "ENMC", "FN", "FN18"}
         With T10 the side's mid-edge nodes lie on the circle; the other edges are straight.
 
     Surface and node sets "bottom", "top", "side".
@@ -74,20 +89,21 @@ def cylinder(
     MeshError
         Non-positive radius or length, an odd n, unknown element.
     """
-    (r,) = _positive("cylinder: radius", [radius], 1)
-    (height,) = _positive("cylinder: length", [length], 1)
-    n, nz = _counts("cylinder: cells", cells, 2)
-    _even("cylinder: cells across the diameter", n)
-    low = _finite("cylinder: origin", origin, 3)
+    (r,) = positive("cylinder: radius", [radius], 1)
+    (height,) = positive("cylinder: length", [length], 1)
+    n, nz = counts("cylinder: cells", cells, 2)
+    even("cylinder: cells across the diameter", n)
+    low = finite("cylinder: origin", origin, 3)
 
     def place(p: Floats) -> Floats:
         x, y = _disk(p[:, 0], p[:, 1])
         return np.column_stack([r * x, r * y, 0.5 * height * (p[:, 2] + 1.0)]) + low
 
-    lattice, corners, kind = _kuhn((n, n, nz), element, (True, True, False), "cylinder")
+    kind = _round_type("cylinder", element)
+    lattice, corners = _kuhn((n, n, nz), kind, (True, True, False))
     sides = _grid_sides(lattice, corners, kind)
     named = {"bottom": sides["z-"], "top": sides["z+"], "side": _join(sides, ("x-", "x+", "y-", "y+"))}
-    return _assemble(_mapped(lattice, corners, kind, place, (0, 1)), corners, kind, named, name)
+    return _assemble(_round_points(lattice, corners, kind, place, (0, 1)), corners, kind, named, name)
 
 
 def sphere(
@@ -108,32 +124,54 @@ def sphere(
     MeshError
         Non-positive radius, an odd number of cells, unknown element.
     """
-    (r,) = _positive("sphere: radius", [radius], 1)
-    (n,) = _counts("sphere: cells", [cells], 1)
-    _even("sphere: cells", n)
-    middle = _finite("sphere: center", center, 3)
-    lattice, corners, kind = _kuhn((n, n, n), element, (True, True, True), "sphere")
-    points = _mapped(lattice, corners, kind, lambda p: middle + r * _ball(p), (0, 1, 2))
+    (r,) = positive("sphere: radius", [radius], 1)
+    (n,) = counts("sphere: cells", [cells], 1)
+    even("sphere: cells", n)
+    middle = finite("sphere: center", center, 3)
+    kind = _round_type("sphere", element)
+    lattice, corners = _kuhn((n, n, n), kind, (True, True, True))
+    points = _round_points(lattice, corners, kind, lambda p: middle + r * _ball(p), (0, 1, 2))
     named = {"surface": _join(_grid_sides(lattice, corners, kind), _SIDES)}
     return _assemble(points, corners, kind, named, name)
 
 
-def _kuhn(counts: Sequence[int], element: str, mirrored: Sequence[bool], what: str) -> tuple[Ints, Ints, str]:
-    """Lattice points (N, 3), x fastest, cells and cell type of a grid of ``counts`` cells.
+def _round_type(what: str, element: str) -> str:
+    """The cell type of an element that a round body can be made of."""
+    kind = cell_type_of(what, element)
+    if kind == "hexahedron":
+        raise MeshError(
+            f"{what}: element {element!r} isn't available: the hexahedra at the corners of the parent square would be "
+            "flat on the round side; take tetrahedra, or a box with map="
+        )
+    return kind
+
+
+def _lattice(shape: Sequence[int]) -> Ints:
+    """Integer points (N, 3) of a lattice, x fastest."""
+    z, y, x = (a.ravel() for a in np.meshgrid(*(np.arange(s) for s in shape[::-1]), indexing="ij"))
+    return np.column_stack([x, y, z])
+
+
+def _bricks(numbers: Sequence[int]) -> tuple[Ints, Ints]:
+    """Lattice points (N, 3) and hexahedra (M, 8), x fastest, of a grid of so many cells."""
+    nx, ny, nz = numbers
+    base = _lattice((nx, ny, nz)) @ (1, nx + 1, (nx + 1) * (ny + 1))
+    up = (nx + 1) * (ny + 1)
+    bottom = np.array([0, 1, nx + 2, nx + 1])
+    return _lattice((nx + 1, ny + 1, nz + 1)), base[:, None] + np.concatenate([bottom, bottom + up])
+
+
+def _kuhn(numbers: Sequence[int], kind: str, mirrored: Sequence[bool]) -> tuple[Ints, Ints]:
+    """Lattice points (N, 3), x fastest, and tetrahedra of a grid of so many cells.
 
     The lattice has step 2 per cell with T10 (all its points are nodes), 1 with T4. In a mirrored axis the
     cells below the middle are reflected.
     """
-    if element not in ELEMENT_CELLS:
-        raise MeshError(f"{what}: unknown element {element!r}, known are {', '.join(ELEMENT_CELLS)}")
-    kind = ELEMENT_CELLS[element]
     step = 2 if CELL_TYPES[kind].has_mid_nodes else 1
-    shape = step * np.asarray(counts) + 1
+    shape = step * np.asarray(numbers) + 1
     strides = np.array([1, shape[0], shape[0] * shape[1]])
-    # cell origins and reflections, x fastest
-    k, j, i = (a.ravel() for a in np.meshgrid(*(np.arange(c) for c in counts[::-1]), indexing="ij"))
-    base = np.column_stack([i, j, k])
-    flip = np.asarray(mirrored) & (2 * base < np.asarray(counts))
+    base = _lattice(numbers)
+    flip = np.asarray(mirrored) & (2 * base < np.asarray(numbers))
     odd = flip.sum(axis=1) % 2 == 1
     # the six tetrahedra 0, e_a, e_a + e_b, 1 of the unit cell, right-handed
     unit = np.zeros((6, 4, 3), dtype=np.int64)
@@ -150,8 +188,7 @@ def _kuhn(counts: Sequence[int], element: str, mirrored: Sequence[bool], what: s
     if step == 2:
         a, b = CELL_TYPES[kind].edges.T
         nodes = np.concatenate([corner, (corner[:, a] + corner[:, b]) // 2], axis=1)
-    z, y, x = (a.ravel() for a in np.meshgrid(*(np.arange(s) for s in shape[::-1]), indexing="ij"))
-    return np.column_stack([x, y, z]), nodes @ strides, kind
+    return _lattice(tuple(shape)), nodes @ strides
 
 
 def _grid_sides(lattice: Ints, cells: Ints, kind: str) -> dict[str, Ints]:
@@ -173,7 +210,7 @@ def _join(sides: dict[str, Ints], names: Sequence[str]) -> Ints:
     return table[np.lexsort((table[:, 1], table[:, 0]))]
 
 
-def _mapped(
+def _round_points(
     lattice: Ints, cells: Ints, kind: str, place: Callable[[Floats], Floats], round_axes: tuple[int, ...]
 ) -> Floats:
     """Points of the mapped lattice, with the edges that don't lie on the round side made straight."""
@@ -211,39 +248,3 @@ def _assemble(points: Floats, cells: Ints, kind: str, surfaces: dict[str, Ints],
     faces = CELL_TYPES[kind].faces
     nodes = {key: np.unique(cells[table[:, 0, None], faces[table[:, 1]]]) for key, table in surfaces.items()}
     return Mesh(points, cells, kind, node_sets=nodes, surface_sets=surfaces, name=name)
-
-
-def _numbers(what: str, values: Any, count: int) -> Floats:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.empty(0)
-    if array.shape != (count,):
-        raise MeshError(f"{what}: expected {count} number{'s' if count > 1 else ''}, got {values!r}")
-    return array
-
-
-def _finite(what: str, values: Any, count: int) -> Floats:
-    array = _numbers(what, values, count)
-    if not np.isfinite(array).all():
-        raise MeshError(f"{what} must be finite, got {values!r}")
-    return array
-
-
-def _positive(what: str, values: Any, count: int) -> Floats:
-    array = _finite(what, values, count)
-    if not (array > 0.0).all():
-        raise MeshError(f"{what} must be positive, got {array.tolist()}")
-    return array
-
-
-def _counts(what: str, values: Any, count: int) -> tuple[int, ...]:
-    array = _numbers(what, values, count)
-    if not ((array >= 1) & (array == np.round(array))).all():
-        raise MeshError(f"{what} must be integers of at least 1, got {values!r}")
-    return tuple(int(v) for v in array)
-
-
-def _even(what: str, value: int) -> None:
-    if value % 2:
-        raise MeshError(f"{what} must be an even number, got {value}")

@@ -20,19 +20,24 @@ Selection = str | Callable[[Floats], Any] | Sequence[int] | np.ndarray
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mesh:
-    """A tetrahedral mesh in metres. All arrays are read-only; the node order is the file's.
+    """A mesh of one cell type in metres. All arrays are read-only; the node order is the file's.
+
+    The cell types are solids ("tetra", "tetra10", "hexahedron"), the surface in space "quad" (shells), and two that
+    files don't hold: "line" (beams) and "tetra_faces", a tetrahedron with a node at each face's centroid. What is
+    called a face of a cell is an edge of a quad, and a line has none.
 
     Parameters
     ----------
     points : (N, 3) float64
         Reference positions X (m). Nodes that no cell uses ("orphans") keep their place in the numbering.
-    cells : (M, 4) or (M, 10) int64
-        Node numbers in meshio's order; T10 mid-edge nodes of the corner pairs 01, 12, 20, 03, 13, 23.
-    cell_type : {"tetra", "tetra10"}
+    cells : (M, n) int64
+        Node numbers in meshio's order, n = 4, 10, 8, 4, 2, 8 in the order of ``cell_type`` below. T10 mid-edge
+        nodes of the corner pairs 01, 12, 20, 03, 13, 23; face nodes 4 .. 7 of the faces 021, 013, 123, 032.
+    cell_type : {"tetra", "tetra10", "hexahedron", "quad", "line", "tetra_faces"}
     node_sets, element_sets : dict of str to (K,) int64
         Sorted node and element numbers.
     surface_sets : dict of str to (K, 2) int64
-        Rows (element, local face).
+        Rows (element, local face); of quads (element, local edge).
     name : str
         Stem of the file, or the generator's name.
     path : str or None
@@ -123,11 +128,14 @@ class Mesh:
     # geometry
 
     def volumes(self) -> Floats:
-        """Volume of each element (m^3), (M,), exact for curved sides too."""
+        """Volume of each element (m^3), (M,), exact for curved sides too ("tetra_faces": of the four corners).
+
+        Of a quad it is the area (m^2), of a line the length (m), so that weighted averages work for any body.
+        """
         return element_volumes(self.points, self.cells, self.kind)
 
     def volume(self) -> float:
-        """Total volume (m^3)."""
+        """Total volume (m^3); area (m^2) of quads, length (m) of lines."""
         return float(self.volumes().sum())
 
     def centroids(self) -> Floats:
@@ -140,7 +148,8 @@ class Mesh:
         return used.min(axis=0), used.max(axis=0)
 
     def straight_sided(self, tol: float = 1e-10) -> np.ndarray:
-        """Mask (M,) of elements whose mid-edge nodes lie within ``tol`` edge lengths of the mid-points."""
+        """Mask (M,) of elements whose mid-edge nodes lie within ``tol`` edge lengths of the mid-points; True for
+        cells without such nodes."""
         if not self.kind.has_mid_nodes:
             return np.ones(len(self.cells), dtype=bool)
         straight = np.ones(len(self.cells), dtype=bool)
@@ -156,8 +165,9 @@ class Mesh:
     # surfaces
 
     def faces(self, table: Selection) -> Ints:
-        """Node numbers (K, 3) or (K, 6) of a surface: corners so that their normal points outward, then
-        mid-edges.
+        """Node numbers of a surface: (K, 3) of T4, (K, 6) of T10, (K, 4) of hexahedra, corners so that their
+        normal points outward, then mid-edges; (K, 4) with face nodes, that node last; (K, 2) of quads, the two
+        ends of each edge.
 
         Parameters
         ----------
@@ -167,11 +177,12 @@ class Mesh:
         return self.cells[rows[:, 0, None], self.kind.faces[rows[:, 1]]]
 
     def face_centroids(self, table: Selection) -> Floats:
-        """Mean of each face's corners (m), (K, 3)."""
+        """Mean of each face's corners (m), (K, 3); of an edge of quads its mid-point."""
         return self.points[self.faces(table)[:, : self.kind.face_corners]].mean(axis=1)
 
     def boundary(self) -> Ints:
-        """All outer faces, (K, 2) rows of (element, local face), in the order of the elements."""
+        """All outer faces, (K, 2) rows of (element, local face), in the order of the elements; of quads the
+        (element, local edge) of edges that belong to one quad only."""
         return self._boundary
 
     @cached_property

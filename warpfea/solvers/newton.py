@@ -101,6 +101,7 @@ class NewtonLoop:
         active = w.newton.active
         self.pcg.solve(active)
         self.residual.hold_pushed(active)
+        self.residual.push_curvature(active)
         launch(k.copy_active, self.dim, [w.v, active, w.base])
         launch(k.dot_rows, self.dim, [w.g, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)

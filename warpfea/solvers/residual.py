@@ -81,10 +81,9 @@ class Residual:
         loads = m.loads
         if not loads.nonpotential:
             return
-        for part in loads.pressures:
-            args = [part.conn, part.law, part.tables, m.reference_device, w.u]
-            args += [w.law_value, part.offset, active, w.pushed_contribution]
-            launch(loads.kernels.follower_pressure, (m.worlds, part.count), args)
+        for part in loads.followers:
+            args = [part.data, w.u, w.law_value, active, w.pushed_contribution]
+            launch(part.force, (m.worlds, part.count), args)
         for field in loads.fields:
             args = [field.block.data, field.members, m.reference_device, field.origin, w.u, w.step.new_time]
             args += [w.step.ramp, active, field.offset, w.pushed_contribution]
@@ -112,13 +111,27 @@ class Residual:
         for block, kernels in zip(m.blocks, self.block_kernels):
             args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
             launch(kernels.tangent_product, (m.worlds, block.count), args)
-        loads = m.loads
         start, entry = m.topology.start, m.topology.entry
-        if loads.pressures:
-            start, entry = loads.pushed_topology.start, loads.pushed_topology.entry
-            for part in loads.pressures:
-                args = [part.conn, part.law, part.tables, m.reference_device, w.u, w.law_value, part.offset, active]
-                launch(loads.kernels.pressure_product, (m.worlds, part.count), [*args, p, w.pushed_tangent])
+        if m.loads.followers:
+            start, entry = m.loads.pushed_topology.start, m.loads.pushed_topology.entry
+            self._push_product(p, active)
         args = [m.topology, w.contribution, start, entry, w.pushed_tangent, p]
         args += [w.step.mass_factor, w.step.dq_dv, active, out, w.rows]
         launch(self.gather.product, self.dim, args)
+
+    def _push_product(self, p: wp.array, active: wp.array) -> None:
+        """Contributions of the follower loads' symmetric tangent times p."""
+        m, w, launch = self.model, self.work, self.launch
+        for part in m.loads.followers:
+            args = [part.data, w.u, w.law_value, active, p, w.pushed_tangent]
+            launch(part.product, (m.worlds, part.count), args)
+
+    def push_curvature(self, active: wp.array) -> None:
+        """p.K p of the follower loads along the direction p, into the Newton control."""
+        m, w, launch = self.model, self.work, self.launch
+        if not m.loads.followers:
+            return
+        self._push_product(w.direction, active)
+        args = [m.loads.pushed_topology, w.pushed_tangent, w.direction, w.step.dq_dv, m.topology.free, active, w.rows]
+        launch(self.gather.pushed_curvature, self.dim, args)
+        self.reduce(w.rows, 1, active, w.newton.push_sum)

@@ -1,0 +1,192 @@
+"""Transverse shear of shells by assumed natural strain (Dvorkin and Bathe 1984): force, energy, tangent, blocks.
+
+The covariant shears e_t = 2 E_(xi zeta) or 2 E_(eta zeta) are taken at tying points and interpolated; the interpolation,
+metric and quadrature are one symmetric matrix A per element, made on the host: Psi = (mu/2) e.A e.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .types import kernel_module, precision
+
+__all__ = ["tied_kernels", "tied_struct"]
+
+
+@functools.cache
+def tied_struct(dtype: str):
+    """The constant data of a block of tied elements, in one precision."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+
+    @wp.struct
+    class TiedBlock:
+        conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
+        is_position: wp.array(dtype=T)  # [local]
+        along: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi or ds_i/deta
+        through: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dzeta
+        X_along: wp.array2d(dtype=vec3)  # [tie, elem] reference X_xi or X_eta
+        X_through: wp.array2d(dtype=vec3)  # [tie, elem] reference X_zeta
+        coupling: wp.array3d(dtype=T)  # [tie, tie, elem] A
+        material: wp.array(dtype=wp.int32)  # [elem]
+        coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
+        contribution_offset: wp.int32
+        element_offset: wp.int32
+        history_offset: wp.int32
+        count: wp.int32
+
+    return TiedBlock
+
+
+@functools.cache
+def tied_kernels(dtype: str, slots: int, ties: int) -> _types.SimpleNamespace:
+    """Kernels of tied elements; their arguments are those of `element_kernels`, so that one loop launches both."""
+    p = precision(dtype)
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    Block = tied_struct(dtype)
+    module = kernel_module(f"tied_{dtype}_{slots}_{ties}")
+    Local = wp.types.matrix(shape=(slots, 3), dtype=T)
+    Ties = wp.types.vector(length=ties, dtype=T)
+    TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
+    NS, NT = slots, ties
+
+    @wp.func
+    def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+        """Slot values of an element, translations taken relative to the first slot."""
+        U = Local()
+        first = field[world, block.conn[0, elem]]
+        for i in range(NS):
+            U[i] = field[world, block.conn[i, elem]] - block.is_position[i] * first
+        return U
+
+    @wp.func
+    def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
+        out = vec3()
+        for i in range(NS):
+            out += table[tie, i, elem] * U[i]
+        return out
+
+    @wp.func
+    def shears(block: Block, U: Local, elem: int) -> Ties:
+        """x_along . x_through less its reference value, without cancellation."""
+        e = Ties()
+        for t in range(NT):
+            a = line(block.along, U, t, elem)
+            d = line(block.through, U, t, elem)
+            e[t] = wp.dot(block.X_along[t, elem], d) + wp.dot(a, block.X_through[t, elem] + d)
+        return e
+
+    @wp.func
+    def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
+        """mu A e."""
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        s = Ties()
+        for t in range(NT):
+            total = T(0.0)
+            for k in range(NT):
+                total += block.coupling[t, k, elem] * e[k]
+            s[t] = mu * total
+        return s
+
+    @wp.kernel(module=module)
+    def internal_force(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=vec3),
+        energy: wp.array3d(dtype=wp.float64),
+        min_J: wp.array(dtype=wp.float64),
+        domain_J: wp.array(dtype=wp.float64),
+    ):
+        """f_i = sum_t s_t (along_ti x_through + through_ti x_along), and the energy e.s/2."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = load(block, u, world, elem)
+        e = shears(block, U, elem)
+        s = stresses(block, e, world, elem)
+        f = Local()
+        for t in range(NT):
+            a = s[t] * (block.X_along[t, elem] + line(block.along, U, t, elem))
+            d = s[t] * (block.X_through[t, elem] + line(block.through, U, t, elem))
+            for i in range(NS):
+                f[i] = f[i] + block.along[t, i, elem] * d + block.through[t, i, elem] * a
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        energy[0, world, block.element_offset + elem] = wp.float64(T(0.5) * wp.dot(e, s))
+        energy[1, world, block.element_offset + elem] = wp.float64(0.0)
+
+    @wp.kernel(module=module)
+    def tangent_product(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """K p."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = load(block, u, world, elem)
+        P = load(block, direction, world, elem)
+        de = Ties()
+        for t in range(NT):
+            a = block.X_along[t, elem] + line(block.along, U, t, elem)
+            d = block.X_through[t, elem] + line(block.through, U, t, elem)
+            de[t] = wp.dot(a, line(block.through, P, t, elem)) + wp.dot(d, line(block.along, P, t, elem))
+        s = stresses(block, shears(block, U, elem), world, elem)
+        ds = stresses(block, de, world, elem)
+        f = Local()
+        for t in range(NT):
+            a = block.X_along[t, elem] + line(block.along, U, t, elem)
+            d = block.X_through[t, elem] + line(block.through, U, t, elem)
+            da = ds[t] * a + s[t] * line(block.along, P, t, elem)
+            dd = ds[t] * d + s[t] * line(block.through, P, t, elem)
+            for i in range(NS):
+                f[i] = f[i] + block.along[t, i, elem] * dd + block.through[t, i, elem] * da
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+
+    @wp.kernel(module=module)
+    def diagonal_blocks(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=sym6),
+    ):
+        """The 3x3 diagonal blocks of K without the geometric part: positive, as A is."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = load(block, u, world, elem)
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        for i in range(NS):
+            b = TieVectors()
+            for t in range(NT):
+                a = block.X_along[t, elem] + line(block.along, U, t, elem)
+                d = block.X_through[t, elem] + line(block.through, U, t, elem)
+                b[t] = block.along[t, i, elem] * d + block.through[t, i, elem] * a
+            K = mat33()
+            for t in range(NT):
+                row = vec3()
+                for k in range(NT):
+                    row += block.coupling[t, k, elem] * b[k]
+                K += wp.outer(b[t], row)
+            entry = block.contribution_offset + i * block.count + elem
+            contribution[world, entry] = mu * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
+
+    return _types.SimpleNamespace(
+        module=module,
+        internal_force=internal_force,
+        tangent_product=tangent_product,
+        diagonal_blocks=diagonal_blocks,
+    )

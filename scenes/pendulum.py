@@ -1,0 +1,48 @@
+"""A soft beam that swings from a pin."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import warpfea as wf
+from warpfea.scene import scene
+
+
+@scene(dt=2.5e-3, t_end=1.5, integrator="bdf2", tol=1e-6, speed=0.3, picture=0.7)
+def pendulum(
+    *,
+    length: float = 1.0,
+    side: float = 0.02,
+    elements: int = 12,
+    E: float = 2e6,
+    nu: float = 0.3,
+    density: float = 7200.0,
+    integration: Literal["split", "full"] = "split",
+) -> wf.ModelBuilder:
+    """A flexible pendulum of 3243 beams, pinned at one end and let go from the horizontal, bends as it falls.
+
+    Only the position of the start node is held, so the beam turns freely there.
+
+    Args:
+        length: of the beam, m.
+        side: of its square section, m.
+        elements: along the length.
+        E: Young's modulus (SVK), Pa.
+        nu: Poisson's ratio.
+        density: kg/m^3.
+        integration: split (without locking) or full.
+    """
+    b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    beam = b.add_beam(
+        [(0, 0, 0), (length, 0, 0)],
+        elements=elements,
+        section=wf.Rectangle(side, side),
+        normal=(0, 0, 1),
+        material=wf.SVK(E=E, nu=nu, density=density),
+        integration=integration,
+        name="beam",
+    )
+    b.clamp(beam.start, slots="position")
+    b.add_probe("tip", beam.end)
+    b.add_probe("middle", beam.at((0.5 * length, 0, 0)))
+    return b

@@ -1,0 +1,117 @@
+"""The problems of `warpfea bench`: bodies clamped at one end and loaded at the other from t = 0, without gravity.
+
+All of SVK, E = 7e8 Pa, nu = 0.33, 2700 kg/m^3.
+
+bar: T10, 3 x 2 x 1 m; 5000 N in +x as a uniform traction on the face x = 3.
+beam: 3243, elements of 0.5 x 0.1 x 0.1 m in a row, eta = lambda_v = 1e5 Pa s; 3100 N in +z at the last node.
+plate: 3443, 4 x 2 x 0.1 m, twice as many elements along x as along y; 1000 N in -z on the edge x = 4.
+
+The tip is the mean of the loaded face, node or edge, along the load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import mesh as meshes
+from .beams import Rectangle
+from .builder import ModelBuilder
+from .materials import SVK, KelvinVoigt
+
+__all__ = ["PROBLEMS", "Problem"]
+
+E, NU, DENSITY = 7e8, 0.33, 2700.0
+BAR = (3.0, 2.0, 1.0)
+PLATE = (4.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A problem in many sizes.
+
+    Attributes:
+        name: as users choose it.
+        size_for: wanted unknowns -> size.
+        unknowns: size -> its unknowns.
+        build: size -> ModelBuilder with the probe "tip".
+        axis: component of the tip's displacement that is compared.
+        smallest: fewest unknowns.
+        defaults: unknowns of a run without --unknowns.
+    """
+
+    name: str
+    size_for: Callable[[int], Any]
+    unknowns: Callable[[Any], int]
+    build: Callable[[Any], ModelBuilder]
+    axis: int
+    smallest: int
+    defaults: tuple[int, ...]
+
+
+def bar_unknowns(cells: tuple[int, int, int]) -> int:
+    """Unknowns of a T10 box whose face x = 0 is clamped."""
+    nx, ny, nz = cells
+    return 3 * (2 * nx) * (2 * ny + 1) * (2 * nz + 1)
+
+
+def bar_cells(unknowns: int) -> tuple[int, int, int]:
+    """Cells close to the proportion 3 : 2 : 1 whose number of unknowns is nearest in ratio."""
+    limit = 2.0 * (unknowns / 72.0) ** (1.0 / 3.0) + 2.0
+    choices = {tuple(max(1, round(k * s)) for k in (3, 2, 1)) for s in np.arange(1.0, limit, 0.05)}
+    best = min(sorted(choices), key=lambda cells: abs(np.log(bar_unknowns(cells) / unknowns)))  # type: ignore[arg-type]
+    return best[0], best[1], best[2]
+
+
+def bar(cells: tuple[int, int, int]) -> ModelBuilder:
+    """The bar of T10 elements."""
+    b = ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = b.add_solid(meshes.box(BAR, cells=cells), material=SVK(E=E, nu=NU, density=DENSITY), name="bar")
+    b.clamp(body.nodes("x-"))
+    b.add_traction(body.surface("x+"), (5000.0 / (BAR[1] * BAR[2]), 0.0, 0.0))
+    b.add_probe("tip", body.surface("x+"))
+    return b
+
+
+def beam(elements: int) -> ModelBuilder:
+    """The beam of 3243 elements."""
+    b = ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    law = SVK(E=E, nu=NU, density=DENSITY, damping=KelvinVoigt(eta=1e5, lambda_v=1e5))
+    body = b.add_beam(
+        [(0.0, 0.0, 0.0), (0.5 * elements, 0.0, 0.0)],
+        elements=elements, section=Rectangle(0.1, 0.1), normal=(0.0, 0.0, 1.0), material=law,
+    )  # fmt: skip
+    b.clamp(body.start)
+    b.add_point_load(body.end, (0.0, 0.0, 3100.0))
+    b.add_probe("tip", body.end)
+    return b
+
+
+def plate(cells: int) -> ModelBuilder:
+    """The plate of 3443 elements, 2 cells x cells."""
+    b = ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    mesh = meshes.grid(PLATE, cells=(2 * cells, cells))
+    thickness = 0.1
+    body = b.add_shell(mesh, thickness=thickness, material=SVK(E=E, nu=NU, density=DENSITY))
+    b.clamp(body.edge("x-"))
+    b.add_traction(body.surface("x+"), (0.0, 0.0, -1000.0 / (PLATE[1] * thickness)))
+    b.add_probe("tip", body.edge("x+"))
+    return b
+
+
+def _plate_unknowns(cells: int) -> int:
+    return 12 * 2 * cells * (cells + 1)
+
+
+PROBLEMS = {
+    "bar": Problem("bar", bar_cells, bar_unknowns, bar, 0, bar_unknowns((3, 2, 1)), (1000, 10000, 30000)),
+    "beam": Problem("beam", lambda n: max(1, round(n / 12)), lambda k: 12 * k, beam, 2, 12, (360, 3600, 12000, 36000)),
+    "plate": Problem(
+        "plate",
+        lambda n: max(1, round((np.sqrt(1.0 + n / 6.0) - 1.0) / 2.0)),
+        _plate_unknowns, plate, 2, _plate_unknowns(1), (768, 1728, 6528, 25344),
+    ),
+}  # fmt: skip

@@ -1,0 +1,245 @@
+"""What a builder has collected of a scene, and the checks of what users pass in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .bodies import Body, NodeSet, SurfaceSet
+from .errors import ModelError
+from .laws import TimeLaw
+from .materials import Material
+from .mesh import Mesh
+
+__all__ = [
+    "BodyForce",
+    "DeadLoad",
+    "Description",
+    "Moment",
+    "Pressure",
+    "Probe",
+    "Rotation",
+    "Support",
+    "assign_materials",
+    "component_mask",
+    "slot_field",
+    "support_slots",
+    "vector",
+]
+
+COMPONENTS = {"x": 0, "y": 1, "z": 2}
+
+
+@dataclass(frozen=True, eq=False)
+class Rotation:
+    """A prescribed rotation about an axis through an anchor.
+
+    Args:
+        anchor: (3,) m.
+        axis: (3,), any length but zero.
+        angle: time law, rad.
+    """
+
+    anchor: Any
+    axis: Any
+    angle: Any
+
+
+@dataclass(eq=False)
+class DeadLoad:
+    """Force weight_i x value(t) on slots; kept for point loads and tractions alike."""
+
+    body: Body
+    slots: np.ndarray
+    weights: np.ndarray
+    law: TimeLaw
+    name: str
+
+
+@dataclass(eq=False)
+class Pressure:
+    """Follower pressure on faces."""
+
+    surface: SurfaceSet
+    law: TimeLaw
+
+
+@dataclass(eq=False)
+class Moment:
+    """A moment shared equally by K points, on the spin of vectors y_k = sum_i vectors_ik e_i of each.
+
+    Attributes:
+        slots: (K, n) body slots.
+        vectors: (K, n, 3) coefficients; columns that the element's spin does not use are 0.
+        axes: (K, 3, 3) reference values of the vectors, columns.
+    """
+
+    body: Body
+    slots: np.ndarray
+    vectors: np.ndarray
+    axes: np.ndarray
+    law: TimeLaw
+
+
+@dataclass(eq=False)
+class BodyForce:
+    """Field b(r, t) on bodies, N/kg."""
+
+    function: Any
+    bodies: list[Body]
+
+
+@dataclass(eq=False)
+class Support:
+    """Prescribed components of slots: clamped (no law), moved by a law, or rotated."""
+
+    body: Body
+    slots: np.ndarray
+    components: np.ndarray
+    law: TimeLaw | None = None
+    node_laws: list[TimeLaw] | None = None
+    rotation: tuple[np.ndarray, np.ndarray] | None = None
+
+
+@dataclass(eq=False)
+class Probe:
+    """A recorded point: sum of weights x slot values."""
+
+    name: str
+    body: Body
+    slots: np.ndarray
+    weights: np.ndarray
+    X: np.ndarray
+
+
+@dataclass(eq=False)
+class Description:
+    """All that a builder has collected."""
+
+    bodies: list[Body] = field(default_factory=list)
+    supports: list[Support] = field(default_factory=list)
+    dead_loads: list[DeadLoad] = field(default_factory=list)
+    pressures: list[Pressure] = field(default_factory=list)
+    moments: list[Moment] = field(default_factory=list)
+    body_forces: list[BodyForce] = field(default_factory=list)
+    probes: list[Probe] = field(default_factory=list)
+
+
+def vector(value: Any, what: str) -> np.ndarray:
+    """Three finite numbers. ModelError otherwise."""
+    try:
+        out = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{what} = {value!r} is not three numbers") from error
+    if out.shape != (3,) or not np.all(np.isfinite(out)):
+        raise ModelError(f"{what} = {value!r} is not three finite numbers")
+    return out
+
+
+def nodal(values: Any, nodes: int, what: str) -> np.ndarray:
+    """(nodes, 3) from one vector or one per node. ModelError for another shape or values that are not finite."""
+    out = np.asarray(values, dtype=float)
+    if out.shape == (3,):
+        out = np.broadcast_to(out, (nodes, 3))
+    if out.shape != (nodes, 3):
+        raise ModelError(f"{what} has shape {out.shape}, expected (3,) or {(nodes, 3)}")
+    bad = np.flatnonzero(~np.isfinite(out).all(axis=1))
+    if len(bad):
+        raise ModelError(f"{what}: node {int(bad[0])} has {out[bad[0]].tolist()}")
+    return out.copy()
+
+
+def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
+    """A vector field on a body's slots, (slots, 3): values at the nodes, and its gradient on gradient slots.
+
+    Args:
+        values: (3,) the same everywhere; a function X (n, 3) -> (n, 3), whose gradient is taken by central
+            differences; or (nodes, 3), for bodies without gradient slots.
+
+    Raises:
+        ModelError: another shape, values that are not finite, or nodal values on a body with gradient slots.
+    """
+    X = body.mesh.points
+    if callable(values):
+        out = nodal(values(X), len(X), what)[body.slot_node]
+        gradient = np.flatnonzero(body.slot_kind > 0)
+        if len(gradient):
+            low, high = body.mesh.bounding_box()
+            step = 1e-5 * float(np.max(high - low))
+            at, along = X[body.slot_node[gradient]], body.reference[gradient]
+            ahead, behind = (nodal(values(at + k * step * along), len(at), what) for k in (1.0, -1.0))
+            out[gradient] = (ahead - behind) / (2.0 * step)
+        return out
+    if body.family.has_gradients and np.shape(values) != (3,):
+        raise ModelError(
+            f"{what}: body {body.name!r} of element {body.family.name} has gradients at its nodes; give a function "
+            "X (n, 3) -> (n, 3), or one vector (3,)"
+        )
+    return np.where((body.slot_kind == 0)[:, None], nodal(values, len(X), what)[body.slot_node], 0.0)
+
+
+def component_mask(text: str, what: str) -> np.ndarray:
+    """(3,) ones where a letter of "xyz" is named."""
+    out = np.zeros(3)
+    if not isinstance(text, str) or not text or any(c not in COMPONENTS for c in text):
+        raise ModelError(f"{what}: components = {text!r} must be letters of 'xyz'")
+    for c in text:
+        out[COMPONENTS[c]] = 1.0
+    return out
+
+
+def support_slots(nodes: NodeSet, which: str) -> np.ndarray:
+    """Body slots of a node set, of the kinds named (see Family.kinds)."""
+    body = nodes.body
+    kinds = body.family.kinds(which)
+    first = body.node_slot[nodes.indices]
+    first = first[first >= 0]
+    if not len(first):
+        return first
+    counts = body.node_slot_count[body.slot_node[first]]
+    every = np.concatenate([f + np.arange(c) for f, c in zip(first, counts)])
+    return every[np.isin(body.slot_kind[every], sorted(kinds))]
+
+
+def assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[str, Material]], np.ndarray]:
+    """Laws with the names of their groups, and each element's index into them."""
+    if isinstance(material, Material):
+        _check_density(name, "", material, mesh)
+        return [("", material)], np.zeros(len(mesh.cells), dtype=np.int64)
+    if not isinstance(material, dict) or not all(isinstance(m, Material) for m in material.values()):
+        raise ModelError(f"body {name!r}: material must be a law or a dict of group name to law, got {material!r}")
+    index = np.full(len(mesh.cells), -1, dtype=np.int64)
+    for k, (group, law) in enumerate(material.items()):
+        if group not in mesh.element_sets:
+            raise ModelError(
+                f"body {name!r}: material group {group!r} is not an element group of {mesh.label}; there are "
+                f"{sorted(mesh.element_sets)}"
+            )
+        members = mesh.element_sets[group]
+        twice = members[index[members] >= 0]
+        if len(twice):
+            raise ModelError(f"body {name!r}: element {int(twice[0])} is in two material groups, one of them {group!r}")
+        index[members] = k
+        _check_density(name, group, law, mesh)
+    bare = np.flatnonzero(index < 0)
+    if len(bare):
+        raise ModelError(
+            f"body {name!r}: {len(bare)} elements of {mesh.label} have no material, the first is element "
+            f"{int(bare[0])}; groups given: {sorted(material)}"
+        )
+    return list(material.items()), index
+
+
+def _check_density(name: str, group: str, material: Any, mesh: Mesh) -> None:
+    density: float | np.ndarray | Callable[[np.ndarray], np.ndarray] = material.density
+    if callable(density):
+        values = np.asarray(density(mesh.points), dtype=float)
+        if values.shape != (len(mesh.points),) or not np.all(np.isfinite(values) & (values > 0.0)):
+            raise ModelError(f"body {name!r}: density f(X) must give one positive finite value per point")
+    elif isinstance(density, np.ndarray) and density.ndim == 1 and len(density) != len(mesh.cells):
+        raise ModelError(
+            f"body {name!r}: density of group {group!r} has {len(density)} values for {len(mesh.cells)} elements"
+        )

@@ -1,0 +1,134 @@
+"""ANCF shell 3443: four nodes, each with position and three gradients (Paper I, 1.3.2), and remedies against locking.
+
+On the parent xi, eta in [0, 1] (mid-surface) and zeta in [-1/2, 1/2] (thickness) the basis is that of Eq. (3) with
+u = xi, w = eta and v = zeta: twelve functions of the mid-surface, and functions bilinear in the surface times the
+thickness. Slots 1 and 2 are gradients along the surface, slot 3 along the director; with bases on the parent square,
+shared nodes make the surface continuous also on distorted quads.
+
+Locking and its remedies, all in the choice of what is integrated where ("split"):
+- Poisson (thickness): a director that is one vector per point can't strain linearly through the thickness, so bending
+  meets (1-nu)^2/(1-2nu) of its stiffness (1.225 for nu = 0.3). The law is split into plane stress through the thickness,
+  which needs no such strain, and what couples the thickness to the surface, integrated on the mid-surface alone (the
+  split of Gerstmayr, Matikainen, Mikkola 2008 for beams, taken to shells).
+- shear: the bilinear director can't follow the slopes of the cubic surface, so a thin plate would have to bend with
+  constant curvature in each direction: it locks (w of a clamped 8x8 plate of t/L = 1e-3 is 3 % of what it should be, with
+  3x3 points as with 4x4). The covariant transverse shears are taken at the corners and the middles of the edges they run
+  along, where neighbours share them, and interpolated (assumed natural strain, Dvorkin and Bathe 1984, Eng. Comput. 1:77;
+  here with the quadratic that Hermite's edges have): two conditions per node and one per edge are left, fewer than unknowns.
+- membrane: the surface is cubic and carries its own in-plane strain; plane stress at 4x4 points is exact in it.
+- nearly incompressible: the thickness part is one point through the thickness.
+"full" is Paper I's law at 4x4x2 points, without remedies.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from ..materials import Material
+from .ancf import fold, nodal_basis, nodal_functions
+from .ancf_beam import box_corners, box_lattice, svk_only
+from .family import Family, Parent, Part, Tying, register
+from .quadrature import box_rule, square_rule
+
+__all__ = ["POWERS", "SHELL"]
+
+# exponents of (xi, eta, zeta) in Paper I's order with u = xi, w = eta, v = zeta
+POWERS = np.array(
+    [(0, 0, 0), (1, 0, 0), (0, 0, 1), (0, 1, 0), (1, 1, 0), (0, 1, 1), (1, 0, 1), (2, 0, 0), (0, 2, 0), (3, 0, 0)]
+    + [(0, 3, 0), (2, 1, 0), (1, 2, 0), (1, 1, 1), (3, 1, 0), (1, 3, 0)]
+)
+NODES = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
+LOW, HIGH = (0.0, 0.0, -0.5), (1.0, 1.0, 0.5)
+RANGES = tuple(zip(LOW, HIGH))
+
+
+@functools.cache
+def _inverse() -> np.ndarray:
+    return nodal_basis(POWERS, NODES)
+
+
+def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return fold(*nodal_functions(POWERS, _inverse(), xi), frames)
+
+
+def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
+    """Through the thickness: plane stress in the surface, and E across it without coupling; no transverse shear."""
+    m = svk_only(material)
+    _, mu = m.lame
+    c = m.E / (1.0 - m.nu**2)
+    return "orthotropic", (c, c, m.E, 0.0, 0.0, m.nu * c, 0.0, 0.0, mu)
+
+
+def _thickness_part(material: Material) -> tuple[str, tuple[float, ...]]:
+    """On the mid-surface: what of the full law couples the thickness to the surface."""
+    m = svk_only(material)
+    lam, mu = m.lame
+    c = m.E / (1.0 - m.nu**2)
+    d = lam + 2.0 * mu
+    return "orthotropic", (d - c, d - c, d - m.E, lam, lam, lam - m.nu * c, 0.0, 0.0, 0.0)
+
+
+def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
+    """Transverse shear."""
+    _, mu = svk_only(material).lame
+    return "assumed_shear", (mu,)
+
+
+def _tie_weights(xi: np.ndarray) -> np.ndarray:
+    """(Q, 12): quadratic along a shear's own direction, linear across."""
+
+    def across(x: np.ndarray) -> list[np.ndarray]:
+        return [1.0 - x, x]
+
+    def along(x: np.ndarray) -> list[np.ndarray]:
+        return [(1.0 - x) * (1.0 - 2.0 * x), 4.0 * x * (1.0 - x), x * (2.0 * x - 1.0)]
+
+    x, y = xi[:, 0], xi[:, 1]
+    first = [a * b for b in across(y) for a in along(x)]
+    second = [a * b for a in across(x) for b in along(y)]
+    return np.stack(first + second, axis=1)
+
+
+SHEAR = Tying(
+    points=np.array([(x, y, 0.0) for y in (0.0, 1.0) for x in (0.0, 0.5, 1.0)]
+                    + [(x, y, 0.0) for x in (0.0, 1.0) for y in (0.0, 0.5, 1.0)]),
+    direction=np.repeat([0, 1], 6),
+    interpolation=_tie_weights,
+)
+
+
+_SIDES = box_corners(LOW, HIGH)
+
+SHELL = register(
+    Family(
+        name="3443",
+        cell_type="quad",
+        node_slots=((0, 1, 2, 3),) * 4,
+        shape=_shape,
+        rules={"full": box_rule((4, 4, 2), RANGES)},
+        curved_rule=box_rule((4, 4, 2), RANGES),
+        mass_rule=box_rule((4, 4, 2), RANGES),
+        curved_mass_rule=box_rule((8, 8, 3), RANGES),
+        vertices=NODES,
+        affine=False,
+        parent=Parent(LOW, HIGH),
+        # bottom, top, then the strips over the edges 01, 12, 23, 30 of the quad
+        faces=(_SIDES[4], _SIDES[5], _SIDES[2], _SIDES[1], _SIDES[3], _SIDES[0]),
+        face_rule=square_rule(5),
+        divisions=((3, 3), (3, 3), (3, 1), (3, 1), (3, 1), (1, 3)),
+        node_samples=NODES[:, None] + np.array([(0.0, 0.0, -0.5), (0.0, 0.0, 0.5)]),
+        lattice=box_lattice(LOW, HIGH, (2, 2, 1)),
+        schemes={
+            "split": (
+                Part("surface", box_rule((4, 4, 2), RANGES), _plane_stress, framed=True),
+                Part("thickness", box_rule((4, 4, 1), RANGES), _thickness_part, framed=True),
+                Part("shear", box_rule((4, 4, 2), RANGES), _shear_part, tying=SHEAR),
+            ),
+        },
+        slot_sets={"surface": (1, 2), "director": (3,)},
+        spin_vectors=1,
+        solid=False,
+    )
+)
