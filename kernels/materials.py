@@ -286,7 +286,7 @@ LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, 
 """Device laws by name. A new law is one entry here and one class in warpfea/materials.py."""
 
 
-ANY_J = ("svk", "orthotropic", "assumed_shear")
+ANY_J = ("svk", "orthotropic", "assumed_strain")
 """Laws that are defined for any F; the others need J > 0."""
 
 

@@ -1,7 +1,7 @@
-"""Transverse shear of shells by assumed natural strain (Dvorkin and Bathe 1984): force, energy, tangent, blocks.
+"""Shears by assumed natural strain (Dvorkin and Bathe 1984): force, energy, tangent product and diagonal blocks.
 
-The covariant shears e_t = 2 E_(xi zeta) or 2 E_(eta zeta) are taken at tying points and interpolated; the interpolation,
-metric and quadrature are one symmetric matrix A per element, made on the host: Psi = (mu/2) e.A e.
+Covariant shears e_t = 2 E_ab are taken at tying points; interpolation, metric and quadrature are one symmetric matrix A
+per element, made on the host: Psi = (mu/2) e.A e.
 """
 
 import functools
@@ -24,11 +24,11 @@ def tied_struct(dtype: str):
     class TiedBlock:
         conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
         is_position: wp.array(dtype=T)  # [local]
-        along: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi or ds_i/deta
-        through: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dzeta
-        X_along: wp.array2d(dtype=vec3)  # [tie, elem] reference X_xi or X_eta
-        X_through: wp.array2d(dtype=vec3)  # [tie, elem] reference X_zeta
-        coupling: wp.array3d(dtype=T)  # [tie, tie, elem] A
+        first: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_a
+        second: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
+        X_first: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
+        X_second: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
+        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the tie's run
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
         contribution_offset: wp.int32
@@ -40,16 +40,20 @@ def tied_struct(dtype: str):
 
 
 @functools.cache
-def tied_kernels(dtype: str, slots: int, ties: int) -> _types.SimpleNamespace:
-    """Kernels of tied elements; their arguments are those of `element_kernels`, so that one loop launches both."""
+def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.SimpleNamespace:
+    """Kernels of tied elements; their arguments are those of `element_kernels`, so that one loop launches both.
+
+    Args:
+        width: A couples the ties of each run of so many.
+    """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Block = tied_struct(dtype)
-    module = kernel_module(f"tied_{dtype}_{slots}_{ties}")
+    module = kernel_module(f"tied_{dtype}_{slots}_{ties}_{width}")
     Local = wp.types.matrix(shape=(slots, 3), dtype=T)
     Ties = wp.types.vector(length=ties, dtype=T)
     TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
-    NS, NT = slots, ties
+    NS, NT, W = slots, ties, width
 
     @wp.func
     def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
@@ -69,12 +73,12 @@ def tied_kernels(dtype: str, slots: int, ties: int) -> _types.SimpleNamespace:
 
     @wp.func
     def shears(block: Block, U: Local, elem: int) -> Ties:
-        """x_along . x_through less its reference value, without cancellation."""
+        """x_a . x_b less its reference value, without cancellation."""
         e = Ties()
         for t in range(NT):
-            a = line(block.along, U, t, elem)
-            d = line(block.through, U, t, elem)
-            e[t] = wp.dot(block.X_along[t, elem], d) + wp.dot(a, block.X_through[t, elem] + d)
+            a = line(block.first, U, t, elem)
+            d = line(block.second, U, t, elem)
+            e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, block.X_second[t, elem] + d)
         return e
 
     @wp.func
@@ -84,8 +88,9 @@ def tied_kernels(dtype: str, slots: int, ties: int) -> _types.SimpleNamespace:
         s = Ties()
         for t in range(NT):
             total = T(0.0)
-            for k in range(NT):
-                total += block.coupling[t, k, elem] * e[k]
+            first = (t / W) * W
+            for k in range(W):
+                total += block.coupling[t, k, elem] * e[first + k]
             s[t] = mu * total
         return s
 
@@ -102,7 +107,7 @@ def tied_kernels(dtype: str, slots: int, ties: int) -> _types.SimpleNamespace:
         min_J: wp.array(dtype=wp.float64),
         domain_J: wp.array(dtype=wp.float64),
     ):
-        """f_i = sum_t s_t (along_ti x_through + through_ti x_along), and the energy e.s/2."""
+        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), and the energy e.s/2."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -111,10 +116,10 @@ def tied_kernels(dtype: str, slots: int, ties: int) -> _types.SimpleNamespace:
         s = stresses(block, e, world, elem)
         f = Local()
         for t in range(NT):
-            a = s[t] * (block.X_along[t, elem] + line(block.along, U, t, elem))
-            d = s[t] * (block.X_through[t, elem] + line(block.through, U, t, elem))
+            a = s[t] * (block.X_first[t, elem] + line(block.first, U, t, elem))
+            d = s[t] * (block.X_second[t, elem] + line(block.second, U, t, elem))
             for i in range(NS):
-                f[i] = f[i] + block.along[t, i, elem] * d + block.through[t, i, elem] * a
+                f[i] = f[i] + block.first[t, i, elem] * d + block.second[t, i, elem] * a
         for i in range(NS):
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
         energy[0, world, block.element_offset + elem] = wp.float64(T(0.5) * wp.dot(e, s))
@@ -139,19 +144,19 @@ def tied_kernels(dtype: str, slots: int, ties: int) -> _types.SimpleNamespace:
         P = load(block, direction, world, elem)
         de = Ties()
         for t in range(NT):
-            a = block.X_along[t, elem] + line(block.along, U, t, elem)
-            d = block.X_through[t, elem] + line(block.through, U, t, elem)
-            de[t] = wp.dot(a, line(block.through, P, t, elem)) + wp.dot(d, line(block.along, P, t, elem))
+            a = block.X_first[t, elem] + line(block.first, U, t, elem)
+            d = block.X_second[t, elem] + line(block.second, U, t, elem)
+            de[t] = wp.dot(a, line(block.second, P, t, elem)) + wp.dot(d, line(block.first, P, t, elem))
         s = stresses(block, shears(block, U, elem), world, elem)
         ds = stresses(block, de, world, elem)
         f = Local()
         for t in range(NT):
-            a = block.X_along[t, elem] + line(block.along, U, t, elem)
-            d = block.X_through[t, elem] + line(block.through, U, t, elem)
-            da = ds[t] * a + s[t] * line(block.along, P, t, elem)
-            dd = ds[t] * d + s[t] * line(block.through, P, t, elem)
+            a = block.X_first[t, elem] + line(block.first, U, t, elem)
+            d = block.X_second[t, elem] + line(block.second, U, t, elem)
+            da = ds[t] * a + s[t] * line(block.first, P, t, elem)
+            dd = ds[t] * d + s[t] * line(block.second, P, t, elem)
             for i in range(NS):
-                f[i] = f[i] + block.along[t, i, elem] * dd + block.through[t, i, elem] * da
+                f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
         for i in range(NS):
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
 
@@ -172,14 +177,15 @@ def tied_kernels(dtype: str, slots: int, ties: int) -> _types.SimpleNamespace:
         for i in range(NS):
             b = TieVectors()
             for t in range(NT):
-                a = block.X_along[t, elem] + line(block.along, U, t, elem)
-                d = block.X_through[t, elem] + line(block.through, U, t, elem)
-                b[t] = block.along[t, i, elem] * d + block.through[t, i, elem] * a
+                a = block.X_first[t, elem] + line(block.first, U, t, elem)
+                d = block.X_second[t, elem] + line(block.second, U, t, elem)
+                b[t] = block.first[t, i, elem] * d + block.second[t, i, elem] * a
             K = mat33()
             for t in range(NT):
                 row = vec3()
-                for k in range(NT):
-                    row += block.coupling[t, k, elem] * b[k]
+                first = (t / W) * W
+                for k in range(W):
+                    row += block.coupling[t, k, elem] * b[first + k]
                 K += wp.outer(b[t], row)
             entry = block.contribution_offset + i * block.count + elem
             contribution[world, entry] = mu * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])

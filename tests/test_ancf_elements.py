@@ -1,4 +1,4 @@
-"""ANCF families 3243, 3443, ENMC, FN, FN18, H3843: functions, continuity, rigid modes, mass, tangent, patch tests, fall."""
+"""ANCF families: functions, continuity, rigid modes, mass, tangent, patch tests, free fall."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import warp as wp
 
 import warpfea as wf
 from warpfea import assembly, elements
+from warpfea.elements import ancf, ancf_beam, ancf_shell
 from warpfea.surfaces import element_functions
 
 RHO, E_MODULUS = 7.0, 1e6
@@ -134,9 +135,10 @@ SHAPES = {
     "H3843 skew": solid("H3843", lambda X: placed(skew(X))),
     "H3843 distorted": solid("H3843", corner_moved),
 }
-SPLIT = [(name, i) for name in SHAPES if name[:5] in ("beam ", "shell") for i in ("split", "full")]
+INTEGRATIONS = {"beam": (*elements.get("3243").schemes, "full"), "shell": (*elements.get("3443").schemes, "full")}
+SPLIT = [(name, i) for name in SHAPES for i in INTEGRATIONS.get(name.split()[0], ())]
 WITH_RULES = SPLIT + [(name, None) for name in SHAPES if (name, "split") not in SPLIT]
-ONE_EACH = [("beam arc", "split"), ("beam arc", "full"), ("shell distorted", "split"), ("shell distorted", "full")]
+ONE_EACH = [c for c in SPLIT if c[0] in ("beam arc", "shell distorted")]
 ONE_EACH += [("ENMC curved", None), ("FN", None), ("FN18", None), ("H3843 distorted", None)]
 
 
@@ -219,12 +221,31 @@ def test_linear_fields(name):
     assert np.abs(np.einsum("esk,eqsl->eqkl", e, h) - A).max() < 1e-11
 
 
+def test_paper_bases(data):
+    """Paper I's monomials: 3243 of Eq. (2), and 3443 of Eq. (3), which needs its nodes in the u-w plane."""
+    xi = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    powers = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (2, 0, 0), (3, 0, 0)])
+    inverse = ancf.nodal_basis(powers, np.array([(0.0, 0, 0), (1.0, 0, 0)]))
+    for mine, expected in zip(ancf_beam.parent_functions(xi), ancf.nodal_functions(powers, inverse, xi)):
+        assert np.abs(mine - expected).max() < 1e-13
+    ref = data.json("S6_i_iii_shell_basis_tet_rules")["i_shell3443"]
+    square = np.array([(-1.0, -1, 0), (1.0, -1, 0), (1.0, 1, 0), (-1.0, 1, 0)])
+    s, _ = ancf.nodal_functions(ancf_shell.POWERS, ancf.nodal_basis(ancf_shell.POWERS, square), xi)
+    u, w, v = xi.T
+    expected = [eval(f, {"u": u, "v": v, "w": w}) for f in ref["nodes_u-w_plane"]["shape_functions"]]  # r, u, v, w
+    order = (np.arange(16).reshape(4, 4)[:, [0, 1, 3, 2]]).ravel()
+    assert np.abs(s - np.array(expected).T[:, order]).max() < 1e-13
+    for plane in ([0, 2, 1], [2, 1, 0]):  # u-v, v-w
+        with pytest.raises(wf.ModelError, match=r"rank 10 at these 4 nodes; .* u-w plane"):
+            ancf.nodal_basis(ancf_shell.POWERS, square[:, plane])
+
+
 def polynomials(degree, dimension=3):
     powers = [p for p in itertools.product(range(degree + 1), repeat=3) if sum(p) <= degree]
     return [p for p in powers if not any(p[dimension:])]
 
 
-def reproduced(body, degree, dimension=3, turn=np.eye(3)):
+def reproduced(body, degree, dimension, turn):
     """Error of interpolating monomials of X in turned axes, largest at random points per monomial."""
     family = body.family
     s, _, _ = tables(body, parent_points(family) * np.repeat([1.0, 0.0], [dimension, 3 - dimension]))
@@ -233,7 +254,9 @@ def reproduced(body, degree, dimension=3, turn=np.eye(3)):
     node = Y[np.flatnonzero(body.slot_kind == 0)][np.cumsum(body.slot_kind == 0) - 1]  # position of each slot's node
     errors = []
     for p in np.array(polynomials(degree, dimension)):
-        grad = np.stack([p[k] * np.prod(node ** np.maximum(p - np.eye(3, dtype=int)[k], 0), axis=1) for k in range(3)], 1)
+        grad = np.stack(
+            [p[k] * np.prod(node ** np.maximum(p - np.eye(3, dtype=int)[k], 0), axis=1) for k in range(3)], 1
+        )
         value = np.where(body.slot_kind == 0, np.prod(node**p, axis=1), np.sum(grad * Y, axis=1))
         got = np.einsum("eqs,es->eq", s, value[body.connectivity])
         errors.append(np.abs(got - np.prod(X**p, axis=2)).max())
@@ -298,7 +321,8 @@ def shared_faces(body):
             near = gap.argmin(axis=1)
             offset = np.round(2 * (corners - family.node_points[corners_of][near])).astype(int)
             labels = [(cell[corners_of[n]], *o) for n, o in zip(near, offset)]
-            if "3443" in family.name and np.ptp(corners[:, 2]) == 0 or "3243" in family.name and np.ptp(corners[:, 0]) > 0:
+            free = {"line": np.ptp(corners[:, 0]) > 0, "quad": np.ptp(corners[:, 2]) == 0}
+            if free.get(family.cell_type, False):
                 continue
             other = seen.setdefault(frozenset(labels), (e, labels, corners))
             if other[0] != e:
@@ -345,8 +369,9 @@ def lowest_elastic_eigenvalue(model):
     return 1 / scipy.linalg.eigh(d[:, None] * M * d, d[:, None] * high * d, eigvals_only=True)[-1]
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
-@pytest.mark.parametrize(("name", "integration"), WITH_RULES)
+@pytest.mark.parametrize(
+    ("name", "integration", "n"), [(*c, n) for c in WITH_RULES for n in (1, 2, 3) if n == 3 or "curved" not in c[0]]
+)
 def test_six_rigid_modes_and_no_more(name, integration, n):
     """One element, two, a patch; thick and thin. A zero-energy mode would make a seventh zero.
 
@@ -356,7 +381,7 @@ def test_six_rigid_modes_and_no_more(name, integration, n):
         _, model = build(name, integration, n=n, t=t)
         values = scaled_eigenvalues(model.tangent_matrix(model.state()).toarray())
         assert np.abs(values[:6]).max() < 1e-14
-        assert values[6] > 0.1 * t**2 if t else 1e-3
+        assert values[6] > (0.1 * t**2 if t else 1e-3)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -372,7 +397,7 @@ def test_no_mode_below_bending(name, integration, n):
     thin = E_MODULUS / RHO * t**2 / 12
     theory = thin * 4.730041**4 if name == "beam straight" else thin / (1 - 0.3**2) * 13.468**2
     ratio = lowest_elastic_eigenvalue(model) / theory
-    assert 0.99 < ratio < (1.45 if integration == "split" else 2.0)  # one cubic bends 1.44 times too stiff
+    assert 0.99 < ratio < (2.0 if integration == "full" else 1.45)  # one cubic bends 1.44 times too stiff
 
 
 @pytest.mark.parametrize("angle", [1.0, 77.0, 180.0])
@@ -458,43 +483,40 @@ def ring(n, t=0.1):
 
 
 def test_mass_of_a_ring_sector(data):
-    """Against a fine quadrature of its Hermite cubics (exact), and the true ring's closed form (fourth order)."""
+    """Against the true ring's closed form, which the linearly interpolated section approaches at second order, and
+    against a fine quadrature of the interpolated geometry."""
     a, t, w = 1.5, 0.1, 0.15
-    r = np.array([np.log(1 + t / 2) - np.log(1 - t / 2), t, t, t + t**3 / 4 * (1 / 3)])  # int r^k dr, k = -1 .. 2
-    r3 = ((1 + t / 2) ** 4 - (1 - t / 2) ** 4) / 4
     mass = RHO * a * t * w
-    center = RHO * w * r[3] * np.array([math.sin(a), 1 - math.cos(a), 0]) / mass
+    center = RHO * w * (t + t**3 / 12) * np.array([math.sin(a), 1 - math.cos(a), 0]) / mass
+    third = ((1 + t / 2) ** 4 - (1 - t / 2) ** 4) / 4  # int r^3 dr
     cc, ss, cs = a / 2 + math.sin(2 * a) / 4, a / 2 - math.sin(2 * a) / 4, math.sin(a) ** 2 / 2
-    second = RHO * w * r3 * np.array([[cc, cs, 0], [cs, ss, 0], [0, 0, 0]])
+    second = RHO * w * third * np.array([[cc, cs, 0], [cs, ss, 0], [0, 0, 0]]) - mass * np.outer(center, center)
     second[2, 2] = mass * w**2 / 12
-    second -= mass * np.outer(center, center)
     errors = []
-    for n in (4, 8):
+    for n in (8, 16):
         found = moments(*ring(n))
-        errors.append([np.abs(x - y).max() / np.abs(y).max() for x, y in zip(found, (mass, center, second))])
-    assert np.max(errors[1]) < 2e-5
-    assert np.min(np.array(errors[0]) / errors[1]) > 10
-    body, model = ring(2)
+        errors.append([data.error(x, y) for x, y in zip(found, (mass, center, second))])
+    assert np.max(errors[1]) < 1e-3
+    assert np.min(np.array(errors[0]) / errors[1]) > 3.9
+
     x, weight = np.polynomial.legendre.leggauss(20)
-    xi = np.stack(np.meshgrid((1 + x) / 2, x / 2, x[:1] * 0, indexing="ij"), axis=-1).reshape(-1, 3)
-    dV = np.einsum("i,j->ij", weight / 2, weight / 2).ravel()
-    theta = a / 2 * np.arange(3)
-    total, first = 0.0, np.zeros(3)
-    for p, q in itertools.pairwise(theta):
-        s = xi[:, 0]
-        H = np.stack([1 - 3 * s**2 + 2 * s**3, s - 2 * s**2 + s**3, 3 * s**2 - 2 * s**3, s**3 - s**2], axis=1)
-        dH = np.stack([6 * s**2 - 6 * s, 1 - 4 * s + 3 * s**2, 6 * s - 6 * s**2, 3 * s**2 - 2 * s], axis=1)
-        e, de = (np.array([[math.cos(k), math.sin(k)] for k in (p, q)]), np.array([[-math.sin(k), math.cos(k)] for k in (p, q)]))
-        nodes = np.stack([e[0], de[0] * a / 2, e[1], de[1] * a / 2])
-        radial = t * ((1 - s[:, None]) * e[0] + s[:, None] * e[1])
-        place = H @ nodes + xi[:, 1, None] * radial
-        along = dH @ nodes + xi[:, 1, None] * t * (e[1] - e[0])
-        det = w * np.abs(along[:, 0] * radial[:, 1] - along[:, 1] * radial[:, 0])
-        total += RHO * dV @ det
-        first[:2] += RHO * (dV * det) @ place
-    mass, center, _ = moments(body, model)
-    assert data.error(mass, total) < 1e-10  # the curve's derivative is taken by differences, to 1e-11
-    assert data.error(center, first / total) < 1e-10
+    s, eta = (g.ravel() for g in np.meshgrid((1 + x) / 2, x / 2, indexing="ij"))
+    dA = np.einsum("i,j->ij", weight / 2, weight / 2).ravel() * RHO * w
+    H = np.polynomial.Polynomial
+    hermite = [H([1, 0, -3, 2]), H([0, 1, -2, 1]), H([0, 0, 3, -2]), H([0, 0, -1, 1])]
+    total, first = 0.0, np.zeros(2)
+    for p in (0.0, a / 2):
+        out = np.array([[math.cos(k), math.sin(k)] for k in (p, p + a / 2)])
+        tangent = out[:, ::-1] * [-1, 1] * a / 2
+        ends = np.stack([out[0], tangent[0], out[1], tangent[1]])
+        radial = t * (out[0] + s[:, None] * (out[1] - out[0]))
+        place = np.stack([h(s) for h in hermite], axis=1) @ ends + eta[:, None] * radial
+        along = np.stack([h.deriv()(s) for h in hermite], axis=1) @ ends + eta[:, None] * t * (out[1] - out[0])
+        dm = dA * np.abs(along[:, 0] * radial[:, 1] - along[:, 1] * radial[:, 0])
+        total, first = total + dm.sum(), first + dm @ place
+    mass, center, _ = moments(*ring(2))
+    assert data.error(mass, total) < 1e-9  # add_beam takes the curve's derivative by differences
+    assert data.error(center[:2], first / total) < 1e-9
 
 
 # tangent and energy
@@ -530,7 +552,7 @@ def test_tangent_and_force_are_derivatives(name, integration, data):
 # patch tests
 
 
-STRETCH = np.array([[0.9, 0.15, 0.0], [0.15, 1.2, 0.0], [0.0, 0.0, 1.1]])  # no transverse shear
+STRETCH = np.array([[1.1, 0.15, 0.0], [0.15, 1.2, 0.0], [0.0, 0.0, 0.95]])  # no transverse shear
 SHEAR = STRETCH + np.array([[0.0, 0.0, 0.1], [0.0, 0.0, -0.15], [0.1, -0.15, 0.0]])
 
 
@@ -547,37 +569,50 @@ def solid_mesh(element):
     return lifted(wf.mesh.box((1, 0.8, 0.8), cells=(3, 2, 2), element="T4"), amount=0.25)
 
 
-def patch(b, body, A):
-    """Outer slots held at e = A E, inner ones started elsewhere: error of the solution over the largest displacement."""
-    mesh = body.mesh
-    rows = mesh.boundary()
-    outer = np.unique(mesh.cells[rows[:, 0, None], mesh.kind.faces[rows[:, 1]]])
+def patch(b, body, A, outer, sides=()):
+    """Outer nodes held at e = A E, inner ones started elsewhere: error of the solution over the largest displacement.
+
+    Sides that no node holds get the traction P N of the constant stress.
+    """
     b.clamp(body.nodes(outer))
+    E = 0.5 * (A.T @ A - np.eye(3))
+    lam, mu = SVK.lame
+    P = A @ (lam * np.trace(E) * np.eye(3) + 2 * mu * E)
+    for name, normal in sides:
+        b.add_traction(body.surface(name), P @ normal)
     model = b.finalize(device="cpu")
     exact = affine(body, A)
     free = model.free_slots[:, 0]
     assert free.sum() >= 8
     noise = np.random.default_rng(2).uniform(-1, 1, exact.shape)
-    state = state_of(model, exact + free[:, None] * np.where(body.slot_kind == 0, 0.003, 0.03)[:, None] * noise)
+    state = state_of(model, exact + free[:, None] * np.where(body.slot_kind == 0, 0.002, 0.02)[:, None] * noise)
     result = wf.solve_static(model, load_steps=1, tol=1e-13, state=state)
     return np.abs(result.state.displacement.numpy()[0] - exact).max() / np.abs(exact).max()
 
 
-@pytest.mark.parametrize("integration", ["split", "full"])
+def outer_nodes(mesh):
+    rows = mesh.boundary()
+    return np.unique(mesh.cells[rows[:, 0, None], mesh.kind.faces[rows[:, 1]]])
+
+
+def patch_of_shell(kind, integration, A):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = b.add_shell(plate_mesh(kind), thickness=0.1, material=SVK, integration=integration)
+    sides = [("top", TURN[:, 2]), ("bottom", -TURN[:, 2])]
+    return patch(b, body, rotation(40.0) @ TURN @ A @ TURN.T, outer_nodes(body.mesh), sides)
+
+
+@pytest.mark.parametrize("integration", INTEGRATIONS["shell"])
 @pytest.mark.parametrize("kind", ["parallelograms", "quads"])
 def test_patch_of_shells(kind, integration):
     """Stretch, in-plane shear, thickness change and rotation; the directors stay normal."""
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
-    body = b.add_shell(plate_mesh(kind), thickness=0.1, material=SVK, integration=integration)
-    assert patch(b, body, rotation(40.0) @ TURN @ STRETCH @ TURN.T) < 1e-9
+    assert patch_of_shell(kind, integration, STRETCH) < 1e-9
 
 
+@pytest.mark.parametrize("integration", INTEGRATIONS["shell"])
 @pytest.mark.parametrize(("kind", "bound"), [("parallelograms", 1e-9), ("quads", 1e-9)])
-@pytest.mark.parametrize("integration", ["split", "full"])
 def test_patch_of_shells_with_transverse_shear(kind, bound, integration):
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
-    body = b.add_shell(plate_mesh(kind), thickness=0.1, material=SVK, integration=integration)
-    assert patch(b, body, rotation(40.0) @ TURN @ SHEAR @ TURN.T) < bound
+    assert patch_of_shell(kind, integration, SHEAR) < bound
 
 
 @pytest.mark.parametrize(
@@ -587,22 +622,17 @@ def test_patch_of_shells_with_transverse_shear(kind, bound, integration):
 def test_patch_of_solids(element, rule):
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(solid_mesh(element), material=SVK, element=element, quadrature=rule)
-    assert patch(b, body, rotation(40.0) @ SHEAR) < 1e-9
+    assert patch(b, body, rotation(40.0) @ SHEAR, outer_nodes(body.mesh)) < 1e-9
 
 
-@pytest.mark.parametrize("integration", ["split", "full"])
+@pytest.mark.parametrize("integration", INTEGRATIONS["beam"])
 def test_patch_of_beams(integration):
-    """Elements of unequal length whose parameter runs unevenly; tension, twist-free shear and rotation."""
+    """Elements of unequal length whose parameter runs unevenly."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = beam(uneven)(b, 4, integration=integration)
-    b.clamp(body.start)
-    b.clamp(body.end)
-    model = b.finalize(device="cpu")
-    exact = affine(body, rotation(40.0) @ SHEAR)
-    free = model.free_slots[:, 0]
-    noise = 0.003 * np.random.default_rng(2).uniform(-1, 1, exact.shape)
-    result = wf.solve_static(model, load_steps=1, tol=1e-13, state=state_of(model, exact + free[:, None] * noise))
-    assert np.abs(result.state.displacement.numpy()[0] - exact).max() < 1e-9 * np.abs(exact).max()
+    (_, side, up), A = body.node_axes[0].T, rotation(40.0) @ SHEAR
+    sides = [("side-", -side), ("side+", side), ("normal-", -up), ("normal+", up)]
+    assert patch(b, body, A, [0, 4], sides) < 1e-9
 
 
 # free fall
@@ -667,4 +697,4 @@ def test_free_fall_of_all_families_beside_held_ones(dtype):
     edge = sim.displacements(driven)[0, driven.edge("x-").indices]
     assert np.abs(edge).max() < 1e-9
     free = sim.displacements(held)[0, held.end.indices[0]]
-    assert 0 < np.abs(free).max() < np.abs(fall("gravity", 1e-3, 10)).max() * 1.2
+    assert 0 < np.abs(free).max() < 2 * np.abs(fall("gravity", 1e-3, 10)).max()

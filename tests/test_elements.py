@@ -400,7 +400,7 @@ def hermite_basis(xi):
     return np.stack(values, axis=1), np.stack(slopes, axis=1)
 
 
-def hermite_shape(xi, nodes, frames):
+def hermite_shape(xi, nodes, frames=None):
     """Functions of the nodal values and gradients d/dX in the global frame, one row per element."""
     corners = elements.get("T4").node_points
     at_nodes, slopes_at_nodes = hermite_basis(corners)

@@ -211,34 +211,36 @@ def element_volumes(body: Body) -> np.ndarray:
 
 @dataclass(eq=False)
 class TiedTables:
-    """Tables of elements with an assumed shear: ds_i/dxi_k and ds_i/dzeta (E, n, S), X_k and X_zeta (E, n, 3), and
-    A (E, n, n) with Psi = (mu/2) e.A e for the covariant shears e (see kernels/tied.py)."""
+    """Tables of elements with tied shears e_t = x_a . x_b - X_a . X_b (see kernels/tied.py).
 
-    along: np.ndarray
-    through: np.ndarray
-    X_along: np.ndarray
-    X_through: np.ndarray
+    Attributes:
+        first, second: (E, n, S) ds_i/dxi_a and ds_i/dxi_b at the tying points.
+        X_first, X_second: (E, n, 3) X_a and X_b.
+        coupling: (E, n, width) A of Psi = (mu/2) e.A e.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    X_first: np.ndarray
+    X_second: np.ndarray
     coupling: np.ndarray
 
 
-def tied_tables(body: Body, elements: np.ndarray, part: Part) -> TiedTables:
-    """Tables of a tied part: Psi = (mu/2) int e_a e_b (g^ab g^33 + g^a3 g^b3), e interpolated from the tying points."""
+def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
+    """Tables of a tied part of some elements of a block."""
+    part, body = host.key.integral, host.body
     tying = part.tying
     assert tying is not None
     _, ds, J, _ = geometry(body, elements, tying.points)
-    ties = np.arange(len(tying.points))
-    along = np.moveaxis(ds[:, ties, :, tying.direction], 0, 1)
-    X_along = np.moveaxis(J[:, ties, :, tying.direction], 0, 1)
-    X_through = J[:, :, :, 2]
-    _, _, J, det = geometry(body, elements, part.rule.points)
-    g = np.linalg.inv(np.swapaxes(J, 2, 3) @ J)
-    # the metric's factor of each pair of tying points' directions
-    metric = g[:, :, :2, :2] * g[:, :, 2, 2][:, :, None, None] + g[:, :, :2, 2, None] * g[:, :, None, :2, 2]
-    D = tying.direction
-    N = tying.interpolation(part.rule.points)
-    w = det * part.rule.weights
-    coupling = np.einsum("eq,qs,qt,eqst->est", w, N, N, metric[:, :, D[:, None], D[None, :]], optimize=True)
-    return TiedTables(along, ds[:, :, :, 2], X_along, X_through, coupling)
+    t = np.arange(len(tying.points))
+    a, b = tying.pairs.T
+    _, _, J_rule, det = geometry(body, elements, part.rule.points)
+    coupling = tying.coupling(J, J_rule, det, part.rule, body.materials[host.material][1])
+    return TiedTables(
+        *(np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b)),
+        *(np.moveaxis(J[:, t, :, k], 0, 1) for k in (a, b)),
+        coupling,
+    )
 
 
 def orthonormal(J0: np.ndarray) -> np.ndarray:

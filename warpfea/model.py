@@ -177,7 +177,7 @@ class Model:
         if key.tying:
             self._tied_tables(data, key, parts)
             points = len(key.tying.points)
-            kernels = tied_kernels(self.dtype, family.slots, points)
+            kernels = tied_kernels(self.dtype, family.slots, points, key.tying.width)
         else:
             self._point_tables(data, key, parts)
             points = len(key.rule.weights)
@@ -187,11 +187,11 @@ class Model:
     def _tied_tables(self, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
         T, vec3 = self.types.T, self.types.vec3
         tables = [
-            assembly.tied_tables(part.body, members, key.integral)
+            assembly.tied_tables(part, members)
             for part in parts
             for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
         ]
-        for name, dtype in (("along", T), ("through", T), ("X_along", vec3), ("X_through", vec3), ("coupling", T)):
+        for name, dtype in (("first", T), ("second", T), ("X_first", vec3), ("X_second", vec3), ("coupling", T)):
             table = np.concatenate([getattr(t, name) for t in tables])
             axis = 1 if dtype is vec3 else 2
             setattr(data, name, self.array("elements", np.moveaxis(table, 0, axis), dtype))

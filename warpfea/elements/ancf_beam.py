@@ -4,10 +4,18 @@ On the parent xi in [0, 1], eta, zeta in [-1/2, 1/2] the basis [1, u, v, w, uv, 
 cubics along the axis, linear in the section. Slot 1 is the gradient along the beam's axis, 2 and 3 lie in the section
 (width, height); the axes are each node's own.
 
-A section that stays a parallelogram can't widen on one side and narrow on the other, so bending meets the stiffness
-of uniaxial *strain*: with nu = 0.3, 1.35 E. "split" (Gerstmayr, Matikainen, Mikkola 2008, Multibody Syst. Dyn. 20:359)
-integrates the part D0 of the SVK law that couples nothing over the volume, and the Poisson part D - D0 on the axis
-alone; bending then has E, tension the full law. "full" is Paper I's.
+Locking, and what the integrations do about it:
+- Poisson: a section that stays a parallelogram can't widen on one side and narrow on the other, so bending meets the
+  stiffness of uniaxial *strain*: with nu = 0.3, 1.35 E. The part D0 of the SVK law that couples nothing is integrated over
+  the volume, the Poisson part D - D0 on the axis alone (Gerstmayr, Matikainen, Mikkola 2008, Multibody Syst. Dyn. 20:359);
+  bending then has E, tension the full law.
+- shear: section vectors turn linearly along an element, a cubic axis does not. At Gauss points both must agree, and the
+  axis loses its cubic. "tied" takes the transverse shear at the nodes, where neighbours share it, and gives the axis's
+  deviation b from the sections in the middle the energy that its curvature would have: for a moment that varies linearly
+  along the element that is what bending lacks (the residual bending flexibility of MacNeal 1978, Comput. Struct. 8:175).
+- thickness: a section vector interpolated between two directions is too short in between; "tied" takes the strain in the
+  section at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
+"tied" has all three, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I).
 """
 
 from __future__ import annotations
@@ -17,8 +25,8 @@ import numpy as np
 from ..errors import ModelError
 from ..materials import SVK, Material
 from .ancf import fold
-from .family import Family, Lattice, Parent, Part, register
-from .quadrature import box_rule, square_rule
+from .family import Family, Lattice, Parent, Part, Tying, register
+from .quadrature import Rule, box_rule, square_rule
 
 __all__ = ["BEAM", "parent_functions", "svk_only"]
 
@@ -95,6 +103,57 @@ def box_lattice(low: tuple[float, ...], high: tuple[float, ...], parts: tuple[in
 
 
 SECTION = [(y, z) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
+GAUSS = [(y, z) for y in (-0.5 / 3**0.5, 0.5 / 3**0.5) for z in (-0.5 / 3**0.5, 0.5 / 3**0.5)]
+
+
+def _axial_part(material: Material) -> tuple[str, tuple[float, ...]]:
+    """D0 along the axis."""
+    return "orthotropic", (svk_only(material).E, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _section_part(material: Material) -> tuple[str, tuple[float, ...]]:
+    """D0 in the section."""
+    m = svk_only(material)
+    return "orthotropic", (0.0, m.E, m.E, 0.0, 0.0, 0.0, m.lame[1], 0.0, 0.0)
+
+
+def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
+    return "assumed_strain", (svk_only(material).lame[1],)
+
+
+def _shear_coupling(at: np.ndarray, J: np.ndarray, det: np.ndarray, rule: Rule, material: Material) -> np.ndarray:
+    """A (E, 24, 3) of the sum over section points and directions of V [mu (g_0^2 + g_1^2)/2 + c b^2]/2.
+
+    g = e/(|X_a| |X_b|) at the ends (0, 1) and in the middle (m), b = g_m - (g_0 + g_1)/2, c = (4/9) E t^2/h^2.
+    """
+    m = svk_only(material)
+    size = np.linalg.norm(at, axis=2)
+    a, b = SHEAR.pairs.T
+    t = np.arange(len(a))
+    scale = 1.0 / (size[:, t, a] * size[:, t, b])
+    volume = det @ rule.weights / len(GAUSS)
+    length = size[:, :, 0].mean(axis=1)
+    out = np.empty((len(at), len(a), 3))
+    deviation = np.array([-0.5, 1.0, -0.5])
+    for first in range(0, len(a), 3):
+        rows = slice(first, first + 3)
+        height = size[:, rows, b[first]].mean(axis=1)
+        c = 4.0 / 9.0 * (m.E / m.lame[1]) * (height / length) ** 2
+        block = 0.5 * np.diag([1.0, 0.0, 1.0]) + c[:, None, None] * np.outer(deviation, deviation)
+        out[:, rows] = volume[:, None, None] * scale[:, rows, None] * scale[:, None, rows] * block
+    return out
+
+
+STATIONS = [(x, y, z) for y, z in GAUSS for x in (0.0, 0.5, 1.0)]
+SHEAR = Tying(np.array(2 * STATIONS), np.repeat([(0, 1), (0, 2)], 12, axis=0), _shear_coupling, width=3)
+
+
+def at_ends(rule: Rule) -> Rule:
+    """A rule of two points along the axis moved to its ends (trapezoidal)."""
+    points = rule.points.copy()
+    points[:, 0] = np.round(points[:, 0])
+    return Rule(f"ends {rule.name}", points, rule.weights, 1, rule.counts)
+
 
 BEAM = register(
     Family(
@@ -116,6 +175,12 @@ BEAM = register(
         node_samples=np.array([[(x, y, z) for y, z in SECTION] for x in (0.0, 1.0)]),
         lattice=box_lattice(LOW, HIGH, (4, 1, 1)),
         schemes={
+            "tied": (
+                Part("axis", box_rule((3, 2, 2), RANGES), _axial_part, framed=True),
+                Part("section", at_ends(box_rule((2, 2, 2), RANGES)), _section_part, framed=True),
+                Part("D_nu", at_ends(box_rule((2, 1, 1), RANGES)), _poisson_part, framed=True),
+                Part("shear", box_rule((3, 2, 2), RANGES), _shear_part, tying=SHEAR),
+            ),
             "split": (
                 Part("D0", box_rule((3, 2, 2), RANGES), _poisson_free, framed=True),
                 Part("D_nu", box_rule((3, 1, 1), RANGES), _poisson_part, framed=True),

@@ -30,7 +30,7 @@ from ..materials import Material
 from .ancf import fold, nodal_basis, nodal_functions
 from .ancf_beam import box_corners, box_lattice, svk_only
 from .family import Family, Parent, Part, Tying, register
-from .quadrature import box_rule, square_rule
+from .quadrature import Rule, box_rule, square_rule
 
 __all__ = ["POWERS", "SHELL"]
 
@@ -73,7 +73,7 @@ def _thickness_part(material: Material) -> tuple[str, tuple[float, ...]]:
 def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
     """Transverse shear."""
     _, mu = svk_only(material).lame
-    return "assumed_shear", (mu,)
+    return "assumed_strain", (mu,)
 
 
 def _tie_weights(xi: np.ndarray) -> np.ndarray:
@@ -91,13 +91,24 @@ def _tie_weights(xi: np.ndarray) -> np.ndarray:
     return np.stack(first + second, axis=1)
 
 
-SHEAR = Tying(
-    points=np.array([(x, y, 0.0) for y in (0.0, 1.0) for x in (0.0, 0.5, 1.0)]
-                    + [(x, y, 0.0) for x in (0.0, 1.0) for y in (0.0, 0.5, 1.0)]),
-    direction=np.repeat([0, 1], 6),
-    interpolation=_tie_weights,
-)
+def _shear_coupling(at: np.ndarray, J: np.ndarray, det: np.ndarray, rule: Rule, material: Material) -> np.ndarray:
+    """A of Psi = (mu/2) int e_a e_b (g^ab g^33 + g^a3 g^b3), e interpolated from the tying points."""
+    g = np.linalg.inv(np.swapaxes(J, 2, 3) @ J)
+    metric = g[:, :, :2, :2] * g[:, :, 2, 2][:, :, None, None] + g[:, :, :2, 2, None] * g[:, :, None, :2, 2]
+    D = SHEAR.pairs[:, 0]
+    N = _tie_weights(rule.points)
+    return np.einsum("eq,qs,qt,eqst->est", det * rule.weights, N, N, metric[:, :, D[:, None], D[None, :]], optimize=True)
 
+
+SHEAR = Tying(
+    points=np.array(
+        [(x, y, 0.0) for y in (0.0, 1.0) for x in (0.0, 0.5, 1.0)]
+        + [(x, y, 0.0) for x in (0.0, 1.0) for y in (0.0, 0.5, 1.0)]
+    ),
+    pairs=np.repeat([(0, 2), (1, 2)], 6, axis=0),
+    coupling=_shear_coupling,
+    width=12,
+)
 
 _SIDES = box_corners(LOW, HIGH)
 

@@ -17,17 +17,20 @@ __all__ = ["Family", "Lattice", "Parent", "Part", "Tying", "families", "for_cell
 
 @dataclass(frozen=True, eq=False)
 class Tying:
-    """Assumed natural transverse shear: 2 E_(k zeta), k = xi or eta, at tying points, and how it is interpolated.
+    """Covariant strains e = 2 E_ab taken at tying points, and the energy Psi = (mu/2) e.A e made of them.
 
     Attributes:
         points: (n, 3) parent coordinates.
-        direction: (n,) 0 for xi, 1 for eta.
-        interpolation: function xi (Q, 3) -> (Q, n): weights of the tying points in the shear of their direction.
+        pairs: (n, 2) parent directions a, b of each strain.
+        coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q), the
+            rule, the material) -> A (E, n, width).
+        width: A couples the points of each run of so many.
     """
 
     points: np.ndarray
-    direction: np.ndarray
-    interpolation: Callable[[np.ndarray], np.ndarray]
+    pairs: np.ndarray
+    coupling: Callable[[np.ndarray, np.ndarray, np.ndarray, Rule, Any], np.ndarray]
+    width: int
 
 
 @dataclass(frozen=True, eq=False)
