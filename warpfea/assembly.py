@@ -235,7 +235,7 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
     t = np.arange(len(tying.points))
     a, b = tying.pairs.T
     _, _, J_rule, det = geometry(body, elements, part.rule.points)
-    coupling = tying.coupling(J, J_rule, det, part.rule, body.materials[host.material][1])
+    coupling = tying.coupling(J, J_rule, det, part.rule, body.materials[host.material][1], body.section)
     return TiedTables(
         *(np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b)),
         *(np.moveaxis(J[:, t, :, k], 0, 1) for k in (a, b)),

@@ -94,6 +94,7 @@ class Body:
         curved_rule: the same of elements with curved sides.
         frames: (elements, n, 3, 3) parent gradients dX/dxi at the element nodes, in the axes of the node, m; of
             families with gradient slots.
+        section: section of a beam.
         node_axes: (nodes, 3, 3) orthonormal axes (columns) of each node's gradient slots; None: the global ones.
         origin: (3,) body origin; device positions are relative to it.
         slots: (used nodes x slots per node) model slots in body order, set at finalize; -1 before.
@@ -108,6 +109,7 @@ class Body:
     curved_rule: str
     frames: np.ndarray | None = field(default=None, repr=False)
     node_axes: np.ndarray | None = field(default=None, repr=False)
+    section: Any = None
     index: int = -1
     slot_offset: int = -1
     velocity: np.ndarray | None = field(default=None, repr=False)

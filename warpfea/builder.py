@@ -139,8 +139,10 @@ class ModelBuilder:
             section: Rectangle(width, height); the height lies along the normal.
             normal: (3,), or a function of s; made perpendicular to the axis. A turning normal makes a twisted beam.
             material: one law.
-            integration: "split" (default with SVK; the Poisson part on the axis alone, which removes locking), "full"
-                (5x3x3 points, as Paper I; default with the other laws), or "3x2x2" points of the full law.
+            integration: "tied" (default with SVK; remedies against Poisson, shear and thickness locking, and the
+                section's shear and torsion factors), "split" (the Poisson part on the axis alone, as Project Chrono),
+                "full" (5x3x3 points, as Paper I; default with the other laws), or "3x2x2" points of the full law; see
+                warpfea.elements.ancf_beam.
             corners: "error", or "weld": a rigid corner, where both sides share the deformation gradient (Shabana and
                 Mikkola 2003).
             initial: initial positions, a function X (n, 3) -> (n, 3), where they differ from the stress-free reference.
@@ -151,7 +153,7 @@ class ModelBuilder:
         """
         name = self._name(name or "beam", given=name is not None)
         mesh, axes, frames = beam_geometry(name, curve, elements, section, normal, corners)
-        return self._add_structure(name, mesh, "3243", material, integration, axes, frames, initial)
+        return self._add_structure(name, mesh, "3243", material, integration, axes, frames, initial, section)
 
     def add_shell(
         self,
@@ -174,8 +176,9 @@ class ModelBuilder:
                 about it, (X_1 - X_0) x (X_3 - X_0).
             thickness: m.
             material: one law, or laws by element group of the mesh.
-            integration: "split" (default with SVK; remedies against thickness and shear locking, see
-                warpfea.elements.ancf_shell), or "full" (4x4x2 points of the full law; default with the other laws).
+            integration: "tied" (default with SVK; remedies against thickness and shear locking, and the shear factor
+                5/6), or "full" (4x4x2 points of the full law, as Paper I; default with the other laws); see
+                warpfea.elements.ancf_shell.
             normals: directors at the nodes, (nodes, 3) or a function X (n, 3) -> (n, 3), of a curved surface known
                 better than by its quads; by default the mean of the quads' normals.
             corners: "error" where normals differ by more than 30 degrees, or "weld": a rigid corner.
@@ -202,11 +205,12 @@ class ModelBuilder:
         axes: np.ndarray,
         frames: np.ndarray,
         initial: Any,
+        section: Rectangle | None = None,
     ) -> Body:
         materials, index = assign_materials(name, mesh, material)
         family = element_families.get(element)
         split = all(law.law == "svk" for _, law in materials)
-        scheme = integration or ("split" if split else "full")
+        scheme = integration or ("tied" if split else "full")
         known = [*family.schemes, *family.rules]
         if scheme not in known:
             raise ModelError(f"body {name!r}: integration = {scheme!r} is none of {', '.join(map(repr, known))}")
@@ -216,7 +220,7 @@ class ModelBuilder:
                 f"body {name!r}: integration = {scheme!r} splits the St. Venant-Kirchhoff law; use 'full' with "
                 f"{type(bad).__name__}"
             )
-        return self._add(Body(name, mesh, family, materials, index, scheme, scheme, frames, axes), initial)
+        return self._add(Body(name, mesh, family, materials, index, scheme, scheme, frames, axes, section), initial)
 
     def _mesh(self, mesh: Any, what: str, scale: float, transform: Any) -> Mesh:
         if isinstance(mesh, (str, pathlib.Path)):

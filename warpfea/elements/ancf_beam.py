@@ -15,10 +15,13 @@ Locking, and what the integrations do about it:
   along the element that is what bending lacks (the residual bending flexibility of MacNeal 1978, Comput. Struct. 8:175).
 - thickness: a section vector interpolated between two directions is too short in between; "tied" takes the strain in the
   section at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
-"tied" has all three, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I).
+- torsion and shear of a plane section (not locking, but too stiff as well): "tied" takes the section's own constants.
+"tied" has all of it, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I).
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,6 +30,9 @@ from ..materials import SVK, Material
 from .ancf import fold
 from .family import Family, Lattice, Parent, Part, Tying, register
 from .quadrature import Rule, box_rule, square_rule
+
+if TYPE_CHECKING:
+    from ..beams import Rectangle
 
 __all__ = ["BEAM", "parent_functions", "svk_only"]
 
@@ -121,31 +127,42 @@ def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
     return "assumed_strain", (svk_only(material).lame[1],)
 
 
-def _shear_coupling(at: np.ndarray, J: np.ndarray, det: np.ndarray, rule: Rule, material: Material) -> np.ndarray:
-    """A (E, 24, 3) of the sum over section points and directions of V [mu (g_0^2 + g_1^2)/2 + c b^2]/2.
+def _shear_coupling(
+    at: np.ndarray, J: np.ndarray, det: np.ndarray, rule: Rule, material: Material, section: Rectangle
+) -> np.ndarray:
+    """A (E, 24, 12): for each direction V/2 times the sum over modes of k [(g_0^2 + g_1^2)/2 + (c/mu) b^2].
 
-    g = e/(|X_a| |X_b|) at the ends (0, 1) and in the middle (m), b = g_m - (g_0 + g_1)/2, c = (4/9) E t^2/h^2.
+    g = e/(|X_a| |X_b|) at the ends (0, 1) and in the middle (m), b = g_m - (g_0 + g_1)/2; the modes of the section are
+    the mean, k the shear factor; what is odd across the direction, torsion, k = J_t/I_p; and the rest, k = 1.
+    c = (4/9) E t^2/h^2, which makes c b^2 V/2 the energy of a curvature that varies linearly along the element.
     """
     m = svk_only(material)
     size = np.linalg.norm(at, axis=2)
     a, b = SHEAR.pairs.T
     t = np.arange(len(a))
     scale = 1.0 / (size[:, t, a] * size[:, t, b])
-    volume = det @ rule.weights / len(GAUSS)
+    volume = det @ rule.weights
     length = size[:, :, 0].mean(axis=1)
-    out = np.empty((len(at), len(a), 3))
-    deviation = np.array([-0.5, 1.0, -0.5])
-    for first in range(0, len(a), 3):
-        rows = slice(first, first + 3)
-        height = size[:, rows, b[first]].mean(axis=1)
+    modes = np.array([np.ones(4), *np.sign(np.array(GAUSS).T), np.sign(np.prod(GAUSS, axis=1))]) / 4.0
+    ends, deviation = 0.5 * np.diag([1.0, 0.0, 1.0]), np.array([-0.5, 1.0, -0.5])
+    out = np.empty((len(at), len(a), 12))
+    for direction in (0, 1):
+        rows = slice(12 * direction, 12 * direction + 12)
+        height = size[:, rows, 1 + direction].mean(axis=1)
         c = 4.0 / 9.0 * (m.E / m.lame[1]) * (height / length) ** 2
-        block = 0.5 * np.diag([1.0, 0.0, 1.0]) + c[:, None, None] * np.outer(deviation, deviation)
+        along = {}
+        for k, mode in enumerate(modes):
+            factor = {0: section.shear, 2 - direction: section.torsion_ratio}.get(k, 1.0)
+            along[k] = np.kron(np.outer(mode, mode), factor * ends), np.kron(np.outer(mode, mode), np.outer(deviation, deviation))
+        plain = sum(pair[0] for pair in along.values())
+        bent = sum(pair[1] for pair in along.values())
+        block = plain + c[:, None, None] * bent
         out[:, rows] = volume[:, None, None] * scale[:, rows, None] * scale[:, None, rows] * block
     return out
 
 
 STATIONS = [(x, y, z) for y, z in GAUSS for x in (0.0, 0.5, 1.0)]
-SHEAR = Tying(np.array(2 * STATIONS), np.repeat([(0, 1), (0, 2)], 12, axis=0), _shear_coupling, width=3)
+SHEAR = Tying(np.array(2 * STATIONS), np.repeat([(0, 1), (0, 2)], 12, axis=0), _shear_coupling, width=12)
 
 
 def at_ends(rule: Rule) -> Rule:

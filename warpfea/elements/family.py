@@ -23,13 +23,13 @@ class Tying:
         points: (n, 3) parent coordinates.
         pairs: (n, 2) parent directions a, b of each strain.
         coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q), the
-            rule, the material) -> A (E, n, width).
+            rule, the material, the body's section) -> A (E, n, width).
         width: A couples the points of each run of so many.
     """
 
     points: np.ndarray
     pairs: np.ndarray
-    coupling: Callable[[np.ndarray, np.ndarray, np.ndarray, Rule, Any], np.ndarray]
+    coupling: Callable[[np.ndarray, np.ndarray, np.ndarray, Rule, Any, Any], np.ndarray]
     width: int
 
 
