@@ -72,7 +72,8 @@ def element_kernels(
     needs_J = law not in materials.ANY_J
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
     vertices = 4
-    name = f"element_{dtype}_{law}_{slots}_{points}_{'affine' if affine else 'table'}_{damping}{'_framed' if framed else ''}"
+    form = "affine" if affine else "framed" if framed else "table"
+    name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
     module = kernel_module(name)
     # what only some scenes or only outputs launch is compiled apart
     history_module = kernel_module(f"{name}_history")

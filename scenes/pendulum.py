@@ -17,7 +17,7 @@ def pendulum(
     E: float = 2e6,
     nu: float = 0.3,
     density: float = 7200.0,
-    integration: Literal["split", "full"] = "split",
+    integration: Literal["tied", "split", "full"] = "tied",
 ) -> wf.ModelBuilder:
     """A flexible pendulum of 3243 beams, pinned at one end and let go from the horizontal, bends as it falls.
 
@@ -30,7 +30,7 @@ def pendulum(
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.
         density: kg/m^3.
-        integration: split (without locking) or full.
+        integration: tied (without locking), split or full.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     beam = b.add_beam(

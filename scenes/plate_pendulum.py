@@ -17,7 +17,7 @@ def plate_pendulum(
     E: float = 4e6,
     nu: float = 0.3,
     density: float = 1000.0,
-    integration: Literal["split", "full"] = "split",
+    integration: Literal["tied", "full"] = "tied",
 ) -> wf.ModelBuilder:
     """A square plate of 3443 shells, pinned at one corner and let go from the horizontal, folds as it falls.
 
@@ -30,7 +30,7 @@ def plate_pendulum(
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.
         density: kg/m^3.
-        integration: split (without locking) or full.
+        integration: tied (without locking) or full.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     plate = b.add_shell(

@@ -9,20 +9,20 @@ import warpfea as wf
 from warpfea.scene import scene
 
 
-@scene(dt=0.02, t_end=2.5, tol=1e-6, speed=0.8, picture=1.6)
+@scene(dt=0.02, t_end=2.25, tol=1e-5, speed=0.8, picture=1.6)
 def rollup(
     *,
     length: float = 1.0,
     width: float = 0.06,
-    height: float = 0.03,
-    elements: int = 32,
+    height: float = 0.02,
+    elements: int = 24,
     turns: float = 1.0,
     duration: float = 2.0,
     E: float = 1e9,
     nu: float = 0.3,
     density: float = 1000.0,
     eta: float = 2e6,
-    integration: Literal["split", "full"] = "split",
+    integration: Literal["tied", "split", "full"] = "tied",
 ) -> wf.ModelBuilder:
     """A built-in beam of 3243 elements is rolled up by a moment at its end, turns x 2 pi E I / length; 1 is a circle.
 
@@ -41,7 +41,7 @@ def rollup(
         nu: Poisson's ratio.
         density: kg/m^3.
         eta: shear viscosity (Kelvin-Voigt), Pa s.
-        integration: split (without locking) or full.
+        integration: tied (without locking), split or full.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     section = wf.Rectangle(width, height)

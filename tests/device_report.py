@@ -60,6 +60,50 @@ def loaded():
     return b, body
 
 
+def beam(integration):
+    """A 3243 beam under its weight and an end moment."""
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=1e7, nu=0.3, density=1000.0, damping=DAMPING["incremental"] if integration == "tied" else None)
+    body = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=16, section=wf.Rectangle(0.05, 0.05), normal=(0, 0, 1),
+                      material=law, integration=integration)  # fmt: skip
+    b.clamp(body.start, slots="position+section")
+    b.add_moment(body.end, (1.0, -2.0, 0.5))
+    b.add_probe("tip", body.end)
+    return b, body
+
+
+def plate(integration):
+    """A 3443 plate of skew quads under its weight and a pressure."""
+    b = wf.ModelBuilder()
+    mesh = wf.mesh.grid(
+        (1.0, 0.5), cells=(8, 4), map=lambda X: X + 0.2 * np.stack([X[:, 1], 0 * X[:, 0], 0 * X[:, 0]], 1)
+    )
+    body = b.add_shell(mesh, thickness=0.02, material=wf.SVK(E=1e8, nu=0.3, density=1000.0), integration=integration)
+    b.clamp(body.edge("x-"))
+    b.add_pressure(body.surface("top"), 50.0)
+    b.add_probe("tip", body.edge("x+"))
+    return b, body
+
+
+def solid(element):
+    """A bar of ANCF solids under its weight and a traction."""
+    b = wf.ModelBuilder()
+    mesh = wf.mesh.box((0.5, 0.1, 0.1), cells=(4, 1, 1), element=element)
+    body = b.add_solid(mesh, element=element, material=wf.SVK(**SVK), name="bar")
+    b.clamp(body.nodes(lambda X: X[:, 0] < 1e-9))
+    b.add_traction(body.surface("x+"), (0.0, 100.0, 0.0))
+    b.add_probe("tip", body.surface("x+"))
+    return b, body
+
+
+ANCF = {
+    "3243 tied": lambda: beam("tied"),
+    "3243 split": lambda: beam("split"),
+    "3243 full": lambda: beam("full"),
+    "3443 tied": lambda: plate("tied"),
+    "3443 full": lambda: plate("full"),
+    **{name: (lambda name=name: solid(name)) for name in ("ENMC", "FN", "FN18", "H3843")},
+}
 CASES = {
     "S3 svk tet4": lambda: cantilever(),
     "S3 svk tet5_paper": lambda: cantilever(quadrature="tet5_paper"),
@@ -68,6 +112,7 @@ CASES = {
     "S3 mooney-rivlin": lambda: cantilever(wf.MooneyRivlin(mu10=1e5, mu01=5e4, k=1e6, density=1000.0)),
     "S3 neo-hookean": lambda: cantilever(wf.NeoHookean(mu=3e5, k=1e6, density=1000.0)),
     "curved rod, all loads": loaded,
+    **ANCF,
 }
 
 

@@ -236,11 +236,9 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
     a, b = tying.pairs.T
     _, _, J_rule, det = geometry(body, elements, part.rule.points)
     coupling = tying.coupling(J, J_rule, det, part.rule, body.materials[host.material][1], body.section)
-    return TiedTables(
-        *(np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b)),
-        *(np.moveaxis(J[:, t, :, k], 0, 1) for k in (a, b)),
-        coupling,
-    )
+    first, second = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
+    X_first, X_second = (np.moveaxis(J[:, t, :, k], 0, 1) for k in (a, b))
+    return TiedTables(first, second, X_first, X_second, coupling)
 
 
 def orthonormal(J0: np.ndarray) -> np.ndarray:

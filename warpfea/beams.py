@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -115,8 +116,8 @@ def beam_geometry(
     """Nodes and frames of a beam.
 
     Returns:
-        Mesh of line cells with the node sets "start" and "end"; node axes (nodes, 3, 3) with columns along the axis, the
-        width and the height; frames (elements, 2, 3, 3) = dX/dxi in those axes, m.
+        Mesh of line cells with the node sets "start" and "end"; node axes (nodes, 3, 3) with columns along the axis,
+        the width and the height; frames (elements, 2, 3, 3) = dX/dxi in those axes, m.
 
     Raises:
         ModelError: as ModelBuilder.add_beam.
@@ -132,7 +133,7 @@ def beam_geometry(
     points = np.array([path.at(k) for k in s])
     if points.shape != (len(s), 3) or not np.all(np.isfinite(points)):
         raise ModelError(f"body {name!r}: the curve must give three finite coordinates (m) for every s in [0, 1]")
-    ends = [(path.slope(a, 1) * (b - a), path.slope(b, -1) * (b - a)) for a, b in zip(s[:-1], s[1:])]
+    ends = [(path.slope(a, 1) * (b - a), path.slope(b, -1) * (b - a)) for a, b in itertools.pairwise(s)]
     frames = np.array(
         [[_frame(name, x, k, section, normal) for x, k in zip(pair, s[e : e + 2])] for e, pair in enumerate(ends)]
     )

@@ -180,8 +180,8 @@ def bench(options: argparse.Namespace) -> int:
 
 
 HEADER = (
-    f"{'problem':8} {'dtype':8} {'unknowns':>9} {'elements':>9} {'ms/step':>10} {'Newton':>7} {'PCG':>7} {'B/unknown':>9} "
-    f"{'residual':>9} {'tip, m':>13} {'tip error':>9} {'set-up, s':>9} {'compile, s':>10}"
+    f"{'problem':8} {'dtype':8} {'unknowns':>9} {'elements':>9} {'ms/step':>10} {'Newton':>7} {'PCG':>7} "
+    f"{'B/unknown':>9} {'residual':>9} {'tip, m':>13} {'tip error':>9} {'set-up, s':>9} {'compile, s':>10}"
 )
 
 

@@ -68,7 +68,8 @@ class MaterialPoint:
         weights: (n,) shape functions at the point.
         X: (3,) reference position, m.
         gradients: (n, 3) dweights/dX, 1/m: the deformation gradient is sum e_i gradients_i^T.
-        axes: (3, 3) columns: of a beam axis, width, height there; of a shell two tangents and the director; else global.
+        axes: (3, 3) columns: of a beam axis, width, height there; of a shell two tangents and the director; else
+            global.
     """
 
     body: Body

@@ -91,9 +91,9 @@ class ModelBuilder:
         Args:
             mesh: file (Gmsh .msh, .vtu, Abaqus .inp) or Mesh, m after `scale`.
             material: one law, or laws by element group of the mesh.
-            element: "T4" or "T10", by default as the cells are; "ENMC", "FN" or "FN18", the ANCF tetrahedra, on tetrahedra
-                (of T10 cells the corner nodes stay, and ENMC keeps the curved shape); "H3843", the ANCF brick, on
-                hexahedra.
+            element: "T4" or "T10", by default as the cells are; "ENMC", "FN" or "FN18", the ANCF tetrahedra, on
+                tetrahedra (of T10 cells the corner nodes stay, and ENMC keeps the curved shape); "H3843", the ANCF
+                brick, on hexahedra.
             quadrature: name of the force rule of all elements; T10: "tet4", "tet5_paper", "tet8", "tet14"; T4: "tet1",
                 "tet4"; ENMC, FN, FN18: "tet14", "conical4"; H3843: "3x3x3", "4x4x4". By default T10 takes "tet4" where
                 straight and "tet8" where curved, T4 "tet1", the others their first.
@@ -115,7 +115,9 @@ class ModelBuilder:
         mesh, frames = solid_geometry(name, mesh, family)
         rule = family.rule(quadrature).name
         curved = family.curved_rule.name if quadrature is None else rule
-        return self._add(Body(name, mesh, family, *assign_materials(name, mesh, material), rule, curved, frames), initial)
+        return self._add(
+            Body(name, mesh, family, *assign_materials(name, mesh, material), rule, curved, frames), initial
+        )
 
     def add_beam(
         self,
@@ -236,8 +238,8 @@ class ModelBuilder:
     def _add(self, body: Body, initial: Any) -> Body:
         body.index = len(self.bodies)
         if initial is not None:
-            body.initial_displacement = (
-                slot_field(body, initial, f"body {body.name!r}: initial") - slot_field(body, lambda X: X, "")
+            body.initial_displacement = slot_field(body, initial, f"body {body.name!r}: initial") - slot_field(
+                body, lambda X: X, ""
             )
         self.bodies.append(body)
         return body
@@ -343,8 +345,8 @@ class ModelBuilder:
             chosen = chosen[body.slot_kind[chosen] > 0]
             if len(chosen) != 3 * len(point):
                 raise ModelError(
-                    f"add_moment: nodes of body {body.name!r} ({body.family.name}) have no gradients to turn; use a point "
-                    "body.at(...), or add_traction"
+                    f"add_moment: nodes of body {body.name!r} ({body.family.name}) have no gradients to turn; use a "
+                    "point body.at(...), or add_traction"
                 )
             slots = chosen.reshape(-1, 3)
             vectors = np.tile(np.eye(3), (len(slots), 1, 1))

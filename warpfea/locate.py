@@ -30,7 +30,10 @@ def locate(body: Body, X: Any) -> MaterialPoint:
     near, size = _near(body, x)
     best = (np.inf, -1, np.zeros(3))
     if len(near):
-        E = body.reference[body.connectivity[near]] + (body.slot_kind[body.connectivity[near]] == 0)[:, :, None] * body.origin
+        E = (
+            body.reference[body.connectivity[near]]
+            + (body.slot_kind[body.connectivity[near]] == 0)[:, :, None] * body.origin
+        )
         xi = np.tile(parent.center, (len(near), 1))
         for _ in range(20):
             s, ds = _own_point(body, near, xi)
@@ -46,8 +49,8 @@ def locate(body: Body, X: Any) -> MaterialPoint:
     if best[0] > max(1e-9, 1e-12 * float(np.abs(x).max()) / size):
         low, high = body.mesh.bounding_box()
         raise ModelError(
-            f"body {body.name!r}: point {x.tolist()} lies outside of it (its nodes fill the box {np.asarray(low).tolist()} "
-            f"to {np.asarray(high).tolist()} m)"
+            f"body {body.name!r}: point {x.tolist()} lies outside of it (its nodes fill the box "
+            f"{np.asarray(low).tolist()} to {np.asarray(high).tolist()} m)"
         )
     return point_of(body, best[1], best[2], x)
 

@@ -15,13 +15,12 @@ __all__ = ["shell_geometry"]
 CORNER = math.radians(30.0)
 
 
-def shell_geometry(
-    name: str, mesh: Mesh, thickness: Any, normals: Any, corners: str
-) -> tuple[np.ndarray, np.ndarray]:
+def shell_geometry(name: str, mesh: Mesh, thickness: Any, normals: Any, corners: str) -> tuple[np.ndarray, np.ndarray]:
     """Axes and frames of a shell.
 
     Args:
-        normals: directors at the nodes, (nodes, 3) or a function X (n, 3) -> (n, 3); None: the mean of the quads' normals.
+        normals: directors at the nodes, (nodes, 3) or a function X (n, 3) -> (n, 3); None: the mean of the quads'
+            normals.
 
     Returns:
         Node axes (nodes, 3, 3), columns two tangents and the director; frames (elements, 4, 3, 3) = dX/dxi in those

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import signal
-import sys
 import time as clock
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from . import integrators
-from .bodies import Body, NodeSet
+from .bodies import NodeSet
 from .errors import ConvergenceError, ModelError
-from .evaluation import lowest_jacobian, von_mises
+from .evaluation import lowest_jacobian
 from .kernels.newton import FAIL_CURVATURE, FAIL_ITERATIONS, FAIL_JACOBIAN, FAIL_LINE_SEARCH, FAIL_NAN
 from .kernels.step import LEDGER, REPORT, STATUS
+from .results import Results
+from .run_loop import close_all, interruptible, step_bar
 from .solvers import NewtonPCG
 from .state import State
 from .stepper import Stepper
-from .surfaces import reference_points
 
 if TYPE_CHECKING:
     from .model import Model
@@ -73,7 +71,7 @@ class ProbeRecord:
     velocity: np.ndarray
 
 
-class Simulation:
+class Simulation(Results):
     """Steps a model through time.
 
     Args:
@@ -291,7 +289,7 @@ class Simulation:
         now = float(self.time[alive].min()) if alive.any() else t_end
         total = max(0, round((t_end - now) / self._dt))
         opened: list[Any] = []
-        with _interruptible() as interrupted, _bar(total, t_end, progress) as bar:
+        with interruptible() as interrupted, step_bar(total, t_end, progress) as bar:
             try:
                 for out in outputs:
                     opened.append(out)
@@ -311,9 +309,9 @@ class Simulation:
                     if (on_step is not None and on_step(self) is False) or interrupted() or not report.converged.any():
                         break
             except BaseException:
-                _close(opened, self)
+                close_all(opened, self)
                 raise
-            _close(opened, self, quiet=False)
+            close_all(opened, self, quiet=False)
             if interrupted():
                 raise KeyboardInterrupt
         if self.last is None:
@@ -348,76 +346,7 @@ class Simulation:
         if self.stepper.ledger:
             self.stepper.begin_ledger(mask)
 
-    # results
-
-    def _rows(self, body: Body, values: np.ndarray) -> np.ndarray:
-        """Slot values to mesh nodes, (B, nodes, 3); nodes that no element uses get 0."""
-        out = np.zeros((self.model.worlds, len(body.mesh.points), 3))
-        used = body.mesh.used_nodes
-        out[:, used] = values[:, body.slot_offset + body.node_slot[used]]
-        return out
-
-    def displacements(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m, in the mesh file's node order."""
-        return self._rows(body, self.state.displacement.numpy())
-
-    def positions(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m."""
-        return body.mesh.points + self.displacements(body)
-
-    def velocities(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m/s."""
-        return self._rows(body, self.state.velocity.numpy())
-
-    def placed(self, body: Body, weights: Any) -> np.ndarray:
-        """(B, P, 3) m: present places of material points given by sparse weights (P, slots of the body)."""
-        u = self.state.displacement.numpy()[:, body.slots].astype(float)
-        return reference_points(body, weights) + np.stack([weights @ row for row in u])
-
-    def skin_points(self, body: Body) -> np.ndarray:
-        """(B, skin points, 3) m: the drawn surface."""
-        return self.placed(body, body.skin.slot_weights)
-
-    def skin_field(self, name: str, body: Body) -> np.ndarray:
-        """(B, skin points) scalars of a field at the drawn surface."""
-        return self.field_on(name, body, body.skin)
-
-    def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
-        """(B, P) scalars of a field at the points of a Skin or Drawing of the body."""
-        if name == "displacement":
-            moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
-            return np.linalg.norm(moved, axis=2)
-        return np.stack([drawn.node_weights @ row for row in self._samples(name, body)])
-
-    def field(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress) or "displacement" (m, magnitude).
-
-        The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
-        """
-        if name == "displacement":
-            return np.linalg.norm(self.displacements(body), axis=2)
-        samples = self._samples(name, body)
-        return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
-
-    def _samples(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes x samples) of a field that is taken at the nodes' samples."""
-        if name != "von_mises":
-            raise ModelError(f"field {name!r} is unknown; there are von_mises, displacement")
-        return von_mises(self.model.evaluation.sample_stress(self.state, body))
-
-    def node_gradients(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3, 3) deformation gradient F at the nodes of a body with gradient slots; NaN at others.
-
-        Of a beam or shell, F turns the node's axes (body.node_axes) into the present ones.
-        """
-        if not body.family.has_gradients:
-            raise ModelError(f"body {body.name!r}: element {body.family.name} has no gradients at its nodes")
-        out = np.full((self.model.worlds, len(body.mesh.points), 3, 3), np.nan)
-        u = self.state.displacement.numpy()[:, body.slots].astype(float)
-        nodes = np.flatnonzero(body.node_slot_count == 4)
-        rows = body.node_slot[nodes][:, None] + np.arange(1, 4)
-        out[:, nodes] = np.eye(3) + np.einsum("bnkc,nkd->bncd", u[:, rows], body.reference[rows])
-        return out
+    # results of the whole run; those of the present state are in Results
 
     def probe(self, name: str) -> ProbeRecord:
         """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""
@@ -485,55 +414,3 @@ class Simulation:
             if state is not None:
                 out |= {f"{label}.{k}": v for k, v in state.bytes.items()}
         return out
-
-
-def _close(opened: list[Any], sim: Simulation, *, quiet: bool = True) -> None:
-    """Close all, also after one has failed; then raise the first error, unless `quiet`."""
-    failed: Exception | None = None
-    for out in opened:
-        try:
-            out.close(sim)
-        except Exception as error:
-            failed = failed or error
-    if failed and not quiet:
-        raise failed
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C sets a flag instead of breaking a step; a second one breaks at once."""
-    hit = [False]
-
-    def handler(*_: Any) -> None:
-        if hit[0]:
-            raise KeyboardInterrupt
-        hit[0] = True
-
-    try:
-        old = signal.signal(signal.SIGINT, handler)
-    except ValueError:  # not in the main thread
-        yield lambda: False
-        return
-    try:
-        yield lambda: hit[0]
-    finally:
-        signal.signal(signal.SIGINT, old)
-
-
-@contextlib.contextmanager
-def _bar(total: int, t_end: float, progress: bool | None) -> Iterator[Callable[[StepReport], None]]:
-    if progress is None:
-        progress = sys.stderr.isatty()
-    if not progress:
-        yield lambda report: None
-        return
-    from tqdm import tqdm
-
-    with tqdm(total=total, unit="step", dynamic_ncols=True) as bar:
-
-        def update(report: StepReport) -> None:
-            bar.set_description(f"t {report.time.min():.4g}/{t_end:g} s", refresh=False)
-            bar.set_postfix_str(f"newton {report.newton.max()} pcg {report.pcg.max()}", refresh=False)
-            bar.update()
-
-        yield update

@@ -28,7 +28,9 @@ def solid_geometry(name: str, mesh: Mesh, family: Family) -> tuple[Mesh, np.ndar
         raise ModelError(f"{label}: element {family.name} is not a solid; use add_beam or add_shell")
     if not family.has_gradients:
         if family.cell_type != mesh.cell_type:
-            raise ModelError(f"{label}: element {family.name} needs {family.cell_type} cells, {mesh.label} has {mesh.cell_type}")
+            raise ModelError(
+                f"{label}: element {family.name} needs {family.cell_type} cells, {mesh.label} has {mesh.cell_type}"
+            )
         return mesh, None
     if family.parent.low is not None:
         if mesh.cell_type != "hexahedron":

@@ -13,7 +13,16 @@ from .errors import ModelError
 if TYPE_CHECKING:
     from .bodies import Body
 
-__all__ = ["Drawing", "Skin", "boundary_faces", "element_functions", "face_centroids", "make_drawing", "make_skin", "reference_points"]
+__all__ = [
+    "Drawing",
+    "Skin",
+    "boundary_faces",
+    "element_functions",
+    "face_centroids",
+    "make_drawing",
+    "make_skin",
+    "reference_points",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +42,7 @@ class Skin:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A body as cells of VTK: cells (C, n) of one type over points, with weights as in Skin, and their elements (C,)."""
+    """A body as cells of VTK: cells (C, n) of one type over points, their elements (C,), and weights as in Skin."""
 
     cell_type: str
     cells: np.ndarray

@@ -94,7 +94,13 @@ class Workspace:
     def _struct(self, kind: Any, worlds: int, **shapes: tuple[int, ...]) -> Any:
         """A control struct with an array [world] for each array field, unless a shape is given."""
         out = kind()
-        special = {"elem_sums": (2, worlds), "slope_sum": (1, worlds), "push_sum": (1, worlds), "any_active": (1,), "any_running": (1,)} | shapes
+        special = {
+            "elem_sums": (2, worlds),
+            "slope_sum": (1, worlds),
+            "push_sum": (1, worlds),
+            "any_active": (1,),
+            "any_running": (1,),
+        } | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array):
                 setattr(out, name, self.array(f"{kind.key}.{name}", special.get(name, (worlds,)), var.type.dtype))

@@ -49,7 +49,6 @@ A scene file is Python:
 """
 
 LATER = {
-    "study": "studies of error against run time",
     "stress": "the suite of stiff and extreme cases",
     "sweep": "sweeps over parameters on many devices",
     "profile": "profiles of kernels",
@@ -141,6 +140,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     _add_info(commands)
     _add_render(commands)
     _add_bench(commands)
+    _add_study(commands)
     for name, what in LATER.items():
         commands.add_parser(name, help=f"{what} (not part of this version)", add_help=False)
     if words and words[0] in LATER:
@@ -149,7 +149,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     arguments.words = list(words)
     if not hasattr(arguments, "command"):
         top.print_help()
-        raise UsageError(f"give a command: run, scenes, info, render, bench ({top.prog} --help tells more)")
+        raise UsageError(f"give a command: run, scenes, info, render, bench, study ({top.prog} --help tells more)")
     return arguments
 
 
@@ -285,13 +285,11 @@ def _add_bench(commands: Any) -> None:
     to = commands.add_parser(
         "bench",
         help="time and error of the solver on a bar, a beam or a plate",
-        description="ms per step, PCG iterations, bytes per unknown, residual and tip error of bodies (SVK, E = 7e8 Pa, "
-        "nu = 0.33, 2700 kg/m^3) that are clamped at x = 0 and loaded at the other end. bar: T10, 3 x 2 x 1 m, 5000 N "
+        description="ms per step, PCG iterations, bytes per unknown, residual and tip error of bodies (SVK, "
+        "E = 7e8 Pa, nu = 0.33, 2700 kg/m^3) that are clamped at x = 0 and loaded at the other end. bar: T10, 3 x 2 x 1 m, 5000 N "
         "along x. beam: 3243, elements of 0.5 x 0.1 x 0.1 m, 3100 N across. plate: 3443, 4 x 2 x 0.1 m, 1000 N down.",
     )
-    to.add_argument(
-        "--problem", action="append", choices=("bar", "beam", "plate"), help="may be repeated; default bar"
-    )
+    to.add_argument("--problem", action="append", choices=("bar", "beam", "plate"), help="may be repeated; default bar")
     to.add_argument(
         "--unknowns", type=counts, default=[], metavar="N,N,...", help="sizes (default: a few of each problem)"
     )
@@ -311,3 +309,21 @@ def _add_bench(commands: Any) -> None:
     to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")
     _add_general(to)
     to.set_defaults(command=_bench)
+
+
+def _add_study(commands: Any) -> None:
+    to = commands.add_parser(
+        "study",
+        help="error against run time of elements",
+        description="ancf-tets: T4, T10, ENMC, FN, FN18 and the brick H3843 on a rigid pendulum, on a soft bar with large "
+        "deflection (static) and on a soft pendulum: error against unknowns and run time, as a table and a plot.",
+        epilog="examples:\n  warpfea study ancf-tets --quick\n  warpfea study ancf-tets --device cpu --out results",
+    )
+    to.add_argument("what", metavar="STUDY", help="ancf-tets")
+    to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
+    to.add_argument("--sizes", type=counts, metavar="N,N,...", help="unknowns (default 100,300,1000,3000,10000)")
+    to.add_argument("--repeat", type=count, default=3, metavar="N", help="runs, of which the median counts (default 3)")
+    to.add_argument("--quick", action="store_true", help="a trial: two sizes, few steps, one run")
+    to.add_argument("--out", metavar="FOLDER", help="write ancf_tets.json, .csv and .png there")
+    _add_general(to)
+    to.set_defaults(command=_call("study", "study"))

@@ -6,15 +6,16 @@ cubics along the axis, linear in the section. Slot 1 is the gradient along the b
 
 Locking, and what the integrations do about it:
 - Poisson: a section that stays a parallelogram can't widen on one side and narrow on the other, so bending meets the
-  stiffness of uniaxial *strain*: with nu = 0.3, 1.35 E. The part D0 of the SVK law that couples nothing is integrated over
-  the volume, the Poisson part D - D0 on the axis alone (Gerstmayr, Matikainen, Mikkola 2008, Multibody Syst. Dyn. 20:359);
-  bending then has E, tension the full law.
+  stiffness of uniaxial *strain*: with nu = 0.3, 1.35 E. The part D0 of the SVK law that couples nothing is integrated
+  over the volume, the Poisson part D - D0 on the axis alone (Gerstmayr, Matikainen, Mikkola 2008, Multibody Syst. Dyn.
+  20:359); bending then has E, tension the full law.
 - shear: section vectors turn linearly along an element, a cubic axis does not. At Gauss points both must agree, and the
   axis loses its cubic. "tied" takes the transverse shear at the nodes, where neighbours share it, and gives the axis's
-  deviation b from the sections in the middle the energy that its curvature would have: for a moment that varies linearly
-  along the element that is what bending lacks (the residual bending flexibility of MacNeal 1978, Comput. Struct. 8:175).
-- thickness: a section vector interpolated between two directions is too short in between; "tied" takes the strain in the
-  section at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
+  deviation b from the sections in the middle the energy that its curvature would have: where a moment varies linearly
+  along the element that is what bending lacks (the residual bending flexibility of MacNeal 1978, Comput. Struct.
+  8:175).
+- thickness: a section vector interpolated between two directions is too short in between; "tied" takes the strain in
+  the section at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
 - torsion and shear of a plane section (not locking, but too stiff as well): "tied" takes the section's own constants.
 "tied" has all of it, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I).
 """
@@ -150,10 +151,13 @@ def _shear_coupling(
         rows = slice(12 * direction, 12 * direction + 12)
         height = size[:, rows, 1 + direction].mean(axis=1)
         c = 4.0 / 9.0 * (m.E / m.lame[1]) * (height / length) ** 2
-        along = {}
+        plain = np.zeros((12, 12))
         for k, mode in enumerate(modes):
             factor = {0: section.shear, 2 - direction: section.torsion_ratio}.get(k, 1.0)
-            along[k] = np.kron(np.outer(mode, mode), factor * ends), np.kron(np.outer(mode, mode), np.outer(deviation, deviation))
+            along[k] = (
+                np.kron(np.outer(mode, mode), factor * ends),
+                np.kron(np.outer(mode, mode), np.outer(deviation, deviation)),
+            )
         plain = sum(pair[0] for pair in along.values())
         bent = sum(pair[1] for pair in along.values())
         block = plain + c[:, None, None] * bent

@@ -21,6 +21,7 @@ from .quadrature import TET_RULES, box_rule, conical_tet, conical_triangle, squa
 
 __all__ = ["BRICK", "CORNERS", "ENMC", "FACES", "FN", "FN18", "tet_functions"]
 
+GRADIENTS = {"gradients": (1, 2, 3), "gradient-x": (1,), "gradient-y": (2,), "gradient-z": (3,)}
 CENTROIDS = np.array([CORNERS[list(f)].mean(axis=0) for f in FACES])
 CUBIC = np.array([p for p in itertools.product(range(4), repeat=3) if sum(p) <= 3])
 
@@ -95,7 +96,7 @@ def _tet(name: str, cell: str, elimination: float | None) -> Family:
             divisions=((3, 3),) * 4,
             node_samples=points[:, None],
             lattice=QUADRATIC,
-            slot_sets={"gradients": (1, 2, 3)},
+            slot_sets=GRADIENTS,
         )
     )
 
@@ -105,7 +106,9 @@ FN = _tet("FN", "tetra", 2.0 / 81.0)
 FN18 = _tet("FN18", "tetra", 1.0 / 18.0)
 
 HEX = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=float)
-HEX_SIDES = tuple(HEX[list(f)] for f in ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)))
+HEX_SIDES = tuple(
+    HEX[list(f)] for f in ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+)
 LOW, HIGH = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 UNIT = tuple(zip(LOW, HIGH))
 
@@ -152,6 +155,6 @@ BRICK = register(
         divisions=((3, 3),) * 6,
         node_samples=HEX[:, None],
         lattice=box_lattice(LOW, HIGH, (2, 2, 2)),
-        slot_sets={"gradients": (1, 2, 3)},
+        slot_sets=GRADIENTS,
     )
 )

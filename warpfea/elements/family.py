@@ -42,7 +42,7 @@ class Part:
         rule: quadrature.
         law: function Material -> (device law, coefficients), or None for the material's own.
         framed: the law has axes along the element (first parent line, then the rest made orthonormal).
-        tying: the energy is of an assumed transverse shear (law: its coefficient mu); None: of the strain at the points.
+        tying: the energy is of strains at tying points (law: its coefficient mu); None: of the strain at the rule.
     """
 
     name: str
@@ -111,8 +111,8 @@ class Family:
         lattice: how an element is drawn.
         schemes: integrations of several parts by name, beside the rules.
         slot_sets: names of slot kinds that supports may hold.
-        spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis or
-            a shell's surface can kink at a point for next to nothing, and must not carry it.
+        spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
+            or a shell's surface can kink at a point for next to nothing, and must not carry it.
         solid: the mesh cell is the body itself; beams and shells have a section or thickness beside it.
     """
 

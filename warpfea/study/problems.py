@@ -1,0 +1,112 @@
+"""The three problems of `warpfea study ancf-tets`: bars of 1 x 0.2 x 0.2 m in cells of 0.2/n m, SVK, nu = 0.3.
+
+rigid: a stiff bar hinged along the edge x = 0, z = 0.2, let go from the horizontal under gravity.
+large: half of a soft bar on its plane of symmetry x = 0, static; its weight grows with x and is balanced by a uniform
+    traction on the face z = 0, so that both ends droop by half a metre. No support carries a shear force, no edge is
+    clamped: the solution is as smooth as boxes allow, and orders of convergence show. (At a clamped edge every element
+    ends at h^1.4.)
+pendulum: the bar of `rigid`, soft; it bends by a tenth of its length as it swings. A line is too thin a support for a
+    soft solid: its deflection grows with the logarithm of the mesh.
+
+T4, T10, ENMC, FN and FN18: 6 tetrahedra per cell; H3843: one brick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .. import mesh as meshes
+from ..bodies import Body, NodeSet
+from ..builder import ModelBuilder
+from ..description import Support, component_mask, support_slots
+from ..materials import SVK
+
+__all__ = ["ELEMENTS", "PROBLEMS", "build", "cells_of", "level_for"]
+
+LENGTH, SIDE = 1.0, 0.2  # m
+ELEMENTS = ("T4", "T10", "FN", "FN18", "ENMC", "H3843")
+PROBLEMS = ("rigid", "large", "pendulum")
+GRAVITY = 9.81
+NU = 0.3
+DENSITY = 1000.0
+STIFF, SOFT = 1e9, 2e5  # Pa, of rigid and pendulum
+LARGE_E = 2e6  # Pa
+LARGE_WEIGHT = 2200.0  # N
+
+
+def cells_of(level: int) -> tuple[int, int, int]:
+    """Cells of a bar with `level` cells across its side."""
+    return 5 * level, level, level
+
+
+def total_unknowns(element: str, level: int) -> int:
+    """Unknowns of the bar before anything is held."""
+    order = 2 if element == "T10" else 1
+    nodes = np.prod([order * n + 1 for n in cells_of(level)])
+    slots = nodes * (1 if element in ("T4", "T10") else 4)
+    if element == "ENMC":
+        slots += 60 * level**3 + 22 * level**2  # faces of the tetrahedra
+    return 3 * int(slots)
+
+
+def level_for(element: str, unknowns: int) -> int:
+    """The level whose number of unknowns is nearest in ratio."""
+    level = 1
+    while total_unknowns(element, level + 1) * total_unknowns(element, level) <= unknowns**2:
+        level += 1
+    return level
+
+
+def build(problem: str, element: str, level: int) -> ModelBuilder:
+    """The problem with the probe "tip": the mean of the face x = 1 m."""
+    return _BUILDERS[problem](element, level)
+
+
+def _bar(b: ModelBuilder, element: str, level: int, law: SVK) -> Body:
+    mesh = meshes.box((LENGTH, SIDE, SIDE), cells=cells_of(level), element=element)
+    body = b.add_solid(mesh, material=law, element=element, name="bar")
+    b.add_probe("tip", body.surface("x+"))
+    return body
+
+
+def _hold(b: ModelBuilder, nodes: NodeSet, across: tuple[int, ...], components: str) -> None:
+    """Hold components of positions, and of the gradients along a face or edge but not `across` it (axes 0..2).
+
+    ModelBuilder.clamp holds all gradients or none. With none the cubic face moves between its nodes; the gradient
+    across, held, takes away the strain there, an error that falls with h only.
+    """
+    slots = support_slots(nodes, "all")
+    kept = ~np.isin(nodes.body.slot_kind[slots], [axis + 1 for axis in across])
+    b.description.supports.append(Support(nodes.body, slots[kept], component_mask(components, "hold")))
+
+
+def _swinging(element: str, level: int, E: float) -> ModelBuilder:
+    b = ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
+    body = _bar(b, element, level, SVK(E=E, nu=NU, density=DENSITY))
+    eps = 1e-6 * SIDE
+    edge = body.nodes(lambda X: (X[:, 0] < eps) & (X[:, 2] > SIDE - eps))
+    _hold(b, edge, (0, 2), "xyz")
+    return b
+
+
+def _large(element: str, level: int) -> ModelBuilder:
+    volume = LENGTH * SIDE * SIDE
+    b = ModelBuilder(gravity=(0.0, 0.0, -LARGE_WEIGHT / (DENSITY * volume)))
+    law: Any = SVK(E=LARGE_E, nu=NU, density=lambda X: 2.0 * DENSITY * X[:, 0] / LENGTH)
+    body = _bar(b, element, level, law)
+    _hold(b, body.nodes("x-"), (0,), "x")
+    _hold(b, body.nodes("y-"), (1,), "y")
+    corner = body.nodes(lambda X: np.abs(X).max(axis=1) < 1e-6 * SIDE)
+    b.clamp(corner, slots="position", components="z")  # carries nothing: the loads are in balance
+    b.add_traction(body.surface("z-"), (0.0, 0.0, LARGE_WEIGHT / (LENGTH * SIDE)))
+    return b
+
+
+_BUILDERS: dict[str, Callable[[str, int], ModelBuilder]] = {
+    "rigid": lambda element, level: _swinging(element, level, STIFF),
+    "large": _large,
+    "pendulum": lambda element, level: _swinging(element, level, SOFT),
+}
