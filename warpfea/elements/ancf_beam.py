@@ -154,12 +154,8 @@ def _shear_coupling(
         plain = np.zeros((12, 12))
         for k, mode in enumerate(modes):
             factor = {0: section.shear, 2 - direction: section.torsion_ratio}.get(k, 1.0)
-            along[k] = (
-                np.kron(np.outer(mode, mode), factor * ends),
-                np.kron(np.outer(mode, mode), np.outer(deviation, deviation)),
-            )
-        plain = sum(pair[0] for pair in along.values())
-        bent = sum(pair[1] for pair in along.values())
+            plain += factor * np.kron(np.outer(mode, mode), ends)
+        bent = np.kron(np.eye(4) / 4.0, np.outer(deviation, deviation))
         block = plain + c[:, None, None] * bent
         out[:, rows] = volume[:, None, None] * scale[:, rows, None] * scale[:, None, rows] * block
     return out

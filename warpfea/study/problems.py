@@ -34,7 +34,7 @@ NU = 0.3
 DENSITY = 1000.0
 STIFF, SOFT = 1e9, 2e5  # Pa, of rigid and pendulum
 LARGE_E = 2e6  # Pa
-LARGE_WEIGHT = 2200.0  # N
+LARGE_WEIGHT = 2400.0  # N
 
 
 def cells_of(level: int) -> tuple[int, int, int]:
@@ -95,7 +95,7 @@ def _swinging(element: str, level: int, E: float) -> ModelBuilder:
 def _large(element: str, level: int) -> ModelBuilder:
     volume = LENGTH * SIDE * SIDE
     b = ModelBuilder(gravity=(0.0, 0.0, -LARGE_WEIGHT / (DENSITY * volume)))
-    law: Any = SVK(E=LARGE_E, nu=NU, density=lambda X: 2.0 * DENSITY * X[:, 0] / LENGTH)
+    law: Any = SVK(E=LARGE_E, nu=NU, density=lambda X: DENSITY * (0.1 + 1.8 * X[:, 0] / LENGTH))
     body = _bar(b, element, level, law)
     _hold(b, body.nodes("x-"), (0,), "x")
     _hold(b, body.nodes("y-"), (1,), "y")

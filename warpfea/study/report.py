@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import pathlib
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
@@ -58,7 +59,7 @@ class Row:
 def with_orders(rows: list[Row]) -> list[Row]:
     """The rows of one element on finer and finer meshes, with observed orders."""
     out = rows[:1]
-    for coarse, fine in zip(rows, rows[1:]):
+    for coarse, fine in itertools.pairwise(rows):
         fall = np.log(coarse.error / fine.error)
         out.append(
             replace(

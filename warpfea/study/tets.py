@@ -239,8 +239,8 @@ def _rigid_reference(steps: int) -> tuple[np.ndarray, dict[str, Any]]:
     floor = _distance(tip, exact)
     half = _distance(stepped_tip(DT / 2, 2 * steps)[1::2], exact)
     about = (
-        f"E = {bars.STIFF:g} Pa, {steps} steps of {DT:g} s; error from the rigid body in the same steps; the steps alone "
-        f"are {floor:.1e} off the exact motion ({half:.1e} with half the step)"
+        f"E = {bars.STIFF:g} Pa, {steps} steps of {DT:g} s; error from the rigid body in the same steps, which "
+        f"alone are {floor:.1e} off the exact motion ({half:.1e} with half the step)"
     )
     return tip - start, {
         "about": about,
