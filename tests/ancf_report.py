@@ -150,7 +150,7 @@ def frequencies(device, quick):
     for nu in (0.0, 0.3):
         for integration in ("tied", "split", "full"):
             law = wf.SVK(E=1e7, nu=nu, density=1000.0)
-            b, _ = cantilever(16, wf.Rectangle(0.05, 0.05), law, integration)
+            b, _ = cantilever(16, wf.Rectangle(0.05, 0.05), law, integration, slots="position+section")
             got = lowest(b, device, 14)
             limit = data["beam_frequencies"]["ancf3243_kinematics_3D_continuum"][f"cantilever_nu{nu}"]["omega_first10"]
             beam = data["beam_frequencies"]["timoshenko"][f"cantilever_nu{nu}_ks0.8333"]["omega"]
@@ -162,7 +162,7 @@ def frequencies(device, quick):
             law = wf.SVK(E=1e9, nu=nu, density=1000.0)
             plate = b.add_shell(wf.mesh.grid((1.0, 1.0), cells=(16, 16)), thickness=0.02, material=law,
                                 integration=integration)  # fmt: skip
-            b.clamp(plate.edge("x-"))
+            b.clamp(plate.edge("x-"), slots="position+director")
             got = lowest(b, device, 6)
             limit = data["plate_frequencies"]["ancf3443_kinematics"][f"CFFF_nu{nu}"]["omega"]
             mindlin = data["plate_frequencies"]["mindlin"][f"CFFF_nu{nu}_ks0.8333"]["omega"]

@@ -286,8 +286,9 @@ def _add_bench(commands: Any) -> None:
         "bench",
         help="time and error of the solver on a bar, a beam or a plate",
         description="ms per step, PCG iterations, bytes per unknown, residual and tip error of bodies (SVK, "
-        "E = 7e8 Pa, nu = 0.33, 2700 kg/m^3) that are clamped at x = 0 and loaded at the other end. bar: T10, 3 x 2 x 1 m, 5000 N "
-        "along x. beam: 3243, elements of 0.5 x 0.1 x 0.1 m, 3100 N across. plate: 3443, 4 x 2 x 0.1 m, 1000 N down.",
+        "E = 7e8 Pa, nu = 0.33, 2700 kg/m^3) that are clamped at x = 0 and loaded at the other end. bar: T10, "
+        "3 x 2 x 1 m, 5000 N along x. beam: 3243, elements of 0.5 x 0.1 x 0.1 m, 3100 N across. plate: 3443, "
+        "4 x 2 x 0.1 m, 1000 N down.",
     )
     to.add_argument("--problem", action="append", choices=("bar", "beam", "plate"), help="may be repeated; default bar")
     to.add_argument(
