@@ -8,7 +8,7 @@ import warpfea as wf
 from warpfea.scene import scene
 
 
-@scene(dt=2.5e-3, t_end=1.5, integrator="bdf2", tol=1e-6, speed=0.3, picture=0.7)
+@scene(dt=1.25e-3, t_end=1.5, integrator="bdf2", tol=1e-6, speed=0.3, picture=0.7)
 def pendulum(
     *,
     length: float = 1.0,
