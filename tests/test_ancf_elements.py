@@ -15,6 +15,7 @@ import warp as wp
 import warpfea as wf
 from warpfea import assembly, elements
 from warpfea.elements import ancf, ancf_beam, ancf_shell
+from warpfea.elements.quadrature import box_rule, conical_tet
 from warpfea.surfaces import element_functions
 
 RHO, E_MODULUS = 7.0, 1e6
@@ -441,6 +442,21 @@ def check_moments(name, mass, center, second, tolerance=1e-12, **options):
     scalar = model.mass_matrix()[::3, ::3].toarray()
     d = 1 / np.sqrt(np.diag(scalar))
     assert np.linalg.eigvalsh(d[:, None] * scalar * d).min() > 1e-7
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_mass_matrix(name, data):
+    """Every entry against a much richer rule."""
+    body, model = build(name, n=2)
+    parent = body.family.parent
+    rule = conical_tet(7) if parent.low is None else box_rule((10, 8, 6), tuple(zip(parent.low, parent.high)))
+    s, _, _, det = assembly.geometry(body, np.arange(len(body.mesh.cells)), rule.points)
+    local = np.einsum("eq,eqi,eqj->eij", RHO * det * rule.weights, s, s, optimize=True)
+    expected = np.zeros((model.slots, model.slots))
+    for conn, m in zip(body.connectivity, local):
+        expected[np.ix_(conn, conn)] += m
+    d = 1 / np.sqrt(np.diag(expected))
+    assert data.error(d[:, None] * model.mass_matrix()[::3, ::3].toarray() * d, d[:, None] * expected * d) < 1e-12
 
 
 @pytest.mark.parametrize("name", ["beam straight", "beam uneven", "shell square", "shell skew"])

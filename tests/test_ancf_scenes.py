@@ -89,7 +89,7 @@ def test_plate_pendulum_stays_symmetric():
 
 
 def test_rollup_closes_the_circle():
-    """By Euler's theory the end returns to the start; the section's strain of 6 % and 22 degrees per element leave a little."""
+    """By Euler's theory the end returns to the start; strains of 6 % and 22 degrees per element leave a little."""
     model = find("rollup")(elements=16, duration=1.0, eta=0.0).finalize(device="cpu")
     result = wf.solve_static(model, load_steps=8, tol=1e-6)
     end = result.probe("end").position[0, -1]
