@@ -15,16 +15,19 @@ report = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(report)
 
 BOUND = {"float64": 1e-10, "float32": 1e-4}
-# the soft rod under every load at once, at float32's default tolerance of 1e-4, which sets this and not the precision
-LOOSE = {("curved rod, all loads", "float32"): 1e-3}
+
+
+def bound(case, dtype):
+    """A beam's bending and stretching stiffness lie three orders of magnitude apart: float32 holds 5e-4 there."""
+    return 5e-4 if dtype == "float32" and case.startswith("3243") else BOUND[dtype]
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("case", report.CASES)
 def test_cuda_equals_cpu(case):
     row = report.compare(case, steps=30)
-    for dtype, bound in BOUND.items():
-        assert row[f"cuda_{dtype}_difference"] < LOOSE.get((case, dtype), bound)
+    for dtype in BOUND:
+        assert row[f"cuda_{dtype}_difference"] < bound(case, dtype)
 
 
 @pytest.mark.cuda
@@ -71,8 +74,8 @@ def test_committed_agreement():
     assert {row["case"] for row in result["rows"]} == set(report.CASES)
     for row in result["rows"]:
         assert row["steps"] >= 100
-        for dtype, bound in BOUND.items():
-            assert row[f"cuda_{dtype}_difference"] < LOOSE.get((row["case"], dtype), bound), row
+        for dtype in BOUND:
+            assert row[f"cuda_{dtype}_difference"] < bound(row["case"], dtype), row
     assert "H200" in result["machine"]["gpu"]
     assert result["versions"]["warp"].startswith("1.19")
 

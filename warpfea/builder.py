@@ -252,8 +252,10 @@ class ModelBuilder:
         Args:
             nodes: what to hold.
             slots: "all" (built in), or "position" (pinned), "position+axis", or other names joined by "+": "axis" and
-                "section" of beams, "surface" and "director" of shells, "gradients" of ANCF solids. Holding the gradient
-                along the axis at a built-in end adds a little stiffness; "position+section" does not.
+                "section" of beams, "surface" and "director" of shells, "gradients" of ANCF solids, or one of them,
+                "gradient-x", "gradient-y", "gradient-z". Holding the gradient along the axis at a built-in end adds a
+                little stiffness; "position+section" does not. On a plane wall of an ANCF solid hold the positions and
+                the gradients along the wall.
             components: which of "xyz" to hold, global axes.
 
         Raises:
