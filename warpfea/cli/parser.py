@@ -316,8 +316,8 @@ def _add_study(commands: Any) -> None:
     to = commands.add_parser(
         "study",
         help="error against run time of elements",
-        description="ancf-tets: T4, T10, ENMC, FN, FN18 and the brick H3843 on a rigid pendulum, on a soft bar with "
-        "large deflection (static) and on a soft pendulum: error against unknowns and run time, a table and a plot.",
+        description="ancf-tets: T4, T10, ENMC, FN, FN18 and the brick H3843 on a rigid pendulum and on a soft bar with "
+        "large deflection, static and in motion: error against unknowns and run time, as a table and a plot.",
         epilog="examples:\n  warpfea study ancf-tets --quick\n  warpfea study ancf-tets --device cpu --out results",
     )
     to.add_argument("what", metavar="STUDY", help="ancf-tets")

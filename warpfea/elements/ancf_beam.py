@@ -17,7 +17,12 @@ Locking, and what the integrations do about it:
 - thickness: a section vector interpolated between two directions is too short in between; "tied" takes the strain in
   the section at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
 - torsion and shear of a plane section (not locking, but too stiff as well): "tied" takes the section's own constants.
-"tied" has all of it, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I).
+"tied" has all of it, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I). What "tied"
+gives up: it is exact in a patch under tension, not under shear tractions or pressure on its sides, which disturb the
+gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft by
+about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Tried and dropped: the
+curvature extrapolated from the middle and the ends, exact to fourth order in that angle, but it lets the axis's gradient
+trade stretch for curvature, an error of 0.4 (h/R)^2 that does not vanish with the mesh.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pathlib
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +22,9 @@ STYLES = {  # a colour-blind-safe set (Okabe and Ito)
     "H3843": ("#009e73", "P"),
 }
 TITLES = {
-    "rigid": "rigid: stiff pendulum",
-    "large": "large: soft bar, static, droop 0.5 of its length",
-    "pendulum": "pendulum: soft pendulum",
+    "rigid": "rigid: stiff bar swinging on a hinge",
+    "large": "large: soft bar, static",
+    "sudden": "sudden: soft bar in motion",
 }
 
 
@@ -62,9 +63,13 @@ def _panel(axes: Any, study: Study, problem: str, against: str, label: str) -> N
     if floor is None:
         floor, text = reference["own_error"], "uncertainty of the reference"
     axes.axhline(floor, color="0.4", linestyle=":", linewidth=1.2)
+    values = [row.error for row in study.rows if row.problem == problem and row.error > 0.0] + [floor]
+    low, high = math.floor(math.log10(min(values)) - 0.1), math.ceil(math.log10(max(values)) + 0.1)
+    axes.set_ylim(10.0**low, 10.0**high)
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
     axes.annotate(
-        text, (0.99, floor), xycoords=("axes fraction", "data"), xytext=(0, 3), textcoords="offset points",
-        ha="right", va="bottom", fontsize=8, color="0.3",
+        text, (0.02, floor), xycoords=("axes fraction", "data"), xytext=(0, 4), textcoords="offset points",
+        ha="left", va="bottom", fontsize=8, color="0.3", bbox=box,
     )  # fmt: skip
     axes.set_title(TITLES[problem], fontsize=11)
     axes.set_xlabel(label)

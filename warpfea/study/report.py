@@ -26,7 +26,7 @@ class Row:
         cells: cells of the box along x, y, z.
         elements, unknowns: counts; unknowns are free components.
         error: largest distance of the tip from the reference, over the bar's length. rigid: from the rigid body in the
-            same time steps, which is free of the time error; large: at the end; pendulum: over all steps.
+            same time steps, which is free of the time error; large: at the end; sudden: over all steps.
         error_exact: rigid: the same from the exact rigid motion, time error included; None elsewhere.
         order: of convergence from the next coarser mesh, with h = unknowns^(-1/3). None: first mesh, or rigid, where
             errors end at the bar's own flexibility.
