@@ -39,9 +39,11 @@ def study(options: argparse.Namespace) -> int:
             found = ancf_tets(
                 device=options.device, sizes=options.sizes, repeat=options.repeat, quick=options.quick, on_run=on_run
             )
-        print(found.table())
+        if not options.quiet:
+            print(found.table(), flush=True)
         if options.out is not None:
             words = shlex.join(["warpfea", *options.words])
             for path in found.write(options.out, command=words, device=options.device):
-                print(f"wrote {path}")
+                if not options.quiet:
+                    print(f"wrote {path}")
     return DONE

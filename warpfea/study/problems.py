@@ -13,7 +13,6 @@ T4, T10, ENMC, FN and FN18: 6 tetrahedra per cell; H3843: one brick.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 

@@ -116,7 +116,9 @@ class Study:
             "rows": [plain(asdict(row)) for row in self.rows],
         }
 
-    def write(self, folder: str | pathlib.Path, *, command: str, device: Any = None) -> list[pathlib.Path]:
+    def write(
+        self, folder: str | pathlib.Path, *, command: str = "warpfea.study.ancf_tets", device: Any = None
+    ) -> list[pathlib.Path]:
         """Write NAME.json, NAME.csv and NAME.png into the folder, made if its parent is there.
 
         Raises:

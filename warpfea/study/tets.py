@@ -205,10 +205,11 @@ def _reference(problem: str, run: Runner, level: int) -> tuple[np.ndarray, dict[
     tip = finest.tip + (finest.tip - coarser) / ((level / (level - 1)) ** order - 1.0)
     own = _distance(tip, finest.tip)
     cells = cells_of(level)
+    mesh = "x".join(map(str, cells))
     how = "static" if problem == "large" else f"{run.steps[problem]} steps of {DT[problem]:g} s"
     about = (
-        f"E = {bars.SOFT:g} Pa, {how}; error from {REFERENCE} on {'x'.join(map(str, cells))} cells, extrapolated with order "
-        f"{order:.1f}, which moved the tip by {own:.1e} of the length"
+        f"E = {bars.SOFT:g} Pa, {how}; error from {REFERENCE} on {mesh} cells, extrapolated "
+        f"with order {order:.1f}, which moved the tip by {own:.1e} of the length"
     )
     known = {"element": REFERENCE, "cells": cells, "unknowns": finest.model.info()["unknowns"], "order": order}
     return tip, {"about": about, **known, "own_error": own, "tip": tip[-1]}
@@ -234,8 +235,8 @@ def _rigid_reference(steps: int) -> tuple[np.ndarray, dict[str, Any]]:
     floor = _distance(tip, exact)
     half = _distance(stepped_tip(dt / 2, 2 * steps)[1::2], exact)
     about = (
-        f"E = {bars.STIFF:g} Pa, {steps} steps of {dt:g} s; error from the rigid body in the same steps, which "
-        f"alone are {floor:.1e} off the exact motion ({half:.1e} with half the step)"
+        f"E = {bars.STIFF:g} Pa, {steps} steps of {dt:g} s; error from the rigid body in the same steps, so the bar's "
+        f"flexibility; the steps alone are {floor:.1e} off the exact motion ({half:.1e} with half the step)"
     )
     return tip - START, {
         "about": about,
