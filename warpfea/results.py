@@ -61,7 +61,8 @@ class Results:
         if name == "displacement":
             moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
             return np.linalg.norm(moved, axis=2)
-        return np.stack([drawn.node_weights @ row for row in self._samples(name, body)])
+        stress = self._stress(name, body)  # the tensor is interpolated: a bent section shows its neutral axis
+        return von_mises(np.stack([drawn.node_weights @ row for row in stress]))
 
     def field(self, name: str, body: Body) -> np.ndarray:
         """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress) or "displacement" (m, magnitude).
@@ -70,14 +71,14 @@ class Results:
         """
         if name == "displacement":
             return np.linalg.norm(self.displacements(body), axis=2)
-        samples = self._samples(name, body)
+        samples = von_mises(self._stress(name, body))
         return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
 
-    def _samples(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes x samples) of a field that is taken at the nodes' samples."""
+    def _stress(self, name: str, body: Body) -> np.ndarray:
+        """(B, nodes x samples, 6) Cauchy stress, Pa, behind a field."""
         if name != "von_mises":
             raise ModelError(f"field {name!r} is unknown; there are von_mises, displacement")
-        return von_mises(self.model.evaluation.sample_stress(self.state, body))
+        return self.model.evaluation.sample_stress(self.state, body)
 
     def node_gradients(self, body: Body) -> np.ndarray:
         """(B, nodes, 3, 3) deformation gradient F at the nodes of a body with gradient slots; NaN at others.

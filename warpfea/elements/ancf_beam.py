@@ -20,9 +20,9 @@ Locking, and what the integrations do about it:
 "tied" has all of it, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I). What "tied"
 gives up: it is exact in a patch under tension, not under shear tractions or pressure on its sides, which disturb the
 gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft by
-about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Tried and dropped: the
-curvature extrapolated from the middle and the ends, exact to fourth order in that angle, but it lets the axis's gradient
-trade stretch for curvature, an error of 0.4 (h/R)^2 that does not vanish with the mesh.
+about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Tried and dropped:
+the curvature extrapolated from the middle and the ends, exact to fourth order in that angle, but it lets the axis's
+gradient trade stretch for curvature, an error of 0.4 (h/R)^2 that does not vanish with the mesh.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ BEAM = register(
         parent=Parent(LOW, HIGH),
         faces=box_corners(LOW, HIGH),
         face_rule=square_rule(5),
-        divisions=((1, 1), (1, 1), (6, 1), (6, 1), (6, 1), (6, 1)),
+        divisions=((2, 2), (2, 2), (6, 2), (6, 2), (6, 2), (6, 2)),
         node_samples=np.array([[(x, y, z) for y, z in SECTION] for x in (0.0, 1.0)]),
         lattice=box_lattice(LOW, HIGH, (4, 1, 1)),
         schemes={

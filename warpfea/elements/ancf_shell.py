@@ -139,7 +139,7 @@ SHELL = register(
         # bottom, top, then the strips over the edges 01, 12, 23, 30 of the quad
         faces=(_SIDES[4], _SIDES[5], _SIDES[2], _SIDES[1], _SIDES[3], _SIDES[0]),
         face_rule=square_rule(5),
-        divisions=((3, 3), (3, 3), (3, 1), (3, 1), (3, 1), (1, 3)),
+        divisions=((3, 3), (3, 3), (3, 2), (3, 2), (3, 2), (2, 3)),
         node_samples=NODES[:, None] + np.array([(0.0, 0.0, -0.5), (0.0, 0.0, 0.5)]),
         lattice=box_lattice(LOW, HIGH, (2, 2, 1)),
         schemes={

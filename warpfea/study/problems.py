@@ -19,7 +19,6 @@ import numpy as np
 from .. import mesh as meshes
 from ..bodies import Body, NodeSet
 from ..builder import ModelBuilder
-from ..description import Support, component_mask, support_slots
 from ..materials import SVK
 
 __all__ = ["ELEMENTS", "PROBLEMS", "build", "cells_of", "level_for"]
@@ -69,15 +68,15 @@ def _bar(b: ModelBuilder, element: str, level: int, law: SVK) -> Body:
     return body
 
 
-def _hold(b: ModelBuilder, nodes: NodeSet, across: tuple[int, ...], components: str) -> None:
-    """Hold components of positions, and of the gradients along a face or edge but not `across` it (axes 0..2).
+def _hold(b: ModelBuilder, nodes: NodeSet, across: str, components: str) -> None:
+    """Hold components of positions, and of the gradients along a face or edge but not `across` it (letters of "xyz").
 
-    ModelBuilder.clamp holds all gradients or none. With none the cubic face moves between its nodes; the gradient
-    across, held, takes away the strain there, an error that falls with h only.
+    With positions alone the cubic face moves between its nodes; the gradient across, held, takes away the strain there.
     """
-    slots = support_slots(nodes, "all")
-    kept = ~np.isin(nodes.body.slot_kind[slots], [axis + 1 for axis in across])
-    b.description.supports.append(Support(nodes.body, slots[kept], component_mask(components, "hold")))
+    b.clamp(nodes, slots="position", components=components)
+    along = [f"gradient-{axis}" for axis in "xyz" if axis not in across]
+    if nodes.body.family.has_gradients:
+        b.clamp(nodes, slots="+".join(along), components=components)
 
 
 def _rigid(element: str, level: int) -> ModelBuilder:
@@ -85,7 +84,7 @@ def _rigid(element: str, level: int) -> ModelBuilder:
     body = _bar(b, element, level, SVK(E=STIFF, nu=NU, density=DENSITY))
     eps = 1e-6 * SIDE
     edge = body.nodes(lambda X: (X[:, 0] < eps) & (X[:, 2] > SIDE - eps))
-    _hold(b, edge, (0, 2), "xyz")
+    _hold(b, edge, "xz", "xyz")
     return b
 
 
@@ -93,8 +92,8 @@ def _balanced(element: str, level: int, weight: float) -> tuple[ModelBuilder, Bo
     """A bar on planes of symmetry, its weight in N balanced by a traction: free to move along z."""
     b = ModelBuilder(gravity=(0.0, 0.0, -weight / (DENSITY * LENGTH * SIDE * SIDE)))
     body = _bar(b, element, level, SVK(E=SOFT, nu=NU, density=_growing))
-    _hold(b, body.nodes("x-"), (0,), "x")
-    _hold(b, body.nodes("y-"), (1,), "y")
+    _hold(b, body.nodes("x-"), "x", "x")
+    _hold(b, body.nodes("y-"), "y", "y")
     b.add_traction(body.surface("z-"), (0.0, 0.0, weight / (LENGTH * SIDE)))
     return b, body
 
