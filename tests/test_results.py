@@ -31,8 +31,20 @@ def test_bench_on_one_gpu():
             assert row["tip_error"] < error
 
 
-def test_bench_on_the_cpu():
-    result = load("bench_cpu.json")
+@pytest.mark.parametrize("name", ["bench_cpu.json", "bench_ancf_cpu.json"])
+def test_bench_on_the_cpu(name):
+    result = load(name)
     assert result["settings"]["steps"] >= 10
     assert {r["dtype"] for r in result["rows"]} == {"float64", "float32"}
     assert all(r["tip_error"] < 1e-4 for r in result["rows"])
+
+
+def test_bench_of_beams_and_plates_on_one_gpu():
+    result = load("bench_ancf_h200.json")
+    assert "H200" in result["machine"]["gpu"]
+    elements = {"beam": [30, 300, 1000, 3000, 10000], "plate": [32, 128, 512, 2048, 8192]}
+    for problem, counts in elements.items():
+        for dtype, residual, error in (("float64", 1e-8, 1e-8), ("float32", 1e-3, 1e-4)):
+            rows = [r for r in result["rows"] if r["problem"] == problem and r["dtype"] == dtype]
+            assert [r["elements"] for r in rows] == counts
+            assert all(r["ms_per_step"] > 0.0 and r["residual"] < residual and r["tip_error"] < error for r in rows)
