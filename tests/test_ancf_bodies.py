@@ -882,3 +882,19 @@ def test_probes_and_point_loads_on_gradient_slots():
     energies = sim.energies()
     work = sum(np.diff(np.concatenate([[[0, 0, 0]], sim.probe("p").displacement[0]]), axis=0) @ [0, 0, 3.0])
     assert energies["work_loads"][0] == pytest.approx(work, rel=1e-10)
+
+
+def test_a_checkpoint_of_another_section_is_refused(tmp_path):
+    def simulation(torsion):
+        b = wf.ModelBuilder()
+        section = wf.Rectangle(0.1, 0.1, torsion=torsion)
+        beam = b.add_beam(
+            [(0, 0, 0), (1, 0, 0)], elements=2, section=section, normal=(0, 0, 1), material=wf.SVK(E=1e7, nu=0.3)
+        )
+        b.clamp(beam.start)
+        return wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+
+    simulation(None).run(2e-3, outputs=[wf.Checkpoint(tmp_path / "c.npz")], progress=False)
+    simulation(None).resume(tmp_path / "c.npz")
+    with pytest.raises(wf.CheckpointError):
+        simulation(1e-5).resume(tmp_path / "c.npz")

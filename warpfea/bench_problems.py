@@ -108,7 +108,9 @@ def _plate_unknowns(cells: int) -> int:
 
 PROBLEMS = {
     "bar": Problem("bar", bar_cells, bar_unknowns, bar, 0, bar_unknowns((3, 2, 1)), (1000, 10000)),
-    "beam": Problem("beam", lambda n: max(1, round(n / 12)), lambda k: 12 * k, beam, 2, 12, (360, 3600, 12000, 36000, 120000)),
+    "beam": Problem(
+        "beam", lambda n: max(1, round(n / 12)), lambda k: 12 * k, beam, 2, 12, (360, 3600, 12000, 36000, 120000)
+    ),
     "plate": Problem(
         "plate",
         lambda n: max(1, round((np.sqrt(1.0 + n / 6.0) - 1.0) / 2.0)),

@@ -344,6 +344,8 @@ class Loads:
             h.update(np.ascontiguousarray(conn).tobytes())
         for force in self.model.description.body_forces:
             h.update(force.function.key.encode())
+        for moment in self.model.description.moments:
+            h.update(np.ascontiguousarray(moment.vectors).tobytes())
         for drive in (self.moved, self.turned):
             for values in (drive.slot, drive.law, drive.components, drive.arm, drive.axis) if drive else ():
                 if values is not None:

@@ -438,6 +438,10 @@ class Model:
             h.update(repr(block.key).encode())
             for part in block.parts:
                 h.update(np.ascontiguousarray(part.conn).tobytes())
+        for body in self.bodies:
+            h.update(repr(body.section).encode())
+            if body.frames is not None:
+                h.update(np.ascontiguousarray(body.frames).tobytes())
         h.update(self.reference.tobytes())
         h.update(self.free_host.tobytes())
         h.update(self._mass.data.tobytes())
