@@ -54,6 +54,10 @@ class BlockKey:
     affine: bool
     framed: bool
 
+    def scheme_of(self, name: str) -> tuple[Part, ...] | None:
+        """The integration `name` of the family, if it has one."""
+        return families.get(self.family).schemes.get(name)
+
     @property
     def integral(self) -> Part:
         """The part of the energy."""

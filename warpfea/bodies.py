@@ -98,6 +98,7 @@ class Body:
         section: section of a beam.
         node_axes: (nodes, 3, 3) orthonormal axes (columns) of each node's gradient slots; None: the global ones.
         origin: (3,) body origin; device positions are relative to it.
+        element_offset: number of elements of the bodies before it, set at finalize.
         slots: (used nodes x slots per node) model slots in body order, set at finalize; -1 before.
     """
 
@@ -113,6 +114,7 @@ class Body:
     section: Any = None
     index: int = -1
     slot_offset: int = -1
+    element_offset: int = -1
     velocity: np.ndarray | None = field(default=None, repr=False)
     initial_displacement: np.ndarray | None = field(default=None, repr=False)
 

@@ -92,8 +92,8 @@ class ModelBuilder:
             mesh: file (Gmsh .msh, .vtu, Abaqus .inp) or Mesh, m after `scale`.
             material: one law, or laws by element group of the mesh.
             element: "T4" or "T10", by default as the cells are; "ENMC", "FN" or "FN18", the ANCF tetrahedra, on
-                tetrahedra (of T10 cells the corner nodes stay, and ENMC keeps the curved shape); "H3843", the ANCF
-                brick, on hexahedra.
+                tetrahedra (of T10 cells the corner nodes stay, numbered anew; ENMC keeps the curved shape); "H3843",
+                the ANCF brick, on hexahedra.
             quadrature: name of the force rule of all elements; T10: "tet4", "tet5_paper", "tet8", "tet14"; T4: "tet1",
                 "tet4"; ENMC, FN, FN18: "tet14", "conical4"; H3843: "3x3x3", "4x4x4". By default T10 takes "tet4" where
                 straight and "tet8" where curved, T4 "tet1", the others their first.
@@ -213,7 +213,7 @@ class ModelBuilder:
         family = element_families.get(element)
         split = all(law.law == "svk" for _, law in materials)
         scheme = integration or ("tied" if split else "full")
-        known = [*family.schemes, *family.rules]
+        known = [name for name in (*family.schemes, *family.rules) if not name.startswith("_")]
         if scheme not in known:
             raise ModelError(f"body {name!r}: integration = {scheme!r} is none of {', '.join(map(repr, known))}")
         if scheme in family.schemes and not split:
@@ -262,9 +262,11 @@ class ModelBuilder:
             ModelError: an unknown name of slots or components, or nodes of another builder.
         """
         body = self._own(nodes, "clamp", NodeSet)
-        self.description.supports.append(
-            Support(body, support_slots(nodes, slots), component_mask(components, f"clamp on {body.name!r}"))
-        )
+        held = support_slots(nodes, slots)
+        if not len(held):
+            raise ModelError(f"clamp on {body.name!r}: the nodes {nodes.name!r} have no slots {slots!r}")
+        mask = component_mask(components, f"clamp on {body.name!r}")
+        self.description.supports.append(Support(body, held, mask))
 
     def drive(
         self,
@@ -273,7 +275,7 @@ class ModelBuilder:
         displacement: Any = None,
         rotation: Rotation | None = None,
         components: str = "xyz",
-        slots: str = "position",
+        slots: str | None = None,
     ) -> None:
         """Move nodes on a prescribed path.
 
@@ -283,7 +285,8 @@ class ModelBuilder:
                 (n, nodes, 3)).
             rotation: Rotation about an axis, from the reference.
             components: which of "xyz" are prescribed.
-            slots: as for clamp; gradients move with a rotation, and are held by a displacement.
+            slots: as for clamp; by default "all" with a rotation, which turns gradients too, and "position" with a
+                displacement, which holds gradients that are named.
 
         Raises:
             ModelError: neither or both of displacement and rotation, or a wrong shape.
@@ -292,6 +295,7 @@ class ModelBuilder:
         what = f"drive of {nodes.name or 'nodes'!r} on body {body.name!r}"
         if (displacement is None) == (rotation is None):
             raise ModelError(f"{what}: give either displacement or rotation")
+        slots = slots or ("position" if rotation is None else "all")
         support = Support(body, support_slots(nodes, slots), component_mask(components, what))
         if rotation is not None:
             if not isinstance(rotation, Rotation):
@@ -301,19 +305,22 @@ class ModelBuilder:
                 raise ModelError(f"{what}: axis is zero")
             support.law = time_law(rotation.angle, f"{what}: angle", scalar=True)
             support.rotation = (vector(rotation.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis))
-        elif isinstance(displacement, tuple) and len(displacement) == 2 and np.ndim(displacement[1]) == 3:
+            self.description.supports.append(support)
+            return
+        moved = np.isin(support.slots, support_slots(nodes, "position"))
+        if not moved.any():
+            raise ModelError(f"{what}: slots = {slots!r} has no position to displace; clamp holds gradients")
+        if not moved.all():  # gradients stay as they are
+            self.description.supports.append(Support(body, support.slots[~moved], support.components))
+        support.slots = support.slots[moved]
+        if isinstance(displacement, tuple) and len(displacement) == 2 and np.ndim(displacement[1]) == 3:
             times, values = np.asarray(displacement[0], float), np.asarray(displacement[1], float)
             if values.shape != (len(times), len(nodes), 3):
                 raise ModelError(f"{what}: values have shape {values.shape}, expected {(len(times), len(nodes), 3)}")
-            support.slots = support_slots(nodes, "position")
-            support.node_laws = [time_law((times, values[:, k]), what) for k in range(len(nodes))]
+            used = np.flatnonzero(body.node_slot[nodes.indices] >= 0)
+            support.node_laws = [time_law((times, values[:, k]), what) for k in used]
         else:
             support.law = time_law(displacement, f"{what}: displacement")
-            moved = np.isin(support.slots, support_slots(nodes, "position"))
-            if not moved.all():
-                held = Support(body, support.slots[~moved], support.components)
-                self.description.supports.append(held)
-                support.slots = support.slots[moved]
         self.description.supports.append(support)
 
     # loads
@@ -343,14 +350,13 @@ class ModelBuilder:
         if isinstance(point, MaterialPoint):
             slots, vectors, axes = point.slots[None], (point.gradients @ point.axes)[None], point.axes[None]
         else:
-            chosen = support_slots(point, "all")
-            chosen = chosen[body.slot_kind[chosen] > 0]
-            if len(chosen) != 3 * len(point):
+            nodes = point.indices[body.node_slot_count[point.indices] == 4]
+            if not len(nodes):
                 raise ModelError(
                     f"add_moment: nodes of body {body.name!r} ({body.family.name}) have no gradients to turn; use a "
                     "point body.at(...), or add_traction"
                 )
-            slots = chosen.reshape(-1, 3)
+            slots = body.node_slot[nodes][:, None] + np.arange(1, 4)
             vectors = np.tile(np.eye(3), (len(slots), 1, 1))
             axes = np.swapaxes(body.reference[slots], 1, 2)
         vectors = vectors * (np.arange(3) >= 3 - body.family.spin_vectors)

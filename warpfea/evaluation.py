@@ -13,6 +13,7 @@ from . import assembly
 from .assembly import chunks, geometry, gradients
 from .elements import Rule
 from .kernels.gather import gather_kernels
+from .kernels.materials import ANY_J
 from .kernels.types import precision
 from .launch import Launcher
 from .state import State
@@ -129,7 +130,10 @@ class Evaluation:
             if body is not None and all(part.body is not body for part in block.parts):
                 continue
             if block.key.tying:
-                continue  # its transverse shear vanishes at the faces, where a shell's stress is wanted
+                if block.key.scheme_of("_shear stress") is None:
+                    continue  # the transverse shear of a shell vanishes at its faces, where its stress is wanted
+                block.shear = block.shear or m.shear_block(block)
+                block = block.shear
             stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
             J = self._zeros((m.worlds, block.points, block.count), m.types.T)
             kernel = block.kernels_for(m.dtype, None).point_stress
@@ -160,7 +164,7 @@ class Evaluation:
                 at_samples = np.einsum("nq,bqek->benk", to_samples, stress[:, :, members].astype(float))
                 rows = (body.mesh.cells[part.elements][:, :, None] * k + np.arange(k)).reshape(len(part.elements), -1)
                 v = volumes[part.elements]
-                if block.key.part == 0:
+                if block.key.part == 0 and not block.key.scheme.startswith("_"):
                     np.add.at(weight, rows, v[:, None])
                 for b in range(m.worlds):
                     np.add.at(total[b], rows, at_samples[b] * v[:, None, None])
@@ -171,12 +175,12 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
     """Model index and description of the element with the smallest J at points and vertices; u (slots, 3), m."""
     best, index, text = np.inf, -1, "no element"
     for block in model.blocks:
-        first = block.element_offset
+        if model.needs_positive_J and block.key.law in ANY_J:
+            continue  # may turn inside out
         for part in block.parts:
             body = part.body
             rule = block.key.rule
             points = np.vstack([rule.points, body.family.vertices])
-            done = 0
             for members in chunks(body, part.elements, len(points)):
                 _, ds, J0, _ = geometry(body, members, points)
                 U = u[body.slot_offset + body.connectivity[members]]
@@ -184,10 +188,8 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
                 J = np.linalg.det(F).min(axis=1)
                 low = int(np.argmin(np.where(np.isnan(J), -np.inf, J)))
                 if not J[low] >= best:
-                    best, index = float(J[low]), first + done + low
+                    best, index = float(J[low]), body.element_offset + int(members[low])
                     text = f"element {int(members[low])} of body {body.name!r} (J = {best:.3g})"
-                done += len(members)
-            first += len(part.elements)
     return index, text
 
 

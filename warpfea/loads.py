@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from . import assembly
+from . import elements as families
 from .elements import Rule
 from .errors import ModelError
 from .kernels.follower import follower_struct, moment_kernels, pressure_kernels
@@ -240,7 +241,7 @@ class Loads:
         m = self.model
         rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.parts]
         rule = max(rules, key=lambda r: r.degree)
-        if getattr(block, "field_rule", None) is None:
+        if block.field_rule is None:
             weights, shapes = [], []
             for part in block.parts:
                 for elems in assembly.chunks(part.body, part.elements, len(rule.weights)):
@@ -248,7 +249,8 @@ class Loads:
                     rho = assembly.density_at(part.body, elems, s, part.body.connectivity[elems])
                     weights.append(rho * det * rule.weights)
                     shapes.append(s)
-            shape = shapes[0] if len(shapes[0]) == 1 else np.concatenate(shapes)
+            per_element = families.get(block.key.family).has_gradients
+            shape = np.concatenate(shapes) if per_element else shapes[0]
             block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
             block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
             block.field_rule = rule
@@ -265,10 +267,7 @@ class Loads:
         self.pushed_topology: Any = None
         if not self._offset:
             return
-        # each launch lays its entries out as [local, item]
-        flat = np.concatenate([c.T.ravel() for c in self._pushed])
-        order = np.argsort(flat, kind="stable")
-        start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=m.slots))])
+        start, order = assembly.gather_table(self._pushed, m.slots)
         topo = topology_struct(m.dtype)()
         topo.start = m.array("loads", start, wp.int32)
         topo.entry = m.array("loads", order, wp.int32)
@@ -344,6 +343,8 @@ class Loads:
             h.update(np.ascontiguousarray(conn).tobytes())
         for force in self.model.description.body_forces:
             h.update(force.function.key.encode())
+        for pressure in self.model.description.pressures:
+            h.update(np.ascontiguousarray(pressure.surface.faces).tobytes())
         for moment in self.model.description.moments:
             h.update(np.ascontiguousarray(moment.vectors).tobytes())
         for drive in (self.moved, self.turned):

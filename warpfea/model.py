@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +42,8 @@ class Block:
     slots: int
     contribution_offset: int
     element_offset: int
+    field_rule: Any = None
+    shear: Any = None
 
     def kernels_for(self, dtype: str, damping: str | None) -> Any:
         """The kernels of this kind of element with another form of damping."""
@@ -102,8 +104,10 @@ class Model:
         return out
 
     def _number(self) -> None:
-        offset = 0
+        offset, elements_before = 0, 0
         for body in self.bodies:
+            body.element_offset = elements_before
+            elements_before += len(body.mesh.cells)
             for rule in {body.rule, body.curved_rule}:
                 for part in body.family.scheme(rule):
                     assembly.check_orientation(body, part.rule)
@@ -183,6 +187,27 @@ class Model:
             points = len(key.rule.weights)
             kernels = element_kernels(self.dtype, key.law, family.slots, points, key.affine, key.damping, key.framed)
         return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element)
+
+    def shear_block(self, block: Block) -> Block:
+        """Elements of a tied block with their shears at points, for output."""
+        name = "_shear stress"
+        key = replace(block.key, scheme=name, part=0, law="orthotropic", framed=True)
+        (part,) = key.scheme_of(name) or ()
+        assert part.law is not None
+        parts, rows = [], []
+        for host in block.parts:
+            _, values = part.law(host.body.materials[host.material][1])
+            parts.append(assembly.HostBlock(key, host.body, host.elements, host.material, values))
+            rows.append(np.pad(values, (0, NCOEF - len(values))))
+        data = block_struct(self.dtype)()
+        data.conn, data.is_position, data.count = block.data.conn, block.data.is_position, block.count
+        data.coefficients = self.array("output", np.array(rows)[None], self.types.T)
+        index = np.concatenate([np.full(len(p.elements), k) for k, p in enumerate(parts)])
+        data.material = self.array("output", index, wp.int32)
+        self._point_tables(data, key, parts)
+        points = len(key.rule.weights)
+        kernels = element_kernels(self.dtype, key.law, block.slots, points, False, None, True)
+        return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0)
 
     def _tied_tables(self, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
         T, vec3 = self.types.T, self.types.vec3

@@ -253,14 +253,12 @@ class Simulation(Results):
         g = np.where(np.isfinite(g), g, np.inf)
         best, index, text = -1.0, -1, "element unknown"
         for block in m.blocks:
-            first = block.element_offset
             for part in block.parts:
                 values = g[part.conn + part.body.slot_offset].max(axis=1)
                 k = int(np.argmax(values))
                 if values[k] > best:
-                    best, index = float(values[k]), first + k
+                    best, index = float(values[k]), part.body.element_offset + int(part.elements[k])
                     text = f"element {int(part.elements[k])} of body {part.body.name!r} (residual {best:.3g} N)"
-                first += len(part.elements)
         return index, text
 
     def run(

@@ -66,10 +66,7 @@ def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.nd
 def svk_only(material: Material) -> SVK:
     """The split is of the SVK law."""
     if not isinstance(material, SVK):
-        raise ModelError(
-            "integration='split' splits the St. Venant-Kirchhoff law; use integration='full' with "
-            f"{type(material).__name__}"
-        )
+        raise ModelError(f"this integration splits the St. Venant-Kirchhoff law, not {type(material).__name__}")
     return material
 
 
@@ -131,6 +128,12 @@ def _section_part(material: Material) -> tuple[str, tuple[float, ...]]:
 
 def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
     return "assumed_strain", (svk_only(material).lame[1],)
+
+
+def _shear_stress(material: Material) -> tuple[str, tuple[float, ...]]:
+    """The shears along the axis at points, for the stress of "tied"."""
+    _, mu = svk_only(material).lame
+    return "orthotropic", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, mu, mu)
 
 
 def _shear_coupling(
@@ -197,6 +200,7 @@ BEAM = register(
         node_samples=np.array([[(x, y, z) for y, z in SECTION] for x in (0.0, 1.0)]),
         lattice=box_lattice(LOW, HIGH, (4, 1, 1)),
         schemes={
+            "_shear stress": (Part("shear", box_rule((3, 2, 2), RANGES), _shear_stress, framed=True),),
             "tied": (
                 Part("axis", box_rule((3, 2, 2), RANGES), _axial_part, framed=True),
                 Part("section", at_ends(box_rule((2, 2, 2), RANGES)), _section_part, framed=True),

@@ -87,7 +87,8 @@ def _tet(name: str, cell: str, elimination: float | None) -> Family:
             rules={"tet14": TET_RULES["tet14"], "conical4": conical_tet(4)},
             curved_rule=TET_RULES["tet14"],
             mass_rule=conical_tet(4),
-            curved_mass_rule=conical_tet(5),
+            # the cubic map of FN on a curved body makes degree 12; the others degree 9
+            curved_mass_rule=conical_tet(7) if name == "FN" else conical_tet(5),
             vertices=CORNERS,
             affine=False,
             parent=Parent(),
