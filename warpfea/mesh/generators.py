@@ -29,7 +29,7 @@ def box(
     *,
     cells: Sequence[int],
     element: str = "T10",
-    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     map: PointMap | None = None,
     name: str = "box",
 ) -> Mesh:
@@ -70,7 +70,7 @@ def cylinder(
     *,
     cells: Sequence[int],
     element: str = "T10",
-    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     name: str = "cylinder",
 ) -> Mesh:
     """A cylinder about the z axis, from ``origin`` (centre of the bottom) to ``origin`` + (0, 0, length) (m).

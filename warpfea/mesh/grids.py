@@ -18,7 +18,7 @@ def grid(
     size: Sequence[float],
     *,
     cells: Sequence[int],
-    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     map: PointMap | None = None,
     name: str = "plate",
 ) -> Mesh:
