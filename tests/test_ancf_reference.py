@@ -119,6 +119,15 @@ def test_manufactured_orders(parts):
     assert order["H3843"] > 3.6
 
 
+def test_manufactured_sines_of_beams_and_plates(parts):
+    rows = parts["manufactured_structures"]
+    for element, integration, error in (("3243", "tied", 1e-4), ("3243", "split", 4e-3), ("3443", "tied", 5e-3)):
+        found = select(rows, element=element, integration=integration)
+        assert found[-1]["elements"] == 16
+        assert found[-1]["error"] < error
+        assert all(r["order"] > 1.8 for r in found[1:])
+
+
 # live, on coarse cases
 
 
