@@ -123,3 +123,47 @@ def test_the_worst_element_is_counted_by_body_and_not_by_energy_part():
     with pytest.raises(wf.ConvergenceError, match="body 'box'") as caught:
         sim.step()
     assert 4 <= caught.value.element < 4 + len(soft.mesh.cells)
+
+
+def quarter(elements):
+    curve = lambda s: (np.sin(1.5 * np.pi * s), 0.0, 1.0 - np.cos(1.5 * np.pi * s))  # noqa: E731
+    b = wf.ModelBuilder()
+    return b.add_beam(curve, elements=elements, section=wf.Rectangle(0.1, 0.1), normal=(0, 1, 0), material=LAW)
+
+
+def kinked():
+    b = wf.ModelBuilder()
+    curve = lambda s: (s, abs(s - 0.5), 0.0 * s)  # noqa: E731
+    return b.add_beam(curve, elements=4, section=wf.Rectangle(0.01, 0.01), normal=(0, 0, 1), material=LAW)
+
+
+def simulated(**options):
+    b = wf.ModelBuilder()
+    body = add_beam(b, (0, 0, 0), 1.0, 2)
+    b.clamp(body.start)
+    return wf.Simulation(b.finalize(device="cpu"), dt=1e-3), body
+
+
+MISTAKES = {
+    "coarse curve": (lambda: quarter(2), r"element \d .* turns by 135 degrees; use elements = 14"),
+    "kink": (kinked, r"corner of 90 degrees at s = 0.5"),
+    "normal": (lambda: wf.ModelBuilder().add_beam([(0, 0, 0), (1, 0, 0)], elements=1, section=wf.Rectangle(1, 1),
+                                                  normal="z", material=LAW), "normal must be three"),
+    "quads as a solid": (lambda: wf.ModelBuilder().add_solid(wf.mesh.grid((1, 1), cells=(1, 1)), material=LAW),
+                         "use add_shell"),
+    "damping": (lambda: wf.SVK(E=1.0, nu=0.3, damping=0.1), "must be a KelvinVoigt"),
+    "builder": (lambda: wf.Simulation(wf.ModelBuilder(), dt=1.0), "finalize"),
+    "static builder": (lambda: wf.solve_static(wf.ModelBuilder()), "finalize"),
+    "outputs": (lambda: simulated()[0].run(1e-3, outputs=["a.usdc"]), "list of writers"),
+    "reaction": (lambda: (lambda sim, body: sim.reaction(body))(*simulated()), "expected nodes"),
+    "field": (lambda: (lambda sim, body: sim.field(body, "von_mises"))(*simulated()), r"field\(name, body\)"),
+    "slots": (lambda: (lambda b: b.clamp(add_beam(b, (0, 0, 0), 1.0, 1).start, slots="director"))(wf.ModelBuilder()),
+              "body 'beam'.*'axis', 'section'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_mistakes_are_explained(case):
+    action, text = MISTAKES[case]
+    with pytest.raises(wf.ModelError, match=text):
+        action()

@@ -54,9 +54,9 @@ class BlockKey:
     affine: bool
     framed: bool
 
-    def scheme_of(self, name: str) -> tuple[Part, ...] | None:
-        """The integration `name` of the family, if it has one."""
-        return families.get(self.family).schemes.get(name)
+    def output_scheme(self, name: str) -> tuple[Part, ...] | None:
+        """The output integration `name` of the family, if it has one."""
+        return families.get(self.family).output_schemes.get(name)
 
     @property
     def integral(self) -> Part:

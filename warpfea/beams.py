@@ -134,6 +134,7 @@ def beam_geometry(
     if points.shape != (len(s), 3) or not np.all(np.isfinite(points)):
         raise ModelError(f"body {name!r}: the curve must give three finite coordinates (m) for every s in [0, 1]")
     ends = [(path.slope(a, 1) * (b - a), path.slope(b, -1) * (b - a)) for a, b in itertools.pairwise(s)]
+    _check_turns(name, s, ends, sharp_allowed=bool(path.marks))
     frames = np.array(
         [[_frame(name, x, k, section, normal) for x, k in zip(pair, s[e : e + 2])] for e, pair in enumerate(ends)]
     )
@@ -145,13 +146,39 @@ def beam_geometry(
     return Mesh(points, cells, "line", node_sets=sets, name=name), axes, local
 
 
+def _check_turns(name: str, s: np.ndarray, ends: list[tuple[np.ndarray, np.ndarray]], *, sharp_allowed: bool) -> None:
+    """Refuse elements that turn too far for a cubic, and kinks between elements."""
+
+    def angle(a: np.ndarray, b: np.ndarray) -> float:
+        size = float(np.linalg.norm(a) * np.linalg.norm(b))
+        return math.degrees(math.acos(float(np.clip(a @ b / size, -1.0, 1.0)))) if size > 0.0 else 0.0
+
+    turns = [angle(a, b) for a, b in ends]
+    worst = int(np.argmax(turns))
+    if turns[worst] > 100.0:
+        raise ModelError(
+            f"body {name!r}: element {worst} (s = {s[worst]:.3g} to {s[worst + 1]:.3g}) turns by {turns[worst]:.3g} "
+            f"degrees; use elements = {math.ceil(len(ends) * turns[worst] / 20.0)} or more, for 20 degrees each"
+        )
+    for k in range(1, len(ends)):
+        kink = angle(ends[k - 1][1], ends[k][0])
+        if kink > 5.0 and not sharp_allowed:
+            raise ModelError(
+                f"body {name!r}: the curve has a corner of {kink:.3g} degrees at s = {s[k]:.3g}; give a smooth curve, "
+                "one beam per side, or a polyline with corners='weld'"
+            )
+
+
 def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal: Any) -> np.ndarray:
     """(3, 3) columns: tangent (as it is), width and height vectors."""
     length = float(np.linalg.norm(tangent))
     if not (math.isfinite(length) and length > 0.0):
         raise ModelError(f"body {name!r}: the curve stands still or is not finite at s = {s:.4g}")
     t = tangent / length
-    up = np.asarray(normal(s) if callable(normal) else normal, dtype=float)
+    try:
+        up = np.asarray(normal(s) if callable(normal) else normal, dtype=float)
+    except (TypeError, ValueError):
+        up = np.zeros(0)
     if up.shape != (3,) or not np.all(np.isfinite(up)):
         raise ModelError(f"body {name!r}: normal must be three finite numbers or a function of s, got {normal!r}")
     n = up - (up @ t) * t
@@ -224,9 +251,13 @@ def _function_path(name: str, curve: Callable[[float], Any]) -> _Path:
 
     h = 1e-3
 
-    def slope(s: float, _: int) -> np.ndarray:
-        if s < 2 * h or s > 1 - 2 * h:
-            d = h if s < 2 * h else -h
+    def slope(s: float, side: int) -> np.ndarray:
+        low, high = at(max(s - h, 0.0)), at(min(s + h, 1.0))
+        middle = at(s)
+        bend = float(np.linalg.norm(high - 2.0 * middle + low))
+        kinked = 2 * h <= s <= 1 - 2 * h and bend > 0.05 * float(np.linalg.norm(high - low))
+        if s < 2 * h or s > 1 - 2 * h or kinked:
+            d = h * side if kinked else h if s < 2 * h else -h
             w = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / (12.0 * d)
             return np.sum([c * at(s + k * d) for k, c in enumerate(w)], axis=0)
         return (8.0 * (at(s + h) - at(s - h)) - (at(s + 2 * h) - at(s - 2 * h))) / (12.0 * h)

@@ -111,6 +111,11 @@ class ModelBuilder:
         name = self._name(name or mesh.name, given=name is not None)
         if len(mesh.cells) == 0:
             raise ModelError(f"body {name!r}: the mesh has no elements")
+        if element is None and mesh.cell_type in ("quad", "line"):
+            raise ModelError(
+                f"body {name!r}: {mesh.label} is a surface of {mesh.cell_type} cells, not a solid; use add_shell(mesh, "
+                "thickness=...)"
+            )
         family = element_families.get(element) if element else element_families.for_cell(mesh.cell_type)
         mesh, frames = solid_geometry(name, mesh, family)
         rule = family.rule(quadrature).name
@@ -213,7 +218,7 @@ class ModelBuilder:
         family = element_families.get(element)
         split = all(law.law == "svk" for _, law in materials)
         scheme = integration or ("tied" if split else "full")
-        known = [name for name in (*family.schemes, *family.rules) if not name.startswith("_")]
+        known = [*family.schemes, *family.rules]
         if scheme not in known:
             raise ModelError(f"body {name!r}: integration = {scheme!r} is none of {', '.join(map(repr, known))}")
         if scheme in family.schemes and not split:
@@ -500,7 +505,8 @@ class ModelBuilder:
         if body not in self.bodies:
             raise ModelError(f"{what}: body {body.name!r} belongs to another builder")
         if isinstance(thing, (NodeSet, SurfaceSet)) and len(thing) == 0:
-            raise ModelError(f"{what}: the selection {thing.name!r} on body {body.name!r} is empty")
+            chosen = repr(thing.name) if thing.name else "of the predicate or list"
+            raise ModelError(f"{what}: the selection {chosen} on body {body.name!r} is empty")
         if isinstance(thing, NodeSet):
             unused = thing.indices[body.node_slot[thing.indices] < 0]
             if len(unused) == len(thing.indices):

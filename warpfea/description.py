@@ -194,7 +194,10 @@ def component_mask(text: str, what: str) -> np.ndarray:
 def support_slots(nodes: NodeSet, which: str) -> np.ndarray:
     """Body slots of a node set, of the kinds named (see Family.kinds)."""
     body = nodes.body
-    kinds = body.family.kinds(which)
+    try:
+        kinds = body.family.kinds(which)
+    except ModelError as error:
+        raise ModelError(f"body {body.name!r}: {error}") from None
     first = body.node_slot[nodes.indices]
     first = first[first >= 0]
     if not len(first):

@@ -130,7 +130,7 @@ class Evaluation:
             if body is not None and all(part.body is not body for part in block.parts):
                 continue
             if block.key.tying:
-                if block.key.scheme_of("_shear stress") is None:
+                if block.key.output_scheme("shear stress") is None:
                     continue  # the transverse shear of a shell vanishes at its faces, where its stress is wanted
                 block.shear = block.shear or m.shear_block(block)
                 block = block.shear
@@ -164,7 +164,7 @@ class Evaluation:
                 at_samples = np.einsum("nq,bqek->benk", to_samples, stress[:, :, members].astype(float))
                 rows = (body.mesh.cells[part.elements][:, :, None] * k + np.arange(k)).reshape(len(part.elements), -1)
                 v = volumes[part.elements]
-                if block.key.part == 0 and not block.key.scheme.startswith("_"):
+                if block.key.part == 0 and block.key.scheme != "shear stress":
                     np.add.at(weight, rows, v[:, None])
                 for b in range(m.worlds):
                     np.add.at(total[b], rows, at_samples[b] * v[:, None, None])

@@ -38,6 +38,11 @@ def _check_density(owner: str, density: Density) -> None:
         )
 
 
+def _check_damping(owner: str, damping: Any) -> None:
+    if damping is not None and not isinstance(damping, KelvinVoigt):
+        raise ModelError(f"{owner}: damping = {damping!r} must be a KelvinVoigt(eta, lambda_v), or None")
+
+
 def _check_nu(owner: str, nu: float) -> None:
     if not (isinstance(nu, (int, float, np.floating)) and -1.0 < nu < 0.5):
         raise ModelError(f"{owner}: nu = {nu!r} must lie between -1 and 0.5, both excluded")
@@ -113,6 +118,7 @@ class SVK(Material):
         _positive("SVK", E=self.E)
         _check_nu("SVK", self.nu)
         _check_density("SVK", self.density)
+        _check_damping("SVK", self.damping)
 
     @classmethod
     def from_E_nu(cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None) -> SVK:
@@ -152,6 +158,7 @@ class MooneyRivlin(Material):
         _positive("MooneyRivlin", k=self.k, mu10=self.mu10)
         _non_negative("MooneyRivlin", mu01=self.mu01)
         _check_density("MooneyRivlin", self.density)
+        _check_damping("MooneyRivlin", self.damping)
 
     @classmethod
     def from_E_nu(
@@ -195,6 +202,7 @@ class NeoHookean(Material):
     def __post_init__(self) -> None:
         _positive("NeoHookean", mu=self.mu, k=self.k)
         _check_density("NeoHookean", self.density)
+        _check_damping("NeoHookean", self.damping)
 
     @classmethod
     def from_E_nu(cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None) -> NeoHookean:

@@ -77,7 +77,7 @@ class Model:
         if not isinstance(worlds, (int, np.integer)) or worlds < 1:
             raise ModelError(f"worlds = {worlds!r} must be a positive whole number")
         if not builder.bodies:
-            raise ModelError("the model has no body: call ModelBuilder.add_solid first")
+            raise ModelError("the model has no body: call add_solid, add_beam or add_shell first")
         self.device = _device(device)
         self.dtype = dtype
         self.worlds = int(worlds)
@@ -190,9 +190,9 @@ class Model:
 
     def shear_block(self, block: Block) -> Block:
         """Elements of a tied block with their shears at points, for output."""
-        name = "_shear stress"
+        name = "shear stress"
         key = replace(block.key, scheme=name, part=0, law="orthotropic", framed=True)
-        (part,) = key.scheme_of(name) or ()
+        (part,) = key.output_scheme(name) or ()
         assert part.law is not None
         parts, rows = [], []
         for host in block.parts:

@@ -69,6 +69,8 @@ class Results:
 
         The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
         """
+        if not isinstance(body, Body):
+            raise ModelError(f"field: expected field(name, body), got field({name!r}, {body!r})")
         if name == "displacement":
             return np.linalg.norm(self.displacements(body), axis=2)
         samples = von_mises(self._stress(name, body))

@@ -71,6 +71,14 @@ class ProbeRecord:
     velocity: np.ndarray
 
 
+def check_model(model: Any) -> None:
+    """Raise ModelError for what is not a Model, such as a builder."""
+    from .model import Model
+
+    if not isinstance(model, Model):
+        raise ModelError(f"expected a Model, got {type(model).__name__}; builder.finalize() makes one")
+
+
 class Simulation(Results):
     """Steps a model through time.
 
@@ -130,6 +138,7 @@ class Simulation(Results):
         capture: bool,
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
+        check_model(model)
         self.model = model
         self.state = model.state() if state is None else state
         got, expected = self.state.displacement, (model.worlds, model.slots)
@@ -283,6 +292,8 @@ class Simulation(Results):
         """
         if not math.isfinite(t_end):
             raise ModelError(f"t_end = {t_end!r} must be finite")
+        if not isinstance(outputs, (list, tuple)) or not all(hasattr(out, "write") for out in outputs):
+            raise ModelError(f"run: outputs must be a list of writers such as USDWriter(path), got {outputs!r}")
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
         total = max(0, round((t_end - now) / self._dt))
@@ -378,6 +389,8 @@ class Simulation(Results):
 
         NaN for a world whose last step was refused, or that was reset or resumed and has not stepped since.
         """
+        if not isinstance(nodes, NodeSet):
+            raise ModelError(f"reaction: expected nodes (body.nodes), got {nodes!r}")
         g = self.stepper.work.g.numpy() * (1.0 - self.model.free_host)
         first = nodes.body.node_slot[nodes.indices]
         rows = nodes.body.slot_offset + first[first >= 0]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .errors import ModelError
-from .simulation import Simulation, StepReport
+from .simulation import Simulation, StepReport, check_model
 from .solvers import NewtonPCG
 from .state import State
 
@@ -52,6 +52,10 @@ class StaticResult:
         """Force of the supports, (B, 3), N."""
         return self.simulation.reaction(nodes)
 
+    def node_gradients(self, body: Any) -> np.ndarray:
+        """(B, nodes, 3, 3) deformation gradient at the nodes of a body with gradient slots."""
+        return self.simulation.node_gradients(body)
+
     def field(self, name: str, body: Any) -> np.ndarray:
         """(B, nodes) scalars."""
         return self.simulation.field(name, body)
@@ -83,6 +87,7 @@ def solve_static(
     """
     if not (isinstance(load_steps, (int, np.integer)) and load_steps >= 1):
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number")
+    check_model(model)
     model.check_static_supports()
     options = solver or NewtonPCG(max_pcg=20000, max_newton=50)
     if tol is not None:

@@ -200,7 +200,6 @@ BEAM = register(
         node_samples=np.array([[(x, y, z) for y, z in SECTION] for x in (0.0, 1.0)]),
         lattice=box_lattice(LOW, HIGH, (4, 1, 1)),
         schemes={
-            "_shear stress": (Part("shear", box_rule((3, 2, 2), RANGES), _shear_stress, framed=True),),
             "tied": (
                 Part("axis", box_rule((3, 2, 2), RANGES), _axial_part, framed=True),
                 Part("section", at_ends(box_rule((2, 2, 2), RANGES)), _section_part, framed=True),
@@ -212,6 +211,7 @@ BEAM = register(
                 Part("D_nu", box_rule((3, 1, 1), RANGES), _poisson_part, framed=True),
             ),
         },
+        output_schemes={"shear stress": (Part("shear", box_rule((3, 2, 2), RANGES), _shear_stress, framed=True),)},
         slot_sets={"axis": (1,), "section": (2, 3)},
         spin_vectors=2,
         solid=False,

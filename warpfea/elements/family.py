@@ -110,6 +110,7 @@ class Family:
         node_samples: (n, k, 3) parent points at each element node where fields are taken for drawing.
         lattice: how an element is drawn.
         schemes: integrations of several parts by name, beside the rules.
+        output_schemes: integrations that are for stresses only.
         slot_sets: names of slot kinds that supports may hold.
         spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
             or a shell's surface can kink at a point for next to nothing, and must not carry it.
@@ -133,13 +134,15 @@ class Family:
     node_samples: np.ndarray
     lattice: Lattice
     schemes: dict[str, tuple[Part, ...]] = field(default_factory=dict)
+    output_schemes: dict[str, tuple[Part, ...]] = field(default_factory=dict)
     slot_sets: dict[str, tuple[int, ...]] = field(default_factory=dict)
     spin_vectors: int = 3
     solid: bool = True
 
     def scheme(self, name: str) -> tuple[Part, ...]:
         """The parts of an integration."""
-        return self.schemes[name] if name in self.schemes else (Part(name, self.rules[name]),)
+        known = {**self.schemes, **self.output_schemes}
+        return known[name] if name in known else (Part(name, self.rules[name]),)
 
     @property
     def slots(self) -> int:
