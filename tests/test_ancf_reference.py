@@ -11,6 +11,8 @@ import pathlib
 import numpy as np
 import pytest
 
+import warpfea as wf
+
 HERE = pathlib.Path(__file__).resolve().parent
 spec = importlib.util.spec_from_file_location("ancf_report", HERE / "ancf_report.py")
 report = importlib.util.module_from_spec(spec)
@@ -146,3 +148,36 @@ def test_frequencies_live():
         if r["integration"] == "tied":
             assert max(r["from_theory"]) < 0.01
     assert np.isfinite([r["omega"] for r in report.frequencies("cpu", quick=True)]).all()
+
+
+@pytest.mark.parametrize("thickness", [0.05, 1e-3])
+@pytest.mark.parametrize(("kind", "bound"), [("beam", 5e-3), ("shell", 0.03)])
+def test_a_thin_arc_bends_as_a_thick_one_does(kind, bound, thickness):
+    """A quarter circle of radius 1 whose end moment adds 0.1 to its curvature; 8 elements, plane, nu = 0."""
+    E, extra, length = 1e9, 0.1, np.pi / 2
+    law = wf.SVK(E=E, nu=0.0)
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    if kind == "beam":
+        body = b.add_beam(
+            lambda s: (np.sin(s * length), 0.0, 1.0 - np.cos(s * length)), elements=8, material=law,
+            section=wf.Rectangle(thickness, thickness), normal=lambda s: (-np.sin(s * length), 0.0, np.cos(s * length)),
+        )  # fmt: skip
+        width, start, end = thickness, body.start, body.end
+    else:
+        width = 0.1
+        bend = lambda X: np.stack([np.sin(X[:, 0]), X[:, 1], 1.0 - np.cos(X[:, 0])], axis=1)  # noqa: E731
+        normals = lambda X: np.stack([-X[:, 0], 0.0 * X[:, 0], 1.0 - X[:, 2]], axis=1)  # noqa: E731
+        mesh = wf.mesh.grid((length, width), cells=(8, 1), map=bend)
+        body = b.add_shell(mesh, thickness=thickness, material=law, normals=normals)
+        start, end = body.edge("x-"), body.edge("x+")
+    b.clamp(start)
+    b.clamp(body.nodes(lambda X: X[:, 0] > -1.0), components="y")
+    b.add_moment(end, (0.0, -extra * E * width * thickness**3 / 12.0, 0.0))
+    b.add_probe("tip", end)
+    result = wf.solve_static(b.finalize(device="cpu"), load_steps=2, tol=1e-5)
+
+    def tip(curvature):
+        return np.array([np.sin(curvature * length), 1.0 - np.cos(curvature * length)]) / curvature
+
+    got = result.probe("tip").position[0, -1, [0, 2]]
+    assert np.linalg.norm(got - tip(1.0 + extra)) < bound * np.linalg.norm(tip(1.0 + extra) - tip(1.0))
