@@ -230,25 +230,6 @@ def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _t
         inverse[world, slot] = B
 
     @wp.kernel(module=module)
-    def pushed_curvature(
-        topo: Topology,
-        contribution: wp.array2d(dtype=vec3),
-        p_in: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=f64),
-        free: wp.array(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        rows: wp.array3d(dtype=f64),
-    ):
-        """(dq/dv) p.K p per slot, K the symmetric tangent of the follower loads."""
-        world, slot = wp.tid()
-        if active[world] == 0:
-            return
-        f = vec3()
-        for k in range(topo.start[slot], topo.start[slot + 1]):
-            f += contribution[world, topo.entry[k]]
-        rows[0, world, slot] = dq_dv[world] * f64(wp.dot(wp.cw_mul(f, free[slot]), p_in[world, slot]))
-
-    @wp.kernel(module=module)
     def mass_product(
         topo: Topology,
         a: wp.array2d(dtype=vec3),
@@ -268,5 +249,4 @@ def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _t
         product=product,
         gather_blocks=gather_blocks,
         mass_product=mass_product,
-        pushed_curvature=pushed_curvature,
     )

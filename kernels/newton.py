@@ -66,7 +66,7 @@ def control_struct():
         slot_sums: wp.array2d(dtype=wp.float64)  # gather.RESIDUAL_ROWS
         elem_sums: wp.array2d(dtype=wp.float64)  # strain energy, viscous potential
         slope_sum: wp.array2d(dtype=wp.float64)
-        push_sum: wp.array2d(dtype=wp.float64)  # (dq/dv) p.K p of the follower loads, 0 without
+        push_sum: wp.array2d(dtype=wp.float64)  # p.K p of the follower loads, 0 without
         dq_dv: wp.array(dtype=wp.float64)
         tol: wp.float64
         eps: wp.float64
@@ -215,7 +215,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         alpha = ctl.alpha[world]
         old_norm = ctl.norm[world]
         # follower loads are held in the search with their symmetric tangent: Phi is then as curved as H says
-        bend = ctl.push_sum[0, world]
+        bend = ctl.dq_dv[world] * ctl.push_sum[0, world]
         phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
         norm = wp.sqrt(ctl.slot_sums[0, world])
         change = phi - ctl.phi[world]

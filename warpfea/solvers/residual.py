@@ -132,6 +132,7 @@ class Residual:
         if not m.loads.followers:
             return
         self._push_product(w.direction, active)
-        args = [m.loads.pushed_topology, w.pushed_tangent, w.direction, w.step.dq_dv, m.topology.free, active, w.rows]
-        launch(self.gather.pushed_curvature, self.dim, args)
+        args = [m.loads.pushed_topology, w.pushed_tangent, active, w.Hp]
+        launch(self.gather.gather_force, self.dim, args)
+        launch(self.newton.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
         self.reduce(w.rows, 1, active, w.newton.push_sum)
