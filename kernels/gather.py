@@ -8,6 +8,7 @@ import types as _types
 
 import warp as wp
 
+from .constraints import constraint_struct, multiplier_struct
 from .types import kernel_module, precision
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels", "topology_struct"]
@@ -41,13 +42,17 @@ def topology_struct(dtype: str):
 
 
 @functools.cache
-def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _types.SimpleNamespace:
-    """Kernels over slots; `nonpotential` adds forces that are held inside a line search, `pressure` their tangent."""
+def gather_kernels(
+    dtype: str, nonpotential: bool, pressure: bool = False, constrained: bool = False
+) -> _types.SimpleNamespace:
+    """Kernels over slots; `nonpotential` adds forces that are held inside a line search, `pressure` their tangent,
+    `constrained` the forces of constraints."""
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
+    Constraints, Multipliers = constraint_struct(), multiplier_struct()
     f64 = wp.float64
-    module = kernel_module(f"gather_{dtype}_{nonpotential}_{pressure}")
+    module = kernel_module(f"gather_{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}")
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -90,12 +95,18 @@ def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _t
         mass_factor: wp.array(dtype=f64),
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
         inertia: wp.array2d(dtype=vec3),
         internal: wp.array2d(dtype=vec3),
         g: wp.array2d(dtype=vec3),
+        gradient: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """Eq. (17): g = M (v - v~) c_M + f_int - f_dead - f_pushed, and the rows of `RESIDUAL_ROWS`."""
+        """Eq. (17): g = M (v - v~) c_M + f_int - f_dead - f_pushed + J^T lambda, and the rows of `RESIDUAL_ROWS`.
+
+        `gradient` is that of the augmented potential, g + J^T rho c, which the next Newton step is solved for.
+        """
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -117,6 +128,26 @@ def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _t
             for k in range(3):
                 magnitude[k] = magnitude[k] + wp.abs(new[k])
         residual_force = a + f - load
+        descent = a + f - held
+        if wp.static(constrained):
+            if con.slot_start[slot + 1] > con.slot_start[slot]:
+                tie = wp.vec3d()
+                squeeze = wp.vec3d()
+                merit = wp.vec3d()
+                for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
+                    term = con.slot_term[k]
+                    row = term / 3
+                    d = con.slot_weight[k] * mul.gradient[world, term]
+                    tie += mul.trial[world, row] * d
+                    squeeze += mul.excess[world, row] * d
+                    merit += mul.merit[world, row] * d
+                residual_force += vec3(tie)
+                gradient[world, slot] = residual_force + vec3(squeeze)
+                descent += vec3(merit)
+                for k in range(3):
+                    magnitude[k] = magnitude[k] + T(wp.abs(tie[k]))
+            else:
+                gradient[world, slot] = residual_force
         inertia[world, slot] = a
         internal[world, slot] = f
         g[world, slot] = residual_force
@@ -133,7 +164,7 @@ def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _t
         rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
         rows[4, world, slot] = f64(kinetic - work)
         rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
-        rows[6, world, slot] = f64(wp.dot(wp.cw_mul(a + f - held, free), direction[world, slot]))
+        rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), direction[world, slot]))
         refreshed = T(0.0)
         if wp.static(nonpotential):
             refreshed = wp.dot(pushed_held[world, slot] - pushed[world, slot], vs)
@@ -155,10 +186,12 @@ def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _t
         mass_factor: wp.array(dtype=f64),
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """H p = c_M M p + (dq/dv) K p on the free components, and p.Hp per slot."""
+        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per slot."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -171,7 +204,13 @@ def gather_kernels(dtype: str, nonpotential: bool, pressure: bool = False) -> _t
         if wp.static(pressure):
             for k in range(pushed_start[slot], pushed_start[slot + 1]):
                 f -= pushed_contribution[world, pushed_entry[k]]
-        h = wp.cw_mul(T(mass_factor[world]) * a + T(dq_dv[world]) * f, topo.free[slot])
+        h = T(mass_factor[world]) * a + T(dq_dv[world]) * f
+        if wp.static(constrained):
+            tie = wp.vec3d()
+            for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
+                tie += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
+            h += vec3(tie)
+        h = wp.cw_mul(h, topo.free[slot])
         out[world, slot] = h
         rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
 

@@ -9,6 +9,7 @@ from .types import kernel_module, precision
 
 __all__ = [
     "COMPONENT_ROWS",
+    "FAIL_CONSTRAINT",
     "FAIL_CURVATURE",
     "FAIL_ITERATIONS",
     "FAIL_JACOBIAN",
@@ -24,6 +25,7 @@ FAIL_LINE_SEARCH = 2
 FAIL_JACOBIAN = 3
 FAIL_NAN = 4
 FAIL_CURVATURE = 5
+FAIL_CONSTRAINT = 6
 
 ARMIJO = 1.0e-4
 WOLFE = 0.8
@@ -68,6 +70,12 @@ def control_struct():
         slope_sum: wp.array2d(dtype=wp.float64)
         push_sum: wp.array2d(dtype=wp.float64)  # p.K p of the follower loads, 0 without
         dq_dv: wp.array(dtype=wp.float64)
+        violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m; with constraints
+        constraint_sums: wp.array2d(dtype=wp.float64)  # constraints.SUM_ROWS
+        stepped: wp.array(dtype=wp.int32)  # the trial was accepted
+        outer: wp.array(dtype=wp.int32)  # multiplier updates of this step
+        constraint_tol: wp.float64  # m
+        classical: wp.int32  # multipliers change in an outer loop
         tol: wp.float64
         eps: wp.float64
         max_iterations: wp.int32
@@ -78,22 +86,26 @@ def control_struct():
 
 
 @functools.cache
-def newton_kernels(dtype: str) -> _types.SimpleNamespace:
+def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace:
     """Kernels of the Newton iteration in one precision of the vectors; scalars are float64."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
-    module = kernel_module(f"newton_{dtype}")
+    module = kernel_module(f"newton_{dtype}{'_constrained' if constrained else ''}")
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
         stored = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
+        if wp.static(constrained):
+            stored += ctl.constraint_sums[0, world]
         return ctl.slot_sums[4, world] + stored / ctl.dq_dv[world]
 
     @wp.func
     def magnitude(ctl: Control, world: int) -> f64:
         stored = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
+        if wp.static(constrained):
+            stored += ctl.constraint_sums[2, world]
         return ctl.slot_sums[5, world] + stored / ctl.dq_dv[world]
 
     @wp.func
@@ -122,6 +134,11 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             scale = wp.sqrt(f2)
             accept = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
             loud = norm > accept
+            if wp.static(constrained):
+                if ctl.violation[world, c] > ctl.constraint_tol:
+                    loud = True
+                    excess = wp.max(excess, ctl.violation[world, c] / ctl.constraint_tol)
+                    floor_excess = f64(1.0e300)
             ctl.quiet[world, c] = wp.where(loud, 0, 1)
             if loud:
                 solve += g2
@@ -153,6 +170,9 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_ITERATIONS
+            if wp.static(constrained):
+                if ctl.relative[world] <= f64(1.0e3) * ctl.tol:
+                    ctl.failed[world] = FAIL_CONSTRAINT  # in balance, but the constraints do not hold
 
     @wp.func
     def fail(ctl: Control, world: int, why: int):
@@ -201,6 +221,10 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         ctl.alpha[world] = f64(1.0)
         ctl.searches[world] = 0
         ctl.searching[world] = 1
+        if wp.static(constrained):
+            ctl.stepped[world] = 0
+            if ctl.classical == 0:
+                ctl.outer[world] = ctl.outer[world] + 1
         if not wp.isfinite(slope):
             fail(ctl, world, FAIL_NAN)
         elif slope >= f64(0.0):
@@ -234,6 +258,10 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
             ctl.searching[world] = 0
             measure(ctl, world)
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+            if wp.static(constrained):
+                ctl.stepped[world] = 1
+                more = ctl.constraint_sums[1, world] - ctl.constraint_sums[0, world]
+                ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
             ctl.phi_magnitude[world] = magnitude(ctl, world)
             ctl.iterations[world] = ctl.iterations[world] + 1
             ctl.total_iterations[world] = ctl.total_iterations[world] + 1
@@ -253,6 +281,26 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
                 if ctl.domain_J[world] <= f64(0.0):
                     why = FAIL_JACOBIAN
                 fail(ctl, world, why)
+
+    @wp.kernel(module=module)
+    def judge_outer(ctl: Control, running: wp.array(dtype=wp.int32), tol: f64, limit: int):
+        """Classical multiplier updates: another inner solve where a constraint is still violated."""
+        world = wp.tid()
+        ctl.stepped[world] = 0
+        if running[world] == 0 or ctl.failed[world] != 0:
+            return
+        largest = f64(0.0)
+        for c in range(ctl.components):
+            largest = wp.max(largest, ctl.violation[world, c])
+        if largest <= tol:
+            return
+        if ctl.outer[world] >= limit:
+            ctl.failed[world] = FAIL_CONSTRAINT
+            return
+        ctl.outer[world] = ctl.outer[world] + 1
+        ctl.iterations[world] = 0
+        ctl.active[world] = 1
+        ctl.stepped[world] = 1
 
     @wp.kernel(module=module)
     def any_set(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
@@ -341,6 +389,7 @@ def newton_kernels(dtype: str) -> _types.SimpleNamespace:
         begin=begin,
         begin_search=begin_search,
         judge_trial=judge_trial,
+        judge_outer=judge_outer,
         any_set=any_set,
         component_partial=component_partial,
         component_sum=component_sum,

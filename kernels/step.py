@@ -17,7 +17,7 @@ __all__ = ["LEDGER", "LEDGER_ROWS", "REPORT", "STATUS", "step_kernels", "step_st
 
 STATUS = {"running": 0, "failed": 1, "frozen": 2}
 
-REPORT = ("status", "newton", "pcg", "residual", "halvings", "min_J", "time", "failure", "attempt_time")
+REPORT = ("status", "newton", "pcg", "residual", "halvings", "min_J", "time", "failure", "attempt_time", "violation", "outer")
 """Columns of the report of a step, [world, column] in float64; probes follow."""
 
 LEDGER = (
@@ -31,6 +31,7 @@ LEDGER = (
     "integrator",
     "ledger_residual",
     "unbalanced",
+    "work_joints",
 )
 """Columns of the energy ledger, J, accumulated since the start (the first three: current values)."""
 
@@ -74,7 +75,7 @@ def step_struct():
 
 @functools.cache
 def step_kernels(
-    dtype: str, coefficients: wp.Function, static: bool, multistep: bool, nonpotential: bool
+    dtype: str, coefficients: wp.Function, static: bool, multistep: bool, nonpotential: bool, constrained: bool = False
 ) -> _types.SimpleNamespace:
     """Kernels of the step loop.
 
@@ -84,6 +85,7 @@ def step_kernels(
         static: no inertia, v is the displacement increment.
         multistep: the scheme uses the step before the last.
         nonpotential: forces without a potential act.
+        constrained: the model has constraints.
     """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -91,7 +93,8 @@ def step_kernels(
     Step = step_struct()
     Newton = control_struct()
     PCG = pcg_struct()
-    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}_{nonpotential}")
+    tied = "_constrained" if constrained else ""
+    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}_{nonpotential}{tied}")
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
@@ -101,6 +104,8 @@ def step_kernels(
         step.running[world] = alive
         step.refused[world] = 0
         newton.total_iterations[world] = 0
+        if wp.static(constrained):
+            newton.outer[world] = 0
         pcg.total[world] = 0
         step.halvings[world] = 0
         if alive == 0:
@@ -304,6 +309,7 @@ def step_kernels(
         newton: Newton,
         sums: wp.array2d(dtype=f64),
         explicit_viscous: wp.array(dtype=f64),
+        constraint_work: wp.array2d(dtype=f64),
         ledger: wp.array2d(dtype=f64),
     ):
         """Add a substep to the ledger; the integrator's part from its own formula, never as the remainder."""
@@ -322,6 +328,10 @@ def step_kernels(
             numerical += sums[8, world] - change_K
         else:
             numerical += sums[0, world]
+        joints = f64(0.0)
+        if wp.static(constrained):
+            joints = constraint_work[0, world]
+            numerical += constraint_work[1, world]
         step.ledger_time[world] = step.time[world]
         ledger[world, 0] = kinetic
         ledger[world, 1] = strain
@@ -332,9 +342,10 @@ def step_kernels(
         ledger[world, 6] = ledger[world, 6] + viscous
         ledger[world, 7] = ledger[world, 7] + numerical
         balance = change_K + change_W - sums[3, world] + viscous + numerical
-        balance -= loads + sums[4, world] + sums[7, world]
+        balance -= loads + sums[4, world] + sums[7, world] + joints
         ledger[world, 8] = ledger[world, 8] + balance
         ledger[world, 9] = ledger[world, 9] + sums[6, world]
+        ledger[world, 10] = ledger[world, 10] + joints
 
     @wp.kernel(module=module)
     def write_report(step: Step, newton: Newton, pcg: PCG, report: wp.array2d(dtype=f64)):
@@ -349,6 +360,14 @@ def step_kernels(
         report[world, 6] = step.time[world]
         report[world, 7] = f64(newton.failed[world])
         report[world, 8] = step.new_time[world]
+        report[world, 9] = f64(0.0)
+        report[world, 10] = f64(0.0)
+        if wp.static(constrained):
+            largest = f64(0.0)
+            for c in range(newton.components):
+                largest = wp.max(largest, newton.violation[world, c])
+            report[world, 9] = largest
+            report[world, 10] = f64(newton.outer[world])
 
     @wp.kernel(module=module)
     def probe_values(

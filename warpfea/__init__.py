@@ -38,6 +38,7 @@ from .beams import Rectangle, spline  # noqa: E402
 from .bodies import Body, ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noqa: E402
 from .builder import ModelBuilder  # noqa: E402
 from .checkpoint import Checkpoint  # noqa: E402
+from .constraints import Joint  # noqa: E402
 from .description import Rotation  # noqa: E402
 from .errors import (  # noqa: E402
     CapacityError,
@@ -51,6 +52,7 @@ from .errors import (  # noqa: E402
     OutputError,
     PenetrationError,
 )
+from .joints import GROUND  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
 from .model import Model  # noqa: E402
 from .render import GIFWriter, PNGWriter  # noqa: E402
@@ -63,6 +65,7 @@ from .usd import USDWriter  # noqa: E402
 from .vtk import VTUWriter  # noqa: E402
 
 __all__ = [
+    "GROUND",
     "SVK",
     "Body",
     "CapacityError",
@@ -73,6 +76,7 @@ __all__ = [
     "ElementSet",
     "Error",
     "GIFWriter",
+    "Joint",
     "KelvinVoigt",
     "MaterialPoint",
     "MeshError",
@@ -103,7 +107,6 @@ __all__ = [
 
 
 _LATER = {
-    "GROUND": "joints",
     "HalfSpace": "contact",
     "Sphere": "contact",
     "Box": "contact",

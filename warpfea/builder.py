@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pathlib
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from . import mesh as meshes
 from .assembly import center_of_mass, surface_weights
 from .beams import Rectangle, beam_geometry
 from .bodies import Body, ElementSet, MaterialPoint, NodeSet, SurfaceSet
+from .constraints import Joint
 from .description import (
     BodyForce,
     DeadLoad,
@@ -29,11 +31,13 @@ from .description import (
     vector,
 )
 from .errors import ModelError
+from .joints import Ground, make_constraint, make_joint
 from .laws import time_law
 from .materials import Material
 from .mesh import Mesh
 from .shells import shell_geometry
 from .solids import solid_geometry
+from .welds import make_weld
 
 if TYPE_CHECKING:
     from .model import Model
@@ -444,19 +448,103 @@ class ModelBuilder:
         X = weights @ (body.reference[slots] + (body.slot_kind[slots] == 0)[:, None] * body.origin)
         self.description.probes.append(Probe(name, body, slots, weights, X))
 
+    # joints
+
+    def add_joint(
+        self,
+        kind: str,
+        *,
+        parent: Any,
+        child: Any,
+        anchor: Any = None,
+        axis: Any = None,
+        axis2: Any = None,
+        drive: Any = None,
+        name: str | None = None,
+    ) -> Joint:
+        """Tie two bodies, or a body and the ground, by a joint.
+
+        Args:
+            kind: "spherical", "universal", "revolute", "cylindrical", "translational", "fixed", or "distance" (a rod of
+                constant length between two points).
+            parent, child: wf.GROUND, a material point (body.at), nodes (body.nodes, beam.end), or a surface, whose mean
+                place and turn count. A joint turns a solid best by a surface or several nodes: at a point of a solid
+                the stress is singular, and the joint the softer the finer the mesh.
+            anchor: (3,) m, where the joint is in the reference; by default where the child's handle is. Of a distance
+                joint with the ground: the rod's end there.
+            axis: (3,) of the hinge or the slide, or the parent's axis of a universal joint.
+            axis2: the child's axis of a universal joint, perpendicular to `axis`; by default any such.
+            drive: time law: angle (rad) of a revolute joint, the child against the parent, right-handed about the axis
+                and of any number of turns; travel (m) of a translational joint, the child along the axis; length (m) of
+                a distance joint. Angle and travel are 0 in the reference.
+            name: unique name.
+
+        Returns:
+            Joint: the handle for sim.joint_force, sim.violation, sim.joint_record.
+
+        Raises:
+            ModelError: an unknown kind, handles that are apart without an anchor, points of a rod that coincide, a
+                handle that does not tell how a direction turns, or an argument that does not belong to the kind.
+        """
+        name = self._joint_name(name, str(kind))
+        for side, thing in (("parent", parent), ("child", child)):
+            if not isinstance(thing, Ground):
+                self._own(thing, f"joint {name!r}: {side}", MaterialPoint, NodeSet, SurfaceSet)
+        return self._join(make_joint(kind, parent, child, anchor, axis, axis2, drive, name))
+
+    def add_constraint(self, kind: str, *, points: Any, value: Any = None, name: str | None = None) -> Joint:
+        """A single basic constraint between points (Paper I, section 5.4).
+
+        Args:
+            kind: "DP1", (Q - P).(T - R) = f m^2; "DP2", the same with R on the body of P and Q; "DIST", |P - Q| = f m,
+                positive; "PIN", P - Q = f (3,) m.
+            points: P, Q (, R, T): material points, nodes or surfaces (their mean), or fixed places (x, y, z), m.
+            value: f, a time law; by default 0 of DP1, DP2 and PIN, and the present distance of DIST.
+            name: unique name.
+
+        Raises:
+            ModelError: an unknown kind, a wrong number of points, points that coincide where a direction is needed, or
+                pinned points that are apart.
+        """
+        name = self._joint_name(name, str(kind))
+        for k, point in enumerate(points if isinstance(points, (tuple, list)) else ()):
+            if hasattr(point, "body"):
+                self._own(point, f"constraint {name!r}: point {k + 1}", MaterialPoint, NodeSet, SurfaceSet)
+        return self._join(make_constraint(kind, points, value, name))
+
+    def weld(self, first: NodeSet | SurfaceSet, second: SurfaceSet | Body, *, name: str | None = None) -> Joint:
+        """Tie a face to another body that it lies in, whatever the families: beam to solid, shell to solid, ...
+
+        The gap between both vanishes in the mean with each shape function of the first face (a mortar tie): nothing is
+        asked of the first body's section but what it can do. The first should be the coarser side.
+
+        Args:
+            first: a surface; beam.start, beam.end or a named edge of a shell (plate.edge) stand for their faces. Other
+                nodes are pinned one by one.
+            second: the body, or a surface of it, that holds the first.
+            name: unique name.
+
+        Raises:
+            ModelError: a point of the first face that lies outside of the second body, or both are one body.
+        """
+        name = self._joint_name(name, "weld")
+        self._own(first, f"weld {name!r}", NodeSet, SurfaceSet)
+        self._own(second, f"weld {name!r}", SurfaceSet, Body)
+        return self._join(make_weld(first, second, name))
+
+    def _joint_name(self, name: str | None, kind: str) -> str:
+        taken = {joint.name for joint in self.description.joints}
+        if name is None:
+            return next(n for k in itertools.count(1) if (n := f"{kind}_{k}") not in taken)
+        if not isinstance(name, str) or name in taken:
+            raise ModelError(f"joint name {name!r} is used twice" if name in taken else f"joint name {name!r} is no text")
+        return name
+
+    def _join(self, joint: Joint) -> Joint:
+        self.description.joints.append(joint)
+        return joint
+
     # parts of later versions
-
-    def add_joint(self, *args: Any, **options: Any) -> Any:
-        """Joints are not part of this version."""
-        raise NotImplementedError("add_joint: joints are not part of this version")
-
-    def add_constraint(self, *args: Any, **options: Any) -> Any:
-        """Constraints are not part of this version."""
-        raise NotImplementedError("add_constraint: constraints are not part of this version")
-
-    def weld(self, *args: Any, **options: Any) -> Any:
-        """Welds are not part of this version."""
-        raise NotImplementedError("weld: constraints are not part of this version")
 
     def add_collider(self, *args: Any, **options: Any) -> Any:
         """Contact is not part of this version."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .bodies import Body, NodeSet, SurfaceSet
+from .constraints import Joint
 from .errors import ModelError
 from .laws import TimeLaw
 from .materials import Material
@@ -126,6 +127,7 @@ class Description:
     moments: list[Moment] = field(default_factory=list)
     body_forces: list[BodyForce] = field(default_factory=list)
     probes: list[Probe] = field(default_factory=list)
+    joints: list[Joint] = field(default_factory=list)
 
 
 def vector(value: Any, what: str) -> np.ndarray:

@@ -35,7 +35,32 @@ class ModelError(Error):
 
 
 class ConstraintError(Error):
-    """A constraint or joint can't be satisfied."""
+    """A constraint or joint can't be satisfied.
+
+    Attributes:
+        joints: names of the joints, the most violated first.
+        violations: of each, m.
+        time: time (s) at the start of the refused step.
+        world: index of the world.
+        state: the state, unchanged since before the refused step; None where none was made.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        joints: list[str] | None = None,
+        violations: list[float] | None = None,
+        time: float = 0.0,
+        world: int = 0,
+        state: Any = None,
+    ) -> None:
+        super().__init__(message)
+        self.joints = joints or []
+        self.violations = violations or []
+        self.time = time
+        self.world = world
+        self.state = state
 
 
 class PenetrationError(Error):

@@ -12,6 +12,8 @@ import warp as wp
 from . import assembly
 from .assembly import chunks, geometry, gradients
 from .elements import Rule
+from .errors import ModelError
+from .kernels.constraints import SUM_ROWS, multiplier_struct
 from .kernels.gather import gather_kernels
 from .kernels.materials import ANY_J
 from .kernels.types import precision
@@ -80,6 +82,61 @@ class Evaluation:
                 args = [block.data, state.displacement, state.velocity, self._all(), contribution, power]
                 self.launch(block.kernels.viscous_force, (m.worlds, block.count), args)
         return self._gather(contribution), power.numpy().sum(axis=1)
+
+    def constraints(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Constraints at a state: values [world, row], gradients [world, 3 row + side, 3], right sides [world, row]."""
+        mul = self._multipliers(state)
+        return mul.value.numpy(), mul.gradient.numpy(), mul.target.numpy()
+
+    def _multipliers(self, state: State, multipliers: np.ndarray | None = None) -> Any:
+        """Evaluated constraints with given multipliers (rows,) and no penalty."""
+        m = self.model
+        con = m.constraints
+        if con is None:
+            raise ModelError("the model has no constraints")
+        loads, B = m.loads, m.worlds
+        value = self._zeros((B, max(loads.law_count, 1)), wp.vec3d)
+        one = wp.ones(B, dtype=wp.float64, device=m.device)
+        if loads.law_count:
+            args = [loads.laws, state.time, one, self._all(), value]
+            self.launch(loads.kernels.evaluate_laws, (B, loads.law_count), args)
+            for kernel, law in loads.function_laws:
+                self.launch(kernel, B, [law, state.time, self._all(), value])
+        mul = multiplier_struct()()
+        for name in ("value", "target", "force", "change", "trial", "merit", "excess", "stiffness"):
+            setattr(mul, name, self._zeros((B, con.count), wp.float64))
+        for name in ("gradient", "product"):
+            setattr(mul, name, self._zeros((B, 3 * con.count), wp.vec3d))
+        mul.rows = self._zeros((SUM_ROWS, B, con.count), wp.float64)
+        mul.violation = self._zeros((B, m.component_count), wp.float64)
+        if multipliers is not None:
+            mul.force.assign(np.tile(multipliers, (B, 1)))
+        alpha = self._zeros((B,), wp.float64)
+        args = [con.data, state.displacement, value, alpha, self._all(), mul]
+        self.launch(con.kernels.evaluate, (B, con.count), args)
+        return mul
+
+    def constraint_jacobian(self, state: State, world: int) -> sp.csr_matrix:
+        """dc/dq of one world, (rows, 3 slots) CSR."""
+        _, gradient, _ = self.constraints(state)
+        con = self.model.constraints
+        assert con is not None
+        return con.expand(gradient[world].reshape(-1, 3, 3))
+
+    def constraint_curvature(self, state: State, multipliers: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """sum_i multipliers_i d2c_i/dq2 direction, [world, slot, 3]; multipliers (rows,), direction (slots, 3)."""
+        m, con = self.model, self.model.constraints
+        mul = self._multipliers(state, multipliers)
+        assert con is not None
+        p = self._zeros((m.worlds, m.slots), m.types.vec3)
+        p.assign(np.tile(direction, (m.worlds, 1, 1)).astype(p.numpy().dtype))
+        one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
+        self.launch(con.kernels.product_terms, (m.worlds, con.count), [con.data, mul, p, one, self._all()])
+        out = np.zeros((m.worlds, m.slots, 3))
+        terms = mul.product.numpy()
+        for world in range(m.worlds):
+            np.add.at(out[world], con.slot_host, con.weight_host[:, None] * terms[world, con.term_host])
+        return out
 
     def tangent_matrix(self, state: State, world: int) -> sp.csr_matrix:
         """df_int/dq as CSR. No element holds two slots of one colour: one product per colour and axis."""

@@ -90,6 +90,8 @@ class Loads:
         self.followers += [self._build_moment(p) for p in model.description.moments]
         self.fields = [p for f in model.description.body_forces for p in self._build_field(f)]
         self._build_pushed()
+        if model.constraints:
+            model.constraints.build(model.component, self._laws.add)
         self._upload_laws()
 
     # construction
@@ -292,7 +294,8 @@ class Loads:
 
     def gather_kernels(self) -> Any:
         """The gather kernels that fit the loads there are."""
-        return gather_kernels(self.model.dtype, self.nonpotential, bool(self.followers))
+        constrained = self.model.constraints is not None
+        return gather_kernels(self.model.dtype, self.nonpotential, bool(self.followers), constrained)
 
     def used_kernels(self) -> list[Any]:
         """The kernels that a step launches for the loads there are."""

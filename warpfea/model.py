@@ -12,6 +12,7 @@ import warp as wp
 
 from . import assembly, elements
 from .bodies import Body
+from .constraints import Constraints
 from .errors import ModelError
 from .evaluation import Evaluation
 from .kernels.element import block_struct, element_kernels
@@ -60,6 +61,7 @@ class Model:
         bodies: the bodies, in the order they were added.
         worlds, dtype, device, up_axis: as given.
         slots: number of slots of all bodies.
+        size: diagonal of the box of all nodes, m; tolerances of constraints are measured with it.
         blocks: element blocks.
     """
 
@@ -89,6 +91,8 @@ class Model:
         self._number()
         self._assemble_mass()
         self._build_blocks(tables)
+        self.constraints = Constraints(self, self.description.joints) if self.description.joints else None
+        self._label_components()
         self.loads = Loads(self, builder.gravity)
         self._build_topology()
         self._build_groups()
@@ -114,6 +118,8 @@ class Model:
             body.slot_offset = offset
             offset += body.slot_count
         self.slots = offset
+        boxes = np.array([body.mesh.bounding_box() for body in self.bodies])
+        self.size = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
         self.slot_kind = np.concatenate([body.slot_kind for body in self.bodies])
         self.reference = np.concatenate([body.reference for body in self.bodies])
         self.is_position_host = (self.slot_kind == 0).astype(float)
@@ -271,17 +277,28 @@ class Model:
         """Which slots share an element."""
         return assembly.slot_graph([p.conn + p.body.slot_offset for b in self.blocks for p in b.parts], self.slots)
 
+    def _label_components(self) -> None:
+        """Connected component of each slot: by elements alone (`part`), and with what joints tie (`component`)."""
+        self.part = assembly.components_of(self.graph())
+        self.component = self.part
+        if self.constraints:
+            ties = sp.lil_matrix((self.part.max() + 1, self.part.max() + 1))
+            for slots in self.constraints.slot_groups():
+                parts = np.unique(self.part[slots])
+                ties[parts[0], parts] = 1.0
+            self.component = assembly.components_of(ties.tocsr())[self.part]
+        self.component_count = int(self.component.max()) + 1
+
     def _build_groups(self) -> None:
         """Bodies, or separate parts of one, that no support holds in some direction (DESIGN 5)."""
         T, vec3 = self.types.T, self.types.vec3
-        label = assembly.components_of(self.graph())
-        count = int(label.max()) + 1
+        label, count = self.component, self.component_count
         free = np.ones((count, 3))
         for c in range(3):
             held = np.unique(label[self.free_host[:, c] == 0.0])
             free[held, c] = 0.0
-        self.component = label
-        self.component_count = count
+        if self.constraints:
+            self.constraints.hold(free)
         if count > 1:
             order = np.argsort(label, kind="stable")
             edges = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
@@ -310,17 +327,28 @@ class Model:
 
     def check_static_supports(self) -> None:
         """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
-        for label in range(int(self.component.max()) + 1):
+        ties = None
+        if self.constraints:
+            start = self.state().displacement.numpy()[0].astype(float)
+            ties = self.constraints.jacobian(start)
+        for label in range(self.component_count):
             slots = np.flatnonzero(self.component == label)
-            modes = assembly.rigid_modes(self.reference[slots], self.slot_kind[slots])
-            held = modes[:, self.free_host[slots] == 0.0]
-            scale = np.linalg.norm(modes.reshape(6, -1), axis=1)
-            values = np.linalg.svd(held / scale[:, None], compute_uv=False) if held.size else np.zeros(6)
-            rank = int(np.sum(values > 1e-9))
-            if rank < 6:
+            parts = np.unique(self.part[slots])
+            modes = np.zeros((len(parts), 6, self.slots, 3))
+            for k, part in enumerate(parts):
+                own = np.flatnonzero(self.part == part)
+                modes[k][:, own] = assembly.rigid_modes(self.reference[own], self.slot_kind[own])
+            modes = modes.reshape(6 * len(parts), -1)
+            modes /= np.linalg.norm(modes, axis=1)[:, None]
+            held = modes[:, (self.free_host == 0.0).ravel()]
+            if ties is not None:
+                held = np.hstack([held, (ties @ modes.T).T / self.size])
+            values = np.linalg.svd(held, compute_uv=False) if held.size else np.zeros(0)
+            free = len(modes) - int(np.sum(values > 1e-9))
+            if free:
                 body = next(b for b in self.bodies if b.slot_offset <= slots[0] < b.slot_offset + b.slot_count)
                 raise ModelError(
-                    f"body {body.name!r} is not supported: its supports leave {6 - rank} rigid motions free, and "
+                    f"body {body.name!r} is not supported: supports and joints leave {free} rigid motions free, and "
                     "statics has no unique answer; clamp or drive more nodes"
                 )
 
@@ -352,6 +380,7 @@ class Model:
             "body forces": bool(d.body_forces),
             "follower pressure": bool(d.pressures),
             "moments": bool(d.moments),
+            "constraints": self.constraints is not None,
             "driven nodes": any(s.law or s.node_laws for s in d.supports),
             "free groups": self.group_count > 0,
             "separate components": self.component_count > 1,
@@ -385,9 +414,13 @@ class Model:
             "unknowns": int(self.free_slots.sum()),
             "elements": sum(len(body.mesh.cells) for body in self.bodies),
             "mass": float(self.lumped_host[self.slot_kind == 0].sum()),
+            "joints": [
+                {"name": j.name, "kind": j.kind, "rows": len(j.rows), "between": j.between}
+                for j in (self.constraints.joints if self.constraints else ())
+            ],
             "features": [k for k, on in features.items() if on],
             "left_out": [k for k, on in features.items() if not on]
-            + ["constraints", "contact", "friction", "per-world parameters"],
+            + ["contact", "friction", "per-world parameters"],
             "blocks": [
                 {
                     "element": b.key.family,
@@ -448,6 +481,18 @@ class Model:
         """Elastic tangent df_int/dq of one world, (3 slots, 3 slots) CSR, N/m; clamped rows included."""
         return self.evaluation.tangent_matrix(state, world)
 
+    def constraint_values(self, state: State) -> np.ndarray:
+        """Values c of all rows of the constraints, [world, row], m; rows of a joint: constraints.rows_of."""
+        return self.evaluation.constraints(state)[0]
+
+    def constraint_jacobian(self, state: State, world: int = 0) -> sp.csr_matrix:
+        """dc/dq of one world, (rows, 3 slots) CSR, with the gradients that the device computes."""
+        return self.evaluation.constraint_jacobian(state, world)
+
+    def constraint_curvature(self, state: State, multipliers: Any, direction: Any) -> np.ndarray:
+        """Product of sum multipliers_i d2c_i/dq2 with a direction (slots, 3), [world, slot, 3]; multipliers (rows,), N."""
+        return self.evaluation.constraint_curvature(state, np.asarray(multipliers), np.asarray(direction))
+
     def set_gravity(self, gravity: Any) -> None:
         """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2."""
         self.loads.set_gravity(gravity)
@@ -472,6 +517,8 @@ class Model:
         h.update(self._mass.data.tobytes())
         h.update(self.coefficients.numpy().tobytes())
         self.loads.hash(h)
+        if self.constraints:
+            self.constraints.hash(h)
         return h.hexdigest()
 
 

@@ -12,9 +12,11 @@ import numpy as np
 
 from . import integrators
 from .bodies import NodeSet
-from .errors import ConvergenceError, ModelError
+from .constraints import Joint
+from .errors import ConstraintError, ConvergenceError, ModelError
 from .evaluation import lowest_jacobian
-from .kernels.newton import FAIL_CURVATURE, FAIL_ITERATIONS, FAIL_JACOBIAN, FAIL_LINE_SEARCH, FAIL_NAN
+from .kernels.constraints import JOINT_COLUMNS
+from .kernels.newton import FAIL_CONSTRAINT, FAIL_CURVATURE, FAIL_ITERATIONS, FAIL_JACOBIAN, FAIL_LINE_SEARCH, FAIL_NAN
 from .kernels.step import LEDGER, REPORT, STATUS
 from .results import Results
 from .run_loop import close_all, interruptible, step_bar
@@ -33,7 +35,12 @@ REASONS = {
     FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
     FAIL_NAN: "a force or energy was not finite",
     FAIL_CURVATURE: "no descent direction was found",
+    FAIL_CONSTRAINT: "constraints could not be satisfied",
 }
+
+
+OPEN = 1e-4
+"""Violation at the start, over the model's size, that a dynamic run refuses to snap shut."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +55,8 @@ class StepReport:
         status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
         min_J: smallest det F; a value <= 0 means that an element turned inside out (SVK only; others refuse it).
         time: s.
+        violation: largest of the constraints, m.
+        outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
     """
 
     converged: np.ndarray
@@ -59,6 +68,19 @@ class StepReport:
     min_J: np.ndarray
     time: np.ndarray
     failure: np.ndarray
+    violation: np.ndarray
+    outer: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class JointRecord:
+    """A joint over time: time (steps,); force (worlds, steps, 3), N, and moment about its anchor, N m, on the child in
+    world axes; violation (worlds, steps), m, the largest of its rows."""
+
+    time: np.ndarray
+    force: np.ndarray
+    moment: np.ndarray
+    violation: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +110,8 @@ class Simulation(Results):
         dt: step, s. `sim.dt` may be set later.
         integrator: "backward_euler" or "bdf2".
         solver: NewtonPCG options.
-        constraint_tol: for joints, which are not part of this version.
+        constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
+            float64, 1e-5 in float32.
         ledger: keep the energy ledger.
         capture: record a step as one graph, on the GPU and on the CPU.
         on_compile: called with (modules ready, modules in all, name) while kernels compile.
@@ -107,13 +130,14 @@ class Simulation(Results):
         dt: float,
         integrator: str = "backward_euler",
         solver: NewtonPCG | None = None,
-        constraint_tol: float = 1e-8,
+        constraint_tol: float | None = None,
         ledger: bool = True,
         capture: bool = True,
         on_failure: str | None = None,
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
-        self._start(model, state, integrators.get(integrator), solver or NewtonPCG(), ledger, capture, on_compile)
+        scheme, options = integrators.get(integrator), solver or NewtonPCG()
+        self._start(model, state, scheme, options, ledger, capture, on_compile, constraint_tol)
         self.dt = dt
         if on_failure not in (None, "raise", "freeze"):
             raise ModelError(f"on_failure = {on_failure!r} is neither 'raise' nor 'freeze'")
@@ -137,8 +161,14 @@ class Simulation(Results):
         ledger: bool,
         capture: bool,
         on_compile: Callable[[int, int, str], None] | None = None,
+        constraint_tol: float | None = None,
     ) -> None:
         check_model(model)
+        if constraint_tol is None:
+            constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
+        if not (isinstance(constraint_tol, (int, float, np.floating)) and 0.0 < constraint_tol < 1.0):
+            raise ModelError(f"constraint_tol = {constraint_tol!r} must lie between 0 and 1")
+
         self.model = model
         self.state = model.state() if state is None else state
         got, expected = self.state.displacement, (model.worlds, model.slots)
@@ -150,12 +180,17 @@ class Simulation(Results):
         self.integrator = scheme
         self.solver = solver
         began = clock.perf_counter()
-        self.stepper = Stepper(model, self.state, scheme, solver, ledger=ledger, capture=capture, on_compile=on_compile)
+        self.stepper = Stepper(
+            model, self.state, scheme, solver,
+            ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, on_compile=on_compile,
+        )  # fmt: skip
         self.compile_s = clock.perf_counter() - began
+        self._check_start()
         self.steps = 0
         self.last: StepReport | None = None
         self.totals = {"newton": np.zeros(model.worlds, int), "pcg": np.zeros(model.worlds, int)}
         self.max_residual = 0.0
+        self.max_violation = 0.0
         self._stepped = np.zeros(model.worlds, dtype=bool)
         self._history: list[np.ndarray] = []
 
@@ -211,6 +246,8 @@ class Simulation(Results):
             min_J=column["min_J"].copy(),
             time=column["time"].copy(),
             failure=column["failure"].astype(int),
+            violation=column["violation"].copy(),
+            outer=column["outer"].astype(int),
         )
         self.steps += 1
         self._stepped |= self.last.converged
@@ -220,18 +257,24 @@ class Simulation(Results):
         good = self.last.converged
         if good.any():
             self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
-        if self.model.probes:
+            self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
+        if self._recorded:
             self._history.append(rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy())
         if fresh.any():
             fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
             if fatal:
                 if not good.any():  # no world advanced
                     self.steps -= 1
-                    if self.model.probes:
+                    if self._recorded:
                         self._history.pop()
                 raise self._failure(int(np.flatnonzero(fresh)[0]))
 
-    def _failure(self, world: int) -> ConvergenceError:
+    @property
+    def _recorded(self) -> bool:
+        """Whether there is anything to record of each step."""
+        return bool(self.model.probes or self.model.constraints)
+
+    def _failure(self, world: int) -> ConvergenceError | ConstraintError:
         """The error for a failed world; its status is cleared so that a caller may try again with another dt."""
         assert self.last is not None
         work = self.stepper.work
@@ -248,12 +291,50 @@ class Simulation(Results):
         status[status == STATUS["failed"]] = STATUS["running"]
         self.state.status.assign(status)
         self.last = None
+        if code == FAIL_CONSTRAINT:
+            return self._unsatisfied(world, time, halvings)
         return ConvergenceError(
             f"step from t = {time:.6g} s with dt = {self._dt:g} s was not accepted in world {world}: "
             f"{REASONS.get(code, 'unknown reason')} after {halvings} halvings; relative residuals "
             f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}",
             time=time, world=world, residuals=history, element=element, state=self.state,
         )  # fmt: skip
+
+    def _unsatisfied(self, world: int, time: float, halvings: int) -> ConstraintError:
+        """The error for constraints that stay violated although the forces balance."""
+        names, values = self._violated(self.stepper.work.multipliers.value.numpy()[world])
+        listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
+        return ConstraintError(
+            f"step from t = {time:.6g} s with dt = {self._dt:g} s: constraints could not be satisfied in world {world} "
+            f"after {halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or "
+            f"with supports, or ask for what the bodies can't reach (tolerance "
+            f"{self.stepper.newton.constraint_tol:.3g} m)",
+            joints=names, violations=values, time=time, world=world, state=self.state,
+        )  # fmt: skip
+
+    def _violated(self, values: np.ndarray, tol: float | None = None) -> tuple[list[str], list[float]]:
+        """Names of the joints whose rows (rows,) exceed the tolerance, the worst first, and by how much, m."""
+        constraints = self.model.constraints
+        assert constraints is not None
+        tol = self.stepper.newton.constraint_tol if tol is None else tol
+        worst = np.array([np.abs(values[rows]).max() for rows in constraints.rows_of])
+        order = [k for k in np.argsort(-worst, kind="stable") if not worst[k] <= tol]
+        return [constraints.joints[k].name for k in order], [float(worst[k]) for k in order]
+
+    def _check_start(self) -> None:
+        """Raise ConstraintError where a dynamic run would begin with open joints and snap them shut."""
+        constraints = self.model.constraints
+        if constraints is None or self.integrator.static:
+            return
+        for world, values in enumerate(self.stepper.work.multipliers.value.numpy()):
+            names, worst = self._violated(values, OPEN * self.model.size)
+            if names:
+                raise ConstraintError(
+                    f"joint {names[0]!r} is {worst[0]:.3g} m off at the start in world {world}, "
+                    f"t = {self.time[world]:.6g} s, and would snap shut in the first step; begin its drive at the "
+                    "present value, move the bodies, or assemble them with solve_static",
+                    joints=names, violations=worst, world=world, time=float(self.time[world]), state=self.state,
+                )  # fmt: skip
 
     def _worst_element(self, world: int) -> tuple[int, str]:
         """Model index and a description of the element whose slots carry the largest residual."""
@@ -330,7 +411,7 @@ class Simulation(Results):
     def _idle_report(self) -> StepReport:
         B = self.model.worlds
         zero, none = np.zeros(B, int), np.zeros(B)
-        return StepReport(self.status == 0, zero, zero, none, zero, self.status, none, self.time, zero)
+        return StepReport(self.status == 0, zero, zero, none, zero, self.status, none, self.time, zero, none, zero)
 
     def freeze(self, worlds: Any) -> None:
         """Leave worlds (indices or mask) as they are from now on."""
@@ -363,23 +444,29 @@ class Simulation(Results):
         if name not in names:
             raise ModelError(f"probe {name!r} is unknown; there are {names}")
         k = names.index(name)
-        B = self.model.worlds
-        table = np.stack(self._history, axis=1) if self._history else np.zeros((B, 0, 1 + 6 * len(names)))
+        table = self._table()
         d, v = table[:, :, 1 + 6 * k : 4 + 6 * k], table[:, :, 4 + 6 * k : 7 + 6 * k]
         return ProbeRecord(table[0, :, 0], self.model.probes[k].X + d, d, v)
+
+    def _table(self) -> np.ndarray:
+        """(B, steps, 1 + columns) all that was recorded."""
+        m = self.model
+        if self._history:
+            return np.stack(self._history, axis=1)
+        return np.zeros((m.worlds, 0, 1 + self.stepper.work.report.shape[1] - len(REPORT)))
 
     def energies(self) -> dict[str, np.ndarray]:
         """Energy ledger, each (B,), J.
 
-        kinetic, strain and potential (of gravity, from the reference) are current values. work (by loads, supports and
-        fields, also given apart), viscous, contact, friction and integrator add up from the start; ledger_residual is
+        kinetic, strain and potential (of gravity, from the reference) are current values. work (by loads, supports,
+        fields and driven joints, also given apart), viscous, contact, friction and integrator add up from the start; ledger_residual is
         change of energy + losses - work, which equals `unbalanced`, the sum of g . dq that the solver's tolerance left.
         """
         if not self.stepper.ledger:
             raise ModelError("energies: the simulation was made with ledger=False")
         table = self.state.ledger.numpy()
         out = {name: table[:, k].copy() for k, name in enumerate(LEDGER)}
-        out["work"] = out["work_loads"] + out["work_supports"] + out["work_fields"]
+        out["work"] = out["work_loads"] + out["work_supports"] + out["work_fields"] + out["work_joints"]
         out["contact"] = np.zeros(len(table))
         out["friction"] = np.zeros(len(table))
         return out
@@ -398,13 +485,48 @@ class Simulation(Results):
         total[~self._stepped] = np.nan
         return total
 
-    def joint_force(self, joint: Any) -> np.ndarray:
-        """Joints are not part of this version."""
-        raise NotImplementedError("joint_force: joints are not part of this version")
+    def joint_record(self, joint: Joint) -> JointRecord:
+        """What has been recorded of a joint, one entry per step."""
+        k = self._joint(joint)
+        table = self._table()
+        first = 1 + 6 * len(self.model.probes) + JOINT_COLUMNS * k
+        own = table[:, :, first : first + JOINT_COLUMNS]
+        return JointRecord(table[0, :, 0], own[:, :, :3], own[:, :, 3:6], own[:, :, 6])
 
-    def violation(self, joint: Any) -> np.ndarray:
-        """Joints are not part of this version."""
-        raise NotImplementedError("violation: joints are not part of this version")
+    def joint_force(self, joint: Joint) -> np.ndarray:
+        """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
+
+        (B, 6) in world axes; `joint_record` has them over time. NaN as for `reaction`.
+        """
+        k = self._joint(joint)
+        first = len(REPORT) + 6 * len(self.model.probes) + JOINT_COLUMNS * k
+        out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
+        out[~self._stepped] = np.nan
+        return out
+
+    def violation(self, joint: Joint) -> np.ndarray:
+        """Largest violation of a joint's constraints in the present state, (B,), m; angles count times the model's size."""
+        k = self._joint(joint)
+        constraints = self.model.constraints
+        assert constraints is not None
+        return np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
+
+    def joint_value(self, joint: Joint) -> np.ndarray:
+        """Angle (rad) of a revolute, cylindrical or driven joint, travel (m) of a translational, length (m) of a distance
+        joint, (B,); of a driven angle with its full turns, else between -pi and pi."""
+        self._joint(joint)
+        constraints = self.model.constraints
+        assert constraints is not None
+        return constraints.measure(joint, self.state)
+
+    def _joint(self, joint: Joint) -> int:
+        known = self.model.constraints.joints if self.model.constraints else []
+        for k, other in enumerate(known):
+            if other is joint:
+                return k
+        names = [j.name for j in known]
+        raise ModelError(f"expected a joint of this model (from add_joint, add_constraint, weld), got {joint!r}; it has "
+                         f"{names}")
 
     def contact_report(self, *pair: Any) -> Any:
         """Contact is not part of this version."""

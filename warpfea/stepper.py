@@ -41,13 +41,19 @@ class Stepper:
         *,
         ledger: bool,
         capture: bool,
+        constraint_tol: float = 0.0,
         on_compile: OnCompile | None = None,
     ) -> None:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
         self.ledger, self.on_compile = ledger, on_compile
         self.launch = Launcher(model.device)
         self.kernels = step_kernels(
-            model.dtype, integrator.coefficients, integrator.static, integrator.multistep, model.loads.nonpotential
+            model.dtype,
+            integrator.coefficients,
+            integrator.static,
+            integrator.multistep,
+            model.loads.nonpotential,
+            model.constraints is not None,
         )
         vec3 = model.types.vec3
         state.sealed = False
@@ -60,8 +66,13 @@ class Stepper:
             state.register("ledger", wp.float64, (len(LEDGER),))
             state.register("ledger_time", wp.float64)
         state.register("status", wp.int32)
+        if model.constraints:
+            state.register("constraint_force", wp.float64, (model.constraints.count,))
+            state.register("constraint_target", wp.float64, (model.constraints.count,), np.nan)
         self.work = Workspace(model, integrator, max_newton=solver.max_newton, ledger=ledger)
-        self.newton = NewtonLoop(model, self.work, self.launch, solver, inertia=not integrator.static)
+        self.newton = NewtonLoop(
+            model, self.work, self.launch, solver, inertia=not integrator.static, constraint_tol=constraint_tol
+        )
         self.dim = (model.worlds, model.slots)
         self.running = self.work.any_flag[2:3]
         self._bind()
@@ -69,6 +80,8 @@ class Stepper:
         state.sealed = True
         self.backup = state.like() if solver.max_halvings > 0 else None
         self._load_modules()
+        if model.constraints:
+            self._start_targets()
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -88,6 +101,21 @@ class Stepper:
             w.step.ledger_time = state.ledger_time
         self.u_before = state.previous_displacement if self.integrator.multistep else state.displacement
         self.v_before = state.previous_velocity if self.integrator.multistep else state.velocity
+
+    def _start_targets(self) -> None:
+        """Right sides at the state's time, where the state does not know them, and the violation at the start."""
+        m, w, state = self.model, self.work, self.state
+        constraints = self.newton.constraints
+        assert constraints is not None
+        active = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
+        w.step.new_time.assign(state.time)
+        w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
+        self._laws(active)
+        w.u.assign(state.displacement)
+        constraints.start(state.constraint_force, active)
+        constraints.evaluate(active)
+        known = state.constraint_target.numpy()
+        state.constraint_target.assign(np.where(np.isnan(known), w.multipliers.target.numpy(), known))
 
     def begin_ledger(self, mask: np.ndarray) -> None:
         """Measure the ledger of the chosen worlds from the present state; what has added up stays."""
@@ -112,21 +140,21 @@ class Stepper:
 
     def modules(self) -> list[wp.Module]:
         """Modules a step launches, found by recording the launches without doing them."""
-        from .kernels.newton import newton_kernels
-        from .kernels.pcg import pcg_kernels
         from .kernels.reduce import reduce_kernels
         from .kernels.state import state_kernels
 
         m = self.model
         out = {k.module for k in self.newton.residual.block_kernels} | {self.kernels.module, reduce_kernels().module}
-        out |= {m.loads.gather_kernels().module, newton_kernels(m.dtype).module}
-        out.add(pcg_kernels(m.dtype).module)
+        out |= {m.loads.gather_kernels().module, self.newton.kernels.module}
+        out.add(self.newton.pcg.kernels.module)
         out |= {kernel.module for kernel in m.loads.used_kernels()}
         if self.backup is not None:
             out.add(state_kernels().module)
         if not self.integrator.static:
             out |= {b.kernels.viscous_force.module for b in m.blocks if b.key.damping == "explicit"}
             out |= {b.kernels.strain_history.module for b in m.blocks if b.key.damping == "incremental"}
+        if m.constraints:
+            out.add(m.constraints.kernels.module)
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
@@ -167,6 +195,10 @@ class Stepper:
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
             self._probe()
+        if m.constraints:
+            args = [m.constraints.data, w.multipliers, m.constraints.joint_data, self.state.displacement]
+            args += [self.state.constraint_force, len(REPORT) + 6 * len(m.probes), w.report]
+            launch(m.constraints.kernels.joint_report, (m.worlds, len(m.constraints.joints)), args)
 
     def _attempt(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
@@ -184,6 +216,9 @@ class Stepper:
         launch(self.kernels.predict, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
         self._loads(running)
         self._damping(running)
+        constraints = self.newton.constraints
+        if constraints:
+            constraints.start(state.constraint_force, running)
         self.newton.run()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
         if self.backup is not None:
@@ -193,18 +228,13 @@ class Stepper:
             self._book()
         args = [w.step, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
         launch(self.kernels.commit, self.dim, args)
+        if constraints:
+            constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
 
     def _loads(self, active: wp.array) -> None:
+        self._laws(active)
         m, w, launch, loads = self.model, self.work, self.launch, self.model.loads
         k = loads.kernels
-        if loads.law_count:
-            launch(
-                k.evaluate_laws,
-                (m.worlds, loads.law_count),
-                [loads.laws, w.step.new_time, w.step.ramp, active, w.law_value],
-            )
-            for kernel, law in loads.function_laws:
-                launch(kernel, m.worlds, [law, w.step.new_time, active, w.law_value])
         if loads.has_dead:
             args = [loads.dead_start, loads.dead_law, loads.dead_weight, w.law_value, m.lumped, loads.gravity]
             launch(k.dead_load, self.dim, [*args, w.step.ramp, active, w.dead, w.dead_magnitude])
@@ -216,6 +246,19 @@ class Stepper:
             d = loads.turned
             args = [d.slot, d.law, d.components, d.arm, d.axis, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
             launch(k.drive_rotation, (m.worlds, d.count), args)
+
+    def _laws(self, active: wp.array) -> None:
+        """Values of the time laws at the end of the attempt."""
+        m, w, launch, loads = self.model, self.work, self.launch, self.model.loads
+        k = loads.kernels
+        if loads.law_count:
+            launch(
+                k.evaluate_laws,
+                (m.worlds, loads.law_count),
+                [loads.laws, w.step.new_time, w.step.ramp, active, w.law_value],
+            )
+            for kernel, law in loads.function_laws:
+                launch(kernel, m.worlds, [law, w.step.new_time, active, w.law_value])
 
     def _damping(self, active: wp.array) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
@@ -250,7 +293,10 @@ class Stepper:
             args = [w.explicit, w.u, state.displacement, accepted, w.rows]
             launch(m.loads.kernels.work_rows, self.dim, args)
             reduce(w.rows, 1, accepted, w.explicit_work)
-        args = [w.step, w.newton, w.ledger_sums, w.explicit_work[0], state.ledger]
+        if self.newton.constraints:
+            self.newton.constraints.work_terms(state.displacement, state.constraint_target, accepted)
+            reduce(w.multipliers.rows, 2, accepted, w.constraint_work)
+        args = [w.step, w.newton, w.ledger_sums, w.explicit_work[0], w.constraint_work, state.ledger]
         launch(self.kernels.ledger_update, m.worlds, args)
 
     def _upload_probes(self) -> list[wp.array]:

@@ -8,12 +8,14 @@ import numpy as np
 import warp as wp
 
 from .integrators import Integrator
+from .kernels.constraints import JOINT_COLUMNS, SUM_ROWS
 from .kernels.gather import RESIDUAL_ROWS
 from .kernels.newton import COMPONENT_ROWS, LANES, control_struct
 from .kernels.pcg import LANES as GROUP_LANES
 from .kernels.pcg import pcg_struct
 from .kernels.reduce import CHUNK
 from .kernels.step import LEDGER_ROWS, REPORT, step_struct
+from .solvers.alm import allocate
 
 if TYPE_CHECKING:
     from .model import Model
@@ -39,6 +41,8 @@ class Workspace:
         self.direction, self.r, self.z, self.p, self.Hp = (field(k) for k in ("direction", "r", "z", "p", "Hp"))
         # the parts of the residual, and the diagonal of H
         self.g, self.inertia, self.internal = field("g"), field("inertia"), field("internal")
+        # with constraints PCG solves for the gradient of the augmented potential
+        self.gradient = field("gradient") if model.constraints else self.g
         self.dead, self.dead_magnitude = field("dead"), field("dead_magnitude")
         self.diagonal = field("diagonal")
         loads = model.loads
@@ -65,23 +69,30 @@ class Workspace:
         self.explicit_work = self.array("explicit_work", (1, B), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
-        longest = max(n, model.element_count)
+        longest = max(n, model.element_count, model.constraints.count if model.constraints else 0)
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
         self.partial = self.array("partial", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, chunks), wp.float64)
         self.law_value = self.array("law_value", (B, max(loads.law_count, 1)), wp.vec3d)
         self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
         self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
-        self.report = self.array("report", (B, len(REPORT) + 6 * len(model.probes)), wp.float64)
+        joints = len(model.constraints.joints) if model.constraints else 0
+        self.report = self.array("report", (B, len(REPORT) + 6 * len(model.probes) + JOINT_COLUMNS * joints), wp.float64)
         self.any_flag = self.array("any_flag", (4,), wp.int32)
         C = model.component_count
         sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
         self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
+        self.multipliers = allocate(model, self)
+        self.constraint_work = self.array("constraint_work", (2, B) if model.constraints else (1, 1), wp.float64)
+        optional = () if model.constraints else ("constraint_sums", "stepped", "outer")
         self.newton = self._struct(
-            control_struct(), B,
+            control_struct(), B, skip=("violation", *optional),
             history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
+            constraint_sums=(SUM_ROWS, B),
         )  # fmt: skip
         self.newton.components = C
+        if model.constraints:
+            self.newton.violation = self.multipliers.violation
         self.pcg = self._struct(pcg_struct(), B, sums=(1, B))
         self.step = self._struct(step_struct(), B)
 
@@ -91,7 +102,7 @@ class Workspace:
         self.bytes[name] = int(np.prod(shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
         return out
 
-    def _struct(self, kind: Any, worlds: int, **shapes: tuple[int, ...]) -> Any:
+    def _struct(self, kind: Any, worlds: int, skip: tuple[str, ...] = (), **shapes: tuple[int, ...]) -> Any:
         """A control struct with an array [world] for each array field, unless a shape is given."""
         out = kind()
         special = {
@@ -102,6 +113,6 @@ class Workspace:
             "any_running": (1,),
         } | shapes
         for name, var in kind.vars.items():
-            if isinstance(var.type, wp.array):
+            if isinstance(var.type, wp.array) and name not in skip:
                 setattr(out, name, self.array(f"{kind.key}.{name}", special.get(name, (worlds,)), var.type.dtype))
         return out

@@ -10,6 +10,7 @@ import warp as wp
 
 from ..errors import ModelError
 from ..kernels.newton import newton_kernels
+from .alm import ConstraintSolver
 from .pcg import PCG
 from .preconditioner import make
 from .residual import Residual
@@ -35,7 +36,11 @@ class NewtonPCG:
         max_newton: iterations before a step is refused.
         max_pcg: iterations per linear solve.
         max_halvings: how often a refused step may be halved.
-        preconditioner: "auto" or "block-jacobi".
+        preconditioner: "auto" or "block-jacobi"; with constraints "auto" deflates their directions.
+        multipliers: how constraint forces are found: "newton", with every Newton step, or "outer", the classical
+            augmented Lagrangian, in a loop around the Newton solves.
+        penalty: kappa, the penalty of a constraint over the stiffness of what it ties.
+        max_outer: multiplier updates of the classical method.
 
     Raises:
         ModelError: a value out of range.
@@ -46,13 +51,20 @@ class NewtonPCG:
     max_pcg: int = 2000
     max_halvings: int = 8
     preconditioner: str = "auto"
+    multipliers: str = "newton"
+    penalty: float = 100.0
+    max_outer: int = 100
 
     def __post_init__(self) -> None:
         if self.tol is not None and not (math.isfinite(self.tol) and 0.0 < self.tol < 1.0):
             raise ModelError(f"NewtonPCG: tol = {self.tol!r} must lie between 0 and 1")
-        for name in ("max_newton", "max_pcg"):
+        for name in ("max_newton", "max_pcg", "max_outer"):
             if not getattr(self, name) >= 1:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be at least 1")
+        if self.multipliers not in ("newton", "outer"):
+            raise ModelError(f"NewtonPCG: multipliers = {self.multipliers!r} is neither 'newton' nor 'outer'")
+        if not (math.isfinite(self.penalty) and self.penalty > 0.0):
+            raise ModelError(f"NewtonPCG: penalty = {self.penalty!r} must be positive")
         if not 0 <= self.max_halvings <= 20:
             raise ModelError(f"NewtonPCG: max_halvings = {self.max_halvings!r} must lie between 0 and 20")
 
@@ -64,10 +76,29 @@ class NewtonPCG:
 class NewtonLoop:
     """The iteration of all worlds: conditional loops on the device, one code path with and without capture."""
 
-    def __init__(self, model: Model, work: Workspace, launch: Launcher, options: NewtonPCG, *, inertia: bool) -> None:
+    def __init__(
+        self,
+        model: Model,
+        work: Workspace,
+        launch: Launcher,
+        options: NewtonPCG,
+        *,
+        inertia: bool,
+        constraint_tol: float,
+    ) -> None:
         self.model, self.work, self.launch = model, work, launch
-        self.kernels = newton_kernels(model.dtype)
-        self.residual = Residual(model, work, launch, viscous=inertia)
+        self.constraint_tol = constraint_tol
+        constrained = model.constraints is not None
+        self.kernels = newton_kernels(model.dtype, constrained)
+        self.classical = constrained and options.multipliers == "outer"
+        self.max_outer = options.max_outer
+        self.constraints: ConstraintSolver | None = None
+        if constrained:
+            deflate = options.preconditioner == "auto"
+            self.constraints = ConstraintSolver(
+                model, work, launch, classical=self.classical, kappa=options.penalty, deflate=deflate
+            )
+        self.residual = Residual(model, work, launch, self.constraints, viscous=inertia)
         self.preconditioner = make(options.preconditioner, model, work, launch, self.residual)
         self.pcg = PCG(
             model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
@@ -80,6 +111,8 @@ class NewtonLoop:
         ctl.max_iterations = options.max_newton
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.nonpotential = int(model.loads.nonpotential or rate)
+        ctl.classical = int(self.classical)
+        ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves are for g alone
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
 
@@ -90,11 +123,38 @@ class NewtonLoop:
         self._clear_direction(active)
         # D is needed to judge the first iterate, so the blocks come first
         self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
+        if self.constraints:
+            self.constraints.evaluate(active)  # J, for rho
         self.preconditioner.build(active)
+        if self.constraints:
+            self.constraints.build(active, penalty=True)
         self.residual.evaluate(active, hold=True)
+        self._solve()
+        if self.classical:
+            self._judge_outer()
+            wp.capture_while(self.iterating, self._update_multipliers)
+
+    def _solve(self) -> None:
+        """Newton's iteration from the residual at hand."""
+        w = self.work
         self.launch(self.kernels.begin, self.model.worlds, [w.newton])
-        self._any(active, self.iterating)
+        self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
+
+    def _judge_outer(self) -> None:
+        w = self.work
+        args = [w.newton, w.step.running, self.constraint_tol, self.max_outer]
+        self.launch(self.kernels.judge_outer, self.model.worlds, args)
+        self._any(w.newton.active, self.iterating)
+
+    def _update_multipliers(self) -> None:
+        """lambda += rho c where a constraint is violated, and the inner solve again, from the velocity at hand."""
+        assert self.constraints is not None
+        w = self.work
+        self.constraints.adopt(w.newton.stepped)
+        self.residual.evaluate(w.newton.active, hold=True)
+        self._solve()
+        self._judge_outer()
 
     def _iterate(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
@@ -102,13 +162,17 @@ class NewtonLoop:
         self.pcg.solve(active)
         self.residual.hold_pushed(active)
         self.residual.push_curvature(active)
+        if self.constraints:
+            self.constraints.predict(active)
         launch(k.copy_active, self.dim, [w.v, active, w.base])
-        launch(k.dot_rows, self.dim, [w.g, w.direction, active, w.rows])
+        launch(k.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self.preconditioner.build(active)
+        if self.constraints:
+            self.constraints.build(active)
         self._any(active, self.iterating)
 
     def _search(self) -> None:
@@ -116,6 +180,8 @@ class NewtonLoop:
         launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.judge_trial, self.model.worlds, [w.newton])
+        if self.constraints and not self.classical:
+            self.constraints.adopt(w.newton.stepped)
         self._any(w.newton.searching, self.searching)
 
     def _any(self, flags: wp.array, out: wp.array) -> None:

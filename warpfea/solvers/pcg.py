@@ -32,7 +32,7 @@ class PCG:
         self.model, self.work, self.launch = model, work, launch
         self.residual = residual
         self.preconditioner = preconditioner
-        self.kernels = pcg_kernels(model.dtype)
+        self.kernels = pcg_kernels(model.dtype, model.constraints is not None)
         self.dim = (model.worlds, model.slots)
         self.deflate = deflate and model.group_count > 0
         work.pcg.max_iterations = max_iterations
@@ -40,7 +40,7 @@ class PCG:
     def solve(self, active: wp.array) -> None:
         """Put the direction into work.direction."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
-        launch(k.start, self.dim, [w.g, m.topology.free, active, w.direction, w.r])
+        launch(k.start, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
         if m.component_count > 1:
             launch(k.silence, self.dim, [w.newton, m.component_of_slot, active, w.r])
         self._translate(active)

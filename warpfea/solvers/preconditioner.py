@@ -33,7 +33,7 @@ class BlockJacobi:
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.work, self.launch, self.residual = work, launch, residual
-        self.kernels = pcg_kernels(model.dtype)
+        self.kernels = pcg_kernels(model.dtype, model.constraints is not None)
         self.dim = (model.worlds, model.slots)
 
     def build(self, active: wp.array) -> None:
@@ -41,8 +41,11 @@ class BlockJacobi:
         self.residual.blocks(active)
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
-        """z = D^-1 r."""
+        """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
         self.launch(self.kernels.block_jacobi, self.dim, [self.work.inverse, r, active, z, self.work.rows])
+        constraints = self.residual.constraints
+        if constraints is not None and constraints.deflate:
+            constraints.precondition(r, z, active)
 
 
 def make(name: str, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> Preconditioner:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from ..kernels.constraints import SUM_ROWS, constraint_struct
 from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from ..launch import Launcher
     from ..model import Model
     from ..workspace import Workspace
+    from .alm import ConstraintSolver
 
 __all__ = ["Reducer", "Residual"]
 
@@ -42,15 +44,19 @@ class Reducer:
 class Residual:
     """Launches that evaluate g(v), Phi(v), the norms, and H p."""
 
-    def __init__(self, model: Model, work: Workspace, launch: Launcher, *, viscous: bool) -> None:
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, constraints: ConstraintSolver | None, *, viscous: bool
+    ) -> None:
         self.model = model
+        self.constraints = constraints
         self.work = work
         self.launch = launch
         # statics has no rates: the kernels without damping serve there
         self.block_kernels = [b.kernels if viscous else b.kernels_for(model.dtype, None) for b in model.blocks]
         self.reduce = Reducer(launch, work, model.worlds)
         self.gather = model.loads.gather_kernels()
-        self.newton = newton_kernels(model.dtype)
+        self.newton = newton_kernels(model.dtype, constraints is not None)
+        self.con = model.constraints.data if model.constraints else constraint_struct()()
         self.dim = (model.worlds, model.slots)
 
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
@@ -65,8 +71,11 @@ class Residual:
         if hold:
             self.hold_pushed(active)
         args = [m.topology, w.contribution, w.v, w.v_tilde, w.dead, w.dead_magnitude, w.pushed, w.pushed_held]
-        args += [w.direction, w.diagonal, w.u, w.step.mass_factor, w.step.dq_dv, active]
-        launch(self.gather.residual, self.dim, [*args, w.inertia, w.internal, w.g, w.rows])
+        args += [w.direction, w.diagonal, w.u, w.step.mass_factor, w.step.dq_dv, active, self.con, w.multipliers]
+        if self.constraints:
+            self.constraints.evaluate(active)
+            self.reduce(w.multipliers.rows, SUM_ROWS, active, w.newton.constraint_sums)
+        launch(self.gather.residual, self.dim, [*args, w.inertia, w.internal, w.g, w.gradient, w.rows])
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         if m.component_count > 1:
@@ -116,7 +125,9 @@ class Residual:
             start, entry = m.loads.pushed_topology.start, m.loads.pushed_topology.entry
             self._push_product(p, active)
         args = [m.topology, w.contribution, start, entry, w.pushed_tangent, p]
-        args += [w.step.mass_factor, w.step.dq_dv, active, out, w.rows]
+        if self.constraints:
+            self.constraints.product(p, active)
+        args += [w.step.mass_factor, w.step.dq_dv, active, self.con, w.multipliers, out, w.rows]
         launch(self.gather.product, self.dim, args)
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:

@@ -1,0 +1,409 @@
+"""Constraints as data: vectors linear in the slots, scalar rows made of them, and the rows' tables on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from .errors import ModelError
+from .kernels.constraints import DISTANCE, DOT, TURN, constraint_kernels, constraint_struct, joint_struct
+from .laws import TimeLaw
+
+if TYPE_CHECKING:
+    from .bodies import Body
+    from .model import Model
+
+__all__ = ["Constraints", "Joint", "Row", "Vector", "constant"]
+
+NEGLIGIBLE = 1e-13
+"""Weights below this share of a vector's largest are rounding of functions that vanish there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The share of a body in a vector: sum of weights x slot values. `child`: it is the joint's child side."""
+
+    body: Body
+    slots: np.ndarray
+    weights: np.ndarray
+    child: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Vector:
+    """A vector in space that is linear in the slots; value (3,) in the reference configuration, m or 1."""
+
+    value: np.ndarray
+    parts: tuple[Part, ...] = ()
+
+    def __sub__(self, other: Vector) -> Vector:
+        flipped = tuple(Part(p.body, p.slots, -p.weights, p.child) for p in other.parts)
+        return Vector(self.value - other.value, self.parts + flipped)
+
+    def __neg__(self) -> Vector:
+        return constant(np.zeros(3)) - self
+
+    def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Model slots, weights and child flags, negligible weights left out. After finalize."""
+        if not self.parts:
+            return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool)
+        slots = np.concatenate([p.body.slot_offset + p.slots for p in self.parts])
+        weights = np.concatenate([p.weights for p in self.parts])
+        child = np.concatenate([np.full(len(p.slots), p.child) for p in self.parts])
+        keep = np.abs(weights) > NEGLIGIBLE * np.abs(weights).max()
+        return slots[keep], weights[keep], child[keep]
+
+
+def constant(value: Any) -> Vector:
+    """A vector that does not move."""
+    return Vector(np.asarray(value, dtype=float))
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A scalar constraint; see kernels/constraints.py for the kinds.
+
+    Attributes:
+        kind: DOT, DISTANCE or TURN.
+        a, b, a2: its vectors.
+        scale: makes metres of it; with `angular` it is taken times the model's size.
+        law: right side over time, or None: `fixed`.
+        component: of the law's value.
+    """
+
+    kind: int
+    a: Vector
+    b: Vector
+    scale: float = 1.0
+    a2: Vector | None = None
+    law: TimeLaw | None = None
+    component: int = 0
+    fixed: float = 0.0
+    angular: bool = False
+
+    @property
+    def terms(self) -> tuple[Vector, Vector, Vector]:
+        """The three vectors; absent ones are constants."""
+        none = constant(np.zeros(3))
+        return self.a, self.b, self.a2 or none
+
+    @property
+    def constant(self) -> float:
+        """A.B of the reference, |A|^2 of a distance. Vectors made perpendicular are so exactly."""
+        A, B = self.a.value, self.b.value
+        if self.kind == DISTANCE:
+            return float(A @ A)
+        dot = float(A @ B)
+        return 0.0 if abs(dot) < 1e-13 * np.linalg.norm(A) * np.linalg.norm(B) else dot
+
+
+@dataclass(eq=False)
+class Joint:
+    """Handle of a joint, weld or single constraint.
+
+    Attributes:
+        name: unique in its model.
+        kind: "revolute", "DP1", "weld", ...
+        rows: its scalar constraints.
+        anchor: where it acts on the child, for the reaction's moment.
+        angle: vectors (a, a2, b) whose angle from a towards a2 is the joint's, or None.
+        travel: vectors (a, b): the joint's travel is a.b / |b| - its reference value, or None.
+        between: what it ties, for messages.
+    """
+
+    name: str
+    kind: str
+    rows: list[Row] = field(repr=False)
+    anchor: Vector = field(repr=False)
+    between: str = ""
+    angle: tuple[Vector, Vector, Vector] | None = field(default=None, repr=False)
+    travel: tuple[Vector, Vector] | None = field(default=None, repr=False)
+    index: int = -1
+
+    def __repr__(self) -> str:
+        return f"Joint({self.name!r}, {self.kind}, {self.between})"
+
+    def bodies(self) -> list[Body]:
+        """Bodies that its rows act on."""
+        found = {id(p.body): p.body for row in self.rows for vector in row.terms for p in vector.parts}
+        return list(found.values())
+
+
+class Constraints:
+    """Rows of a model on the device, ordered by connected component and by cluster of rows that share slots.
+
+    Attributes:
+        joints: in the order they were added.
+        count: number of rows.
+        rows_of: for each joint the indices of its rows.
+        data: the device tables.
+    """
+
+    def __init__(self, model: Model, joints: Sequence[Joint]) -> None:
+        self.model = model
+        self.joints = list(joints)
+        self.kernels = constraint_kernels(model.dtype)
+        self.rows = [row for joint in self.joints for row in joint.rows]
+        self.count = len(self.rows)
+
+    # connectivity, before the model knows its components
+
+    def slot_groups(self) -> list[np.ndarray]:
+        """For each joint the model slots that its rows tie."""
+        return [
+            np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.terms])) for joint in self.joints
+        ]
+
+    def hold(self, free: np.ndarray) -> None:
+        """Clear the directions (components, 3) in which a component is tied to the ground."""
+        position = self.model.slot_kind == 0
+        for k, row in enumerate(self.rows):
+            felt = False
+            for side in range(3):
+                slots, weights, _ = self._entries[3 * k + side]
+                size = np.abs(weights).sum()
+                felt |= bool(abs(weights[position[slots]].sum()) > 1e-9 * size) if len(slots) else False
+            if felt:
+                axis = row.b.value if row.kind == DOT and not row.b.parts else np.ones(3)
+                free[self.component_host[k], np.abs(axis) > 1e-12] = 0.0
+
+    # the device tables
+
+    def build(self, component: np.ndarray, add_law: Any) -> None:
+        """Upload; `component` of each slot, `add_law` numbers a time law."""
+        m = self.model
+        self._order(component)
+        self._fill_terms(add_law)
+        self._fill_pairs()
+        self._fill_joints()
+
+    def _order(self, component: np.ndarray) -> None:
+        """Sort the joints by component and cluster."""
+        groups = self.slot_groups()
+        free = self.model.free_host.any(axis=1)
+        joint_of = np.concatenate([np.full(len(g), k) for k, g in enumerate(groups)])
+        slot = np.concatenate(groups)
+        keep = free[slot]
+        shared = sp.csr_matrix(
+            (np.ones(keep.sum()), (joint_of[keep], slot[keep])), shape=(len(groups), self.model.slots)
+        )
+        cluster = sp.csgraph.connected_components(shared @ shared.T, directed=False)[1]
+        own = np.array([component[g[0]] for g in groups])
+        order = np.lexsort((np.arange(len(groups)), cluster, own))
+        first, rows, self.rows_of = 0, [], [np.zeros(0, dtype=np.int64)] * len(groups)
+        clusters, components = [], []
+        for k in order:
+            n = len(self.joints[k].rows)
+            self.rows_of[k] = np.arange(first, first + n)
+            first += n
+            rows += self.joints[k].rows
+            clusters += [cluster[k]] * n
+            components += [own[k]] * n
+        self.rows = rows
+        self.cluster_host = np.unique(clusters, return_inverse=True)[1]
+        # renumber in order of appearance, so that clusters are runs of rows
+        seen: dict[int, int] = {}
+        self.cluster_host = np.array([seen.setdefault(int(c), len(seen)) for c in clusters])
+        self.component_host = np.array(components)
+
+    def _fill_terms(self, add_law: Any) -> None:
+        m, rows = self.model, self.rows
+        entries = [vector.entries() for row in rows for vector in row.terms]
+        start = np.concatenate([[0], np.cumsum([len(e[0]) for e in entries])])
+        slot = np.concatenate([e[0] for e in entries])
+        weight = np.concatenate([e[1] for e in entries])
+        self.child_host = np.concatenate([e[2] for e in entries])
+        term = np.repeat(np.arange(len(entries)), np.diff(start))
+        self.term_host, self.slot_host, self.weight_host, self.start_host = term, slot, weight, start
+        numbers: dict[int, int] = {}
+        law = np.full(len(rows), -1)
+        for k, row in enumerate(rows):
+            if row.law is not None:
+                if id(row.law) not in numbers:
+                    numbers[id(row.law)] = add_law(row.law)
+                law[k] = numbers[id(row.law)]
+        data = constraint_struct()()
+        self.scale_host = np.array([r.scale * (m.size if r.angular else 1.0) for r in rows])
+        order = np.argsort(slot, kind="stable")
+        slot_start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
+        self.reference_host = np.array([vector.value for row in rows for vector in row.terms])
+        tables: dict[str, tuple[Any, Any]] = {
+            "kind": ([r.kind for r in rows], wp.int32),
+            "scale": (self.scale_host, wp.float64),
+            "constant": ([r.constant for r in rows], wp.float64),
+            "fixed": ([r.fixed for r in rows], wp.float64),
+            "law": (law, wp.int32),
+            "law_component": ([r.component for r in rows], wp.int32),
+            "component": (self.component_host, wp.int32),
+            "cluster": (self.cluster_host, wp.int32),
+            "start": (start, wp.int32),
+            "slot": (slot, wp.int32),
+            "weight": (weight, wp.float64),
+            "reference": (self.reference_host, wp.vec3d),
+            "slot_start": (slot_start, wp.int32),
+            "slot_term": (term[order], wp.int32),
+            "slot_weight": (weight[order], wp.float64),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
+        self.data = data
+        self._entries = entries
+
+    def _fill_pairs(self) -> None:
+        """Dense matrix of each cluster: for every pair of rows the pairs of vectors that share slots."""
+        free = self.model.free_host.any(axis=1)
+        sizes = np.bincount(self.cluster_host)
+        first = np.concatenate([[0], np.cumsum(sizes)])
+        # rows share vectors: a pin's three rows are of one
+        number: dict[int, int] = {}
+        weights: list[dict[int, float]] = []
+        vectors = []
+        for k, row in enumerate(self.rows):
+            own = []
+            for side, vector in enumerate((row.a, row.b, row.a2)):
+                if vector is None or not vector.parts:
+                    continue
+                if id(vector) not in number:
+                    slots, w, _ = self._entries[3 * k + side]
+                    number[id(vector)] = len(weights)
+                    merged: dict[int, float] = {}
+                    for s, x in zip(slots.tolist(), w.tolist()):
+                        if free[s]:
+                            merged[s] = merged.get(s, 0.0) + x
+                    weights.append(merged)
+                own.append((side, number[id(vector)]))
+            vectors.append(own)
+        blocks: dict[tuple[int, int], int] = {}
+        block_start, block_slot, block_weight = [0], [], []
+        pair_start, pair_side, pair_block = [0], [], []
+        for c, n in enumerate(sizes):
+            for i in range(first[c], first[c] + n):
+                for j in range(first[c], first[c] + n):
+                    for side_i, u in vectors[i]:
+                        for side_j, v in vectors[j]:
+                            key = (min(u, v), max(u, v))
+                            if key not in blocks:
+                                small, other = sorted((weights[u], weights[v]), key=len)
+                                common = [(s, x * other[s]) for s, x in small.items() if s in other]
+                                blocks[key] = len(block_start) - 1 if common else -1
+                                if common:
+                                    block_slot += [s for s, _ in common]
+                                    block_weight += [x for _, x in common]
+                                    block_start.append(len(block_slot))
+                            if blocks[key] >= 0:
+                                pair_side.append((side_i, side_j))
+                                pair_block.append(blocks[key])
+                    pair_start.append(len(pair_block))
+        self.block_count = len(block_start) - 1
+        self.matrix_entries = int((sizes**2).sum())
+        self.cluster_sizes = sizes
+        m, data = self.model, self.data
+        tables: dict[str, tuple[Any, Any]] = {
+            "cluster_start": (first, wp.int32),
+            "matrix_start": (np.concatenate([[0], np.cumsum(sizes**2)[:-1]]), wp.int32),
+            "pair": (pair_start, wp.int32),
+            "pair_side": (np.reshape(pair_side or [(0, 0)], (-1, 2)), wp.vec2i),
+            "pair_block": (pair_block or [0], wp.int32),
+            "block_start": (block_start, wp.int32),
+            "block_slot": (block_slot or [0], wp.int32),
+            "block_weight": (block_weight or [0.0], wp.float64),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
+
+    def _fill_joints(self) -> None:
+        m = self.model
+        position = m.slot_kind == 0
+        origin = np.concatenate([np.tile(b.origin, (b.slot_count, 1)) for b in m.bodies])
+        place = m.reference + position[:, None] * origin
+        anchors = [joint.anchor.entries() for joint in self.joints]
+        data = joint_struct()()
+        tables: dict[str, tuple[Any, Any]] = {
+            "first": ([rows[0] for rows in self.rows_of], wp.int32),
+            "last": ([rows[-1] + 1 for rows in self.rows_of], wp.int32),
+            "anchor": ([joint.anchor.value for joint in self.joints], wp.vec3d),
+            "anchor_start": (np.concatenate([[0], np.cumsum([len(a[0]) for a in anchors])]), wp.int32),
+            "anchor_slot": (np.concatenate([a[0] for a in anchors] + [np.zeros(1)]), wp.int32),
+            "anchor_weight": (np.concatenate([a[1] for a in anchors] + [np.zeros(1)]), wp.float64),
+            "role": (np.where(self.child_host, 1 + position[self.slot_host], 0), wp.int32),
+            "place": (place[self.slot_host], wp.vec3d),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
+        self.joint_data = data
+        for k, joint in enumerate(self.joints):
+            joint.index = k
+
+    # on the host, for supports, tests and users
+
+    def jacobian(self, u: np.ndarray, target: np.ndarray | None = None) -> sp.csr_matrix:
+        """dc/dq (rows, 3 slots) at displacements u (slots, 3), computed on the host; targets f (rows,), by default
+        `fixed`."""
+        values = self.vectors(u)
+        f = np.array([r.fixed for r in self.rows]) if target is None else target
+        G = np.zeros((self.count, 3, 3))
+        for k, row in enumerate(self.rows):
+            a, b, a2 = values[3 * k : 3 * k + 3]
+            if row.kind == DISTANCE:
+                G[k, 0] = a / np.linalg.norm(a)
+            elif row.kind == TURN:
+                s, c = np.sin(f[k]), np.cos(f[k])
+                G[k] = -s * b, c * a2 - s * a, c * b
+            else:
+                G[k, 0], G[k, 1] = b, a
+            G[k] *= self.scale_host[k]
+        return self.expand(G)
+
+    def expand(self, G: np.ndarray) -> sp.csr_matrix:
+        """Rows of the Jacobian from the gradients of the vectors (rows, 3, 3)."""
+        data = self.weight_host[:, None] * G.reshape(-1, 3)[self.term_host]
+        rows = np.repeat(self.term_host // 3, 3)
+        columns = (3 * self.slot_host[:, None] + np.arange(3)).ravel()
+        return sp.csr_matrix((data.ravel(), (rows, columns)), shape=(self.count, 3 * self.model.slots))
+
+    def measure(self, joint: Joint, state: Any) -> np.ndarray:
+        """Angle (rad), travel or length (m) of a joint, (worlds,)."""
+        target = self.model.evaluation.constraints(state)[2]
+        out = []
+        for world, u in enumerate(state.displacement.numpy().astype(float)):
+            if joint.angle:
+                a, a2, b = (self._present(v, u) for v in joint.angle)
+                angle = np.arctan2(b @ a2, b @ a)
+                driven = [k for k in self.rows_of[joint.index] if self.rows[k].kind == TURN]
+                if driven:
+                    angle += 2.0 * np.pi * np.round((target[world, driven[0]] - angle) / (2.0 * np.pi))
+                out.append(angle)
+            elif joint.travel:
+                gap, axis = (self._present(v, u) for v in joint.travel)
+                out.append(gap @ axis / np.linalg.norm(axis))
+            elif joint.rows[0].kind == DISTANCE:
+                out.append(np.linalg.norm(self._present(joint.rows[0].a, u)))
+            else:
+                raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no angle, travel or length")
+        return np.array(out)
+
+    @staticmethod
+    def _present(vector: Vector, u: np.ndarray) -> np.ndarray:
+        slots, weights, _ = vector.entries()
+        return vector.value + weights @ u[slots]
+
+    def vectors(self, u: np.ndarray) -> np.ndarray:
+        """(3 rows, 3) all vectors at displacements u (slots, 3)."""
+        out = self.reference_host.copy()
+        np.add.at(out, self.term_host, self.weight_host[:, None] * u[self.slot_host])
+        return out
+
+    def hash(self, h: Any) -> None:
+        """Feed what defines the rows into a hash."""
+        for row in self.rows:
+            h.update(f"{row.kind} {row.scale!r} {row.constant!r} {row.fixed!r} {row.component}".encode())
+        for values in (self.slot_host, self.weight_host, self.start_host, self.reference_host):
+            h.update(np.ascontiguousarray(values).tobytes())
+
+
+assert (DOT, DISTANCE, TURN) == (0, 1, 2)

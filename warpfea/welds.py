@@ -1,0 +1,106 @@
+"""Welds of faces to other bodies: mortar ties, the gap zero in the mean with each function of the first face."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from . import assembly
+from .bodies import Body, NodeSet, SurfaceSet
+from .constraints import Joint, Part, Vector
+from .description import support_slots
+from .errors import ModelError
+from .joints import pin_rows
+from .locate import locate
+from .surfaces import named_faces
+
+__all__ = ["make_weld"]
+
+
+def make_weld(first: NodeSet | SurfaceSet, second: SurfaceSet | Body, name: str) -> Joint:
+    """Compose a weld; see ModelBuilder.weld."""
+    what = f"weld {name!r}"
+    holder = second if isinstance(second, Body) else second.body
+    body = first.body
+    if body is holder:
+        raise ModelError(f"{what}: both sides are body {body.name!r}")
+    face = first if isinstance(first, SurfaceSet) else _face(first)
+    if face is not None:
+        gaps, anchor = _mortar(face, holder, what)
+        label = f"surface {face.name!r} of body {body.name!r}" if face.name else f"a surface of body {body.name!r}"
+    else:
+        assert isinstance(first, NodeSet)
+        gaps, anchor = _pins(first, holder, what)
+        label = f"{len(gaps)} nodes of body {body.name!r}"
+    rows = [row for gap in gaps for row in pin_rows(gap)]
+    return Joint(name, "weld", rows, anchor, f"body {holder.name!r} and {label}")
+
+
+def _face(nodes: NodeSet) -> SurfaceSet | None:
+    """The face of a beam or shell that a named set of nodes stands for."""
+    body = nodes.body
+    if body.family.solid or not nodes.name:
+        return None
+    faces = named_faces(body).get(nodes.name)
+    return None if faces is None else SurfaceSet(body, faces, nodes.name)
+
+
+def _mortar(face: SurfaceSet, holder: Body, what: str) -> tuple[list[Vector], Vector]:
+    """One vector per slot i of the face: int phi_i (x - x_holder) dA / int |phi_i| dA."""
+    body = face.body
+    t = assembly.facet_tables(face)
+    x = body.reference[t.conn] + (body.slot_kind[t.conn] == 0)[:, :, None] * body.origin
+    normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
+    dA = np.linalg.norm(normal, axis=2) * t.weights
+    X = np.einsum("fqi,fik->fqk", t.shape, x)
+    n, m = body.slot_count, holder.slot_count
+    F, Q, _ = t.shape.shape
+    own, other = np.zeros((F * Q, n)), np.zeros((F * Q, m))
+    for k, (f, q) in enumerate(np.ndindex(F, Q)):
+        np.add.at(own[k], t.conn[f], t.shape[f, q])
+        place = _locate(holder, X[f, q], what)
+        np.add.at(other[k], place.slots, place.weights)
+    share = dA.ravel()
+    gaps = []
+    for slot in np.unique(t.conn):
+        test = own[:, slot] * share
+        size = np.abs(test).sum()
+        if size > 1e-12 * share.sum():
+            gaps.append(_gap(body, holder, test @ own / size, test @ other / size))
+    mean = share / share.sum()
+    return gaps, _anchor(body, mean @ own, mean @ X.reshape(-1, 3))
+
+
+def _pins(nodes: NodeSet, holder: Body, what: str) -> tuple[list[Vector], Vector]:
+    """Nodes at their places in the holder."""
+    body = nodes.body
+    slots = support_slots(nodes, "position")
+    places = body.reference[slots] + body.origin
+    gaps = []
+    for slot, X in zip(slots, places):
+        own, other = np.zeros(body.slot_count), np.zeros(holder.slot_count)
+        own[slot] = 1.0
+        place = _locate(holder, X, what)
+        np.add.at(other, place.slots, place.weights)
+        gaps.append(_gap(body, holder, own, other))
+    mean = np.zeros(body.slot_count)
+    mean[slots] = 1.0 / len(slots)
+    return gaps, _anchor(body, mean, places.mean(axis=0))
+
+
+def _locate(holder: Body, X: np.ndarray, what: str) -> Any:
+    try:
+        return locate(holder, X)
+    except ModelError as error:
+        raise ModelError(f"{what}: {error}; the welded face must lie in the other body") from None
+
+
+def _gap(body: Body, holder: Body, own: np.ndarray, other: np.ndarray) -> Vector:
+    a, b = np.flatnonzero(own), np.flatnonzero(other)
+    return Vector(np.zeros(3), (Part(body, a, own[a], True), Part(holder, b, -other[b], False)))
+
+
+def _anchor(body: Body, weights: np.ndarray, X: np.ndarray) -> Vector:
+    slots = np.flatnonzero(weights)
+    return Vector(X, (Part(body, slots, weights[slots], True),))
