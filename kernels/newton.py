@@ -201,7 +201,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         phi = objective(ctl, world) + ctl.slot_sums[7, world]
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = magnitude(ctl, world)
-        ctl.forcing[world] = f64(0.1)
+        # constraints are stiff: a loose first solve costs more iterations than it saves
+        ctl.forcing[world] = f64(wp.static(1.0e-2 if constrained else 0.1))
         if ctl.domain_J[world] <= f64(0.0):
             fail(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):

@@ -294,10 +294,11 @@ def floating_frame_slider_crank(
         r(s, t) = pin(t) + u(s, t) e1 + w(s, t) e2,     w = sum_k a_k sin(k pi s / L),
         u(s) = int_0^s sqrt((1 + e)^2 - w'^2) ds,       e = sum_j b_j cos(c_j s / L),
 
-    where e is the axial strain: the shortening of the chord, int w'^2 / 2 to the second order, is kept in full, and
-    with it the stiffening and softening of the rod by its axial force. The chord's length u(L) and the line of the
-    slider give the chord's angle. q = (a, b) follows Lagrange's equations, here as d'Alembert's principle with
-    J = dr/dq by formula and integrals by Gauss points,
+    where e is the axial strain, in the shapes of the straight rod with the slider at its end (c tan c = rod's mass /
+    slider's mass, which gives its axial ringing the right frequency with one shape). The shortening of the chord, int
+    w'^2 / 2 to the second order, is kept in full, and with it the stiffening and softening of the rod by its axial
+    force. The chord's length u(L) and the line of the slider give the chord's angle. q = (a, b) follows Lagrange's
+    equations, here as d'Alembert's principle with J = dr/dq by formula and integrals by Gauss points,
 
         int rho A J^T r'' ds + m J_slider^T r''_slider + d/dq int (EA e^2 + EI kappa^2) / 2 ds = 0,
         kappa = d/ds arcsin(w' / (1 + e)),
@@ -406,11 +407,12 @@ def _check_rigid() -> None:
 
 
 def _check_pendulum() -> None:
-    link: tuple = ((1.3, 0.7), (0.5, 0.8), (0.21, 0.47), (0.03, 0.05))
-    terms, rng, worst = _double_pendulum_terms(*link, 9.81), np.random.default_rng(0), 0.0
+    link: dict[str, Any] = {"masses": (1.3, 0.7), "lengths": (0.5, 0.8), "centers": (0.21, 0.47),
+                            "inertias": (0.03, 0.05), "gravity": 9.81}  # fmt: skip
+    terms, rng, worst = _double_pendulum_terms(**link), np.random.default_rng(0), 0.0
 
     def energies(q, v):
-        return _double_pendulum_energies(q, v, *link, 9.81)
+        return _double_pendulum_energies(q, v, **link)
 
     for _ in range(200):
         q, v = rng.uniform(-4.0, 4.0, 2), rng.uniform(-6.0, 6.0, 2)
@@ -429,7 +431,7 @@ def _check_pendulum() -> None:
             slope.append((kinetic - potential).imag / 1e-30)
         worst = max(worst, np.abs(rate - slope).max() / max(1.0, np.abs(slope).max()))
     t = np.linspace(0.0, 5.0, 501)
-    angles, rates = double_pendulum(t, *link, (2.6, 2.0), (0.5, -1.0))
+    angles, rates = double_pendulum(t, angles=(2.6, 2.0), rates=(0.5, -1.0), **link)
     total = np.array([sum(energies(q, v)) for q, v in zip(angles, rates)])
     potential = np.array([energies(q, v)[1] for q, v in zip(angles, rates)])
     print(f"double pendulum: Lagrange {worst:.1e}, energy {np.abs(total - total[0]).max() / np.ptp(potential):.1e} of "
