@@ -75,6 +75,7 @@ def control_struct():
         stepped: wp.array(dtype=wp.int32)  # the trial was accepted
         outer: wp.array(dtype=wp.int32)  # multiplier updates of this step
         constraint_tol: wp.float64  # m
+        slack: wp.float64  # norm of PCG over the norm that is judged, across constraints
         classical: wp.int32  # multipliers change in an outer loop
         tol: wp.float64
         eps: wp.float64
@@ -171,7 +172,10 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_ITERATIONS
             if wp.static(constrained):
-                if ctl.relative[world] <= f64(1.0e3) * ctl.tol:
+                largest = f64(0.0)
+                for c in range(ctl.components):
+                    largest = wp.max(largest, ctl.violation[world, c])
+                if ctl.relative[world] <= f64(1.0e3) * ctl.tol and largest > ctl.constraint_tol:
                     ctl.failed[world] = FAIL_CONSTRAINT  # in balance, but the constraints do not hold
 
     @wp.func

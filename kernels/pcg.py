@@ -124,11 +124,13 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
             newton.forcing[world] * newton.solve_norm[world], f64(0.1) * newton.solve_accept[world]
         )
         if wp.static(constrained):
-            # across constraints r.z counts less than the norm that is judged, by the root of the penalty's factor: a
-            # solve is measured with its own start, and goes on a little further at the end
-            ctl.target[world] = wp.max(
-                newton.forcing[world] * wp.sqrt(wp.max(rz, f64(0.0))), f64(0.02) * newton.solve_accept[world]
-            )
+            # across constraints r.z counts less than the norm that is judged, by the root of the penalty's factor;
+            # and it may drive a step where the forces balance
+            goal = newton.forcing[world] * newton.solve_norm[world]
+            if newton.classical == 0:
+                goal = goal * newton.slack
+            goal = wp.min(goal, newton.forcing[world] * wp.sqrt(wp.max(rz, f64(0.0))))
+            ctl.target[world] = wp.max(goal, f64(0.1) * newton.slack * newton.solve_accept[world])
         if rz > ctl.target[world] * ctl.target[world] and ctl.max_iterations > 0:
             ctl.active[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)

@@ -182,6 +182,10 @@ def step_kernels(
         dq = T(step.dq_dv[world])
         if wp.static(not static):
             guess = w + (dq * is_position[slot]) * vec3(step.gravity[world])
+            if wp.static(multistep):
+                if step.a1[world] > f64(0.0):  # goes on as it went: exact for a constant acceleration too
+                    ratio = T(step.h[world] / step.previous_h[world])
+                    guess = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
         keep = (T(1.0) / dq) * (u_n[world, slot] - q)
         f = free[slot]
         for k in range(3):

@@ -112,6 +112,7 @@ class NewtonLoop:
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.nonpotential = int(model.loads.nonpotential or rate)
         ctl.classical = int(self.classical)
+        ctl.slack = 1.0 / math.sqrt(1.0 + options.penalty)
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves are for g alone
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
