@@ -60,12 +60,18 @@ def constraint_struct():
         slot_start: wp.array(dtype=wp.int32)  # [slot + 1]
         slot_term: wp.array(dtype=wp.int32)
         slot_weight: wp.array(dtype=wp.float64)
-        cluster: wp.array(dtype=wp.int32)  # [row] rows that share slots, directly or by others, are a cluster
+        cluster: wp.array(dtype=wp.int32)  # [row] rows whose matrix is inverted together
         cluster_start: wp.array(dtype=wp.int32)  # [cluster + 1] rows
         matrix_start: wp.array(dtype=wp.int32)  # [cluster] entry of its dense matrix
         pair: wp.array(dtype=wp.int32)  # [matrix entry] its first pair of terms
         pair_side: wp.array(dtype=wp.vec2i)  # [pair] sides of the row and of the column
         pair_block: wp.array(dtype=wp.int32)  # [pair] the block of both vectors
+        couple_start: wp.array(dtype=wp.int32)  # [row + 1] its couplings to rows of other clusters
+        couple_row: wp.array(dtype=wp.int32)  # [coupling] the row
+        couple_column: wp.array(dtype=wp.int32)  # [coupling] the other row
+        couple_pair: wp.array(dtype=wp.int32)  # [coupling + 1] its pairs of terms
+        colour: wp.array(dtype=wp.int32)  # [cluster] coupled clusters differ
+        colour_cluster: wp.array(dtype=wp.int32)  # clusters by colour
         block_start: wp.array(dtype=wp.int32)  # [block + 1]
         block_slot: wp.array(dtype=wp.int32)
         block_weight: wp.array(dtype=wp.float64)  # product of both weights at the slot
@@ -93,7 +99,9 @@ def multiplier_struct():
         violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m
         block: wp.array2d(dtype=wp.mat33d)  # [world, block] sum w w D^-1
         matrix: wp.array2d(dtype=wp.float64)  # [world, entry] (1 / (dq/dv rho) + J D^-1 J^T)^-1
+        coupling: wp.array2d(dtype=wp.float64)  # [world, coupling] J D^-1 J^T between clusters
         restricted: wp.array2d(dtype=wp.float64)  # J D^-1 r
+        swept: wp.array2d(dtype=wp.float64)
         solved: wp.array2d(dtype=wp.float64)  # matrix times it
         classical: wp.int32  # multipliers change in the outer loop only
         kappa: wp.float64
@@ -113,7 +121,8 @@ def joint_struct():
         anchor_start: wp.array(dtype=wp.int32)  # [joint + 1]
         anchor_slot: wp.array(dtype=wp.int32)
         anchor_weight: wp.array(dtype=wp.float64)
-        role: wp.array(dtype=wp.int32)  # [entry] 0 parent, 1 child's gradient, 2 child's position
+        role: wp.array(dtype=wp.int32)  # [entry] 1 child's gradient, 2 child's position, negative: a parent's against
+        # a child in space, 0: not counted
         place: wp.array(dtype=wp.vec3d)  # [entry] reference value of the slot, in space
 
     return Joints
@@ -358,10 +367,11 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
                 term = 3 * row + side
                 for k in range(con.start[term], con.start[term + 1]):
                     role = joints.role[k]
-                    if role > 0:
+                    if role != 0:
                         f = -(force[world, row] * con.weight[k]) * mul.gradient[world, term]
+                        f = f64(wp.sign(role)) * f
                         arm = joints.place[k] + vec3d(u[world, con.slot[k]])
-                        if role == 2:
+                        if wp.abs(role) == 2:
                             arm = arm - anchor
                             F += f
                         M += wp.cross(arm, f)
@@ -386,6 +396,25 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
             s += con.block_weight[k] * wp.mat33d(inverse[world, con.block_slot[k]])
         mul.block[world, block] = s
 
+    @wp.func
+    def pair_sum(con: Constraints, mul: Multipliers, world: int, row: int, column: int, first: int, last: int) -> f64:
+        """(J D^-1 J^T) of two rows."""
+        s = f64(0.0)
+        for k in range(first, last):
+            side = con.pair_side[k]
+            left = mul.gradient[world, 3 * row + side[0]]
+            right = mul.gradient[world, 3 * column + side[1]]
+            s += wp.dot(left, mul.block[world, con.pair_block[k]] * right)
+        return s
+
+    @wp.kernel(module=module)
+    def assemble_coupling(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
+        """J D^-1 J^T between rows of different clusters."""
+        world, k = wp.tid()
+        if active[world] != 0:
+            first, last = con.couple_pair[k], con.couple_pair[k + 1]
+            mul.coupling[world, k] = pair_sum(con, mul, world, con.couple_row[k], con.couple_column[k], first, last)
+
     @wp.kernel(module=module)
     def assemble_matrix(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
         """J D^-1 J^T within each cluster, one thread per row."""
@@ -396,18 +425,11 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         n = con.cluster_start[con.cluster[row] + 1] - first
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         for column in range(n):
-            s = f64(0.0)
-            for k in range(con.pair[base + column], con.pair[base + column + 1]):
-                side = con.pair_side[k]
-                left = mul.gradient[world, 3 * row + side[0]]
-                right = mul.gradient[world, 3 * (first + column) + side[1]]
-                s += wp.dot(left, mul.block[world, con.pair_block[k]] * right)
-            mul.matrix[world, base + column] = s
+            start, end = con.pair[base + column], con.pair[base + column + 1]
+            mul.matrix[world, base + column] = pair_sum(con, mul, world, row, first + column, start, end)
 
     @wp.kernel(module=module)
-    def penalty(
-        con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers
-    ):
+    def penalty(con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers):
         """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii): free of units, of the mesh and of E. Frozen during a step."""
         world, row = wp.tid()
         if active[world] == 0:
@@ -509,9 +531,7 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
             mul.matrix[world, base + j] = d * mul.matrix[world, base + j]
 
     @wp.kernel(module=module)
-    def restrict(
-        con: Constraints, mul: Multipliers, z: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)
-    ):
+    def restrict(con: Constraints, mul: Multipliers, z: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)):
         """J z."""
         world, row = wp.tid()
         if active[world] != 0:
@@ -530,6 +550,45 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         for j in range(n):
             s += mul.matrix[world, base + j] * mul.restricted[world, first + j]
         mul.solved[world, row] = s
+
+    @wp.kernel(module=module)
+    def sweep(
+        con: Constraints,
+        mul: Multipliers,
+        first_cluster: int,
+        forward: int,
+        active: wp.array(dtype=wp.int32),
+    ):
+        """One colour of a symmetric block Gauss-Seidel sweep over coupled clusters.
+
+        It stands for (G + L) G^-1 (G + L^T) >= J D^-1 J^T + 1/((dq/dv) rho), G the clusters' own matrices: with more than
+        the right matrix the preconditioner stays positive definite.
+        """
+        world, k = wp.tid()
+        if active[world] == 0:
+            return
+        cluster = con.colour_cluster[first_cluster + k]
+        colour = con.colour[cluster]
+        first = con.cluster_start[cluster]
+        n = con.cluster_start[cluster + 1] - first
+        for row in range(first, first + n):
+            s = f64(0.0)
+            if forward == 1:
+                s = mul.restricted[world, row]
+            for c in range(con.couple_start[row], con.couple_start[row + 1]):
+                other = con.couple_column[c]
+                rank = con.colour[con.cluster[other]]
+                if (forward == 1 and rank < colour) or (forward == 0 and rank > colour):
+                    s -= mul.coupling[world, c] * mul.solved[world, other]
+            mul.swept[world, row] = s
+        base = con.matrix_start[cluster]
+        for i in range(n):
+            s = f64(0.0)
+            for j in range(n):
+                s += mul.matrix[world, base + i * n + j] * mul.swept[world, first + j]
+            if forward == 0:
+                s += mul.solved[world, first + i]
+            mul.solved[world, first + i] = s
 
     @wp.kernel(module=module)
     def project(
@@ -570,6 +629,8 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         joint_report=joint_report,
         pair_blocks=pair_blocks,
         assemble_matrix=assemble_matrix,
+        assemble_coupling=assemble_coupling,
+        sweep=sweep,
         penalty=penalty,
         invert_clusters=invert_clusters,
         eliminate=eliminate,

@@ -162,6 +162,14 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             ctl.history[world, k] = ctl.relative[world]
 
     @wp.func
+    def unsatisfied(ctl: Control, world: int) -> bool:
+        """Whether forces balance but constraints do not hold: more iterations only raise the multipliers."""
+        largest = f64(0.0)
+        for c in range(ctl.components):
+            largest = wp.max(largest, ctl.violation[world, c])
+        return ctl.relative[world] <= f64(1.0e3) * ctl.tol and largest > ctl.constraint_tol
+
+    @wp.func
     def settle(ctl: Control, world: int):
         """End the iteration where it has converged, stands still within rounding, or used up its iterations."""
         record(ctl, world)
@@ -172,11 +180,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_ITERATIONS
             if wp.static(constrained):
-                largest = f64(0.0)
-                for c in range(ctl.components):
-                    largest = wp.max(largest, ctl.violation[world, c])
-                if ctl.relative[world] <= f64(1.0e3) * ctl.tol and largest > ctl.constraint_tol:
-                    ctl.failed[world] = FAIL_CONSTRAINT  # in balance, but the constraints do not hold
+                if unsatisfied(ctl, world):
+                    ctl.failed[world] = FAIL_CONSTRAINT
 
     @wp.func
     def fail(ctl: Control, world: int, why: int):
@@ -186,6 +191,9 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         within = ctl.floor_excess[world] <= f64(1.0) and ctl.iterations[world] > 0
         if not (within and why != FAIL_NAN):
             ctl.failed[world] = why
+            if wp.static(constrained):
+                if why != FAIL_NAN and unsatisfied(ctl, world):
+                    ctl.failed[world] = FAIL_CONSTRAINT
 
     @wp.kernel(module=module)
     def reset_min_J(ctl: Control, active: wp.array(dtype=wp.int32)):

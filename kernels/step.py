@@ -17,7 +17,19 @@ __all__ = ["LEDGER", "LEDGER_ROWS", "REPORT", "STATUS", "step_kernels", "step_st
 
 STATUS = {"running": 0, "failed": 1, "frozen": 2}
 
-REPORT = ("status", "newton", "pcg", "residual", "halvings", "min_J", "time", "failure", "attempt_time", "violation", "outer")
+REPORT = (
+    "status",
+    "newton",
+    "pcg",
+    "residual",
+    "halvings",
+    "min_J",
+    "time",
+    "failure",
+    "attempt_time",
+    "violation",
+    "outer",
+)
 """Columns of the report of a step, [world, column] in float64; probes follow."""
 
 LEDGER = (

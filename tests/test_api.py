@@ -151,6 +151,42 @@ def test_errors_derive_from_one():
     names = ["MeshError", "ModelError", "ConvergenceError", "ConstraintError", "PenetrationError", "CapacityError"]
     for name in [*names, "CheckpointError", "OutputError"]:
         assert issubclass(getattr(wf, name), wf.Error)
-    for name in ("GROUND", "HalfSpace"):
-        with pytest.raises(NotImplementedError, match=name):
-            getattr(wf, name)
+    with pytest.raises(NotImplementedError, match="HalfSpace"):
+        wf.HalfSpace
+
+
+def test_joints():
+    steel = wf.SVK(E=7e8, nu=0.33, density=2700.0)
+    b = wf.ModelBuilder()
+    beam = b.add_beam(
+        [(0, 0, 0), (1, 0, 0)], elements=2, section=wf.Rectangle(0.1, 0.1), normal=(0, 0, 1), material=steel
+    )
+    plate = b.add_shell(
+        wf.mesh.grid((1, 1), cells=(2, 2)), thickness=0.1, material=steel, transform=(np.eye(3), (1, 0, 0))
+    )
+    box = b.add_solid(wf.mesh.box((0.5, 0.5, 0.5), cells=(1, 1, 1)), transform=(np.eye(3), (-0.5, -0.25, -0.25)),
+                      material=steel, name="box")  # fmt: skip
+    elbow = b.add_joint(
+        "revolute",
+        parent=beam.end,
+        child=plate.at((1, 0, 0)),
+        anchor=(1, 0, 0),
+        axis=(0, 1, 0),
+        drive=None,
+        name="elbow",
+    )
+    P, Q, R, T = beam.start, beam.end, plate.at((1, 0, 0)), plate.at((1, 1, 0))
+    right = b.add_constraint("DP1", points=(P, Q, R, T), value=0.0)
+    weld = b.weld(beam.start, box.surface("x+"))
+    hold = b.add_joint("fixed", parent=wf.GROUND, child=box.surface("x-"))
+    assert isinstance(elbow, wf.Joint)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, constraint_tol=1e-8)
+    assert sim.step().violation[0] <= 1e-8 * sim.model.size
+    for joint in (elbow, right, weld, hold):
+        assert sim.joint_force(joint).shape == (1, 6)
+        assert sim.violation(joint).shape == (1,)
+        record = sim.joint_record(joint)
+        assert record.time.shape == (1,)
+        assert record.force.shape == record.moment.shape == (1, 1, 3)
+        assert record.violation.shape == (1, 1)
+    assert sim.joint_value(elbow).shape == (1,)

@@ -149,9 +149,6 @@ def test_bad_input(case, tmp_path, monkeypatch):
 
 
 LATER = {
-    "add_joint": lambda b, s: b.add_joint("revolute"),
-    "add_constraint": lambda b, s: b.add_constraint("DP1"),
-    "weld": lambda b, s: b.weld(None, None),
     "add_collider": lambda b, s: b.add_collider(None),
     "add_contact": lambda b, s: b.add_contact(s, None),
     "energy_momentum": lambda b, s: wf.Simulation(b.finalize(device="cpu"), dt=1.0, integrator="energy_momentum"),

@@ -13,6 +13,7 @@ from . import elements as families
 from .bodies import Body, SurfaceSet
 from .elements import Part, Rule
 from .elements.family import Tying
+from .elements.quadrature import composite
 from .errors import MeshError, ModelError
 from .surfaces import element_functions
 
@@ -305,10 +306,10 @@ class FacetTables:
     weights: np.ndarray
 
 
-def facet_tables(surface: SurfaceSet) -> FacetTables:
-    """Functions of the faces of a surface at the points of its family's face rule."""
+def facet_tables(surface: SurfaceSet, parts: int = 1) -> FacetTables:
+    """Functions of the faces of a surface at the points of its family's face rule, repeated on parts x parts of it."""
     body, faces = surface.body, surface.faces
-    rule = body.family.face_rule
+    rule = composite(body.family.face_rule, parts)
     Q, S = len(rule.weights), body.family.slots
     values = np.zeros((3, len(faces), Q, S))
     used = np.zeros((len(faces), S), dtype=bool)

@@ -224,6 +224,13 @@ class Body:
         return self.nodes(name)
 
     @cached_property
+    def element_boxes(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Boxes of the elements, for finding points."""
+        from .locate import element_boxes
+
+        return element_boxes(self)
+
+    @cached_property
     def boundary(self) -> np.ndarray:
         """(K, 2) all outer faces, rows (element, local face)."""
         return surfaces.boundary_faces(self)

@@ -537,7 +537,9 @@ class ModelBuilder:
         if name is None:
             return next(n for k in itertools.count(1) if (n := f"{kind}_{k}") not in taken)
         if not isinstance(name, str) or name in taken:
-            raise ModelError(f"joint name {name!r} is used twice" if name in taken else f"joint name {name!r} is no text")
+            raise ModelError(
+                f"joint name {name!r} is used twice" if name in taken else f"joint name {name!r} is no text"
+            )
         return name
 
     def _join(self, joint: Joint) -> Joint:

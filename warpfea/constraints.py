@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Constraints", "Joint", "Row", "Vector", "constant"]
 
+DENSE = 64
+"""Most coupled rows of several joints whose matrix is inverted as one; beyond, joints are swept colour by colour."""
 NEGLIGIBLE = 1e-13
 """Weights below this share of a vector's largest are rounding of functions that vanish there."""
 
@@ -156,7 +159,8 @@ class Constraints:
     def slot_groups(self) -> list[np.ndarray]:
         """For each joint the model slots that its rows tie."""
         return [
-            np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.terms])) for joint in self.joints
+            np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.terms]))
+            for joint in self.joints
         ]
 
     def hold(self, free: np.ndarray) -> None:
@@ -240,7 +244,6 @@ class Constraints:
             "law": (law, wp.int32),
             "law_component": ([r.component for r in rows], wp.int32),
             "component": (self.component_host, wp.int32),
-            "cluster": (self.cluster_host, wp.int32),
             "start": (start, wp.int32),
             "slot": (slot, wp.int32),
             "weight": (weight, wp.float64),
@@ -255,14 +258,75 @@ class Constraints:
         self._entries = entries
 
     def _fill_pairs(self) -> None:
-        """Dense matrix of each cluster: for every pair of rows the pairs of vectors that share slots."""
-        free = self.model.free_host.any(axis=1)
+        """For every pair of rows that share slots the pairs of vectors that do: dense within clusters, else couplings."""
+        first = self._cluster_rows()
+        shared = self._shared_vectors()
+        n = np.diff(first)
+        pair_start, pair_side, pair_block = [0], [], []
+        couple_start, couple_column = [0], []
+        couple_pairs: list[list[tuple[tuple[int, int], int]]] = []
+        for i in range(self.count):
+            c = self.cluster_host[i]
+            columns = shared[i]
+            for j in range(first[c], first[c + 1]):
+                for side, block in columns.get(j, ()):
+                    pair_side.append(side)
+                    pair_block.append(block)
+                pair_start.append(len(pair_block))
+            for j in sorted(columns):
+                if self.cluster_host[j] != c:
+                    couple_column.append(j)
+                    couple_pairs.append(columns[j])
+            couple_start.append(len(couple_column))
+        couple_pair = [len(pair_block)]
+        for pairs in couple_pairs:
+            pair_side += [side for side, _ in pairs]
+            pair_block += [block for _, block in pairs]
+            couple_pair.append(len(pair_block))
+        self.couple_count = len(couple_column)
+        self.matrix_entries = int((n**2).sum())
+        self.cluster_sizes = n
+        couple_row = np.repeat(np.arange(self.count), np.diff(couple_start))
+        self._colour_clusters(couple_row, np.array(couple_column, dtype=np.int64))
+        tables: dict[str, tuple[Any, Any]] = {
+            "cluster": (self.cluster_host, wp.int32),
+            "cluster_start": (first, wp.int32),
+            "matrix_start": (np.concatenate([[0], np.cumsum(n**2)[:-1]]), wp.int32),
+            "pair": (pair_start, wp.int32),
+            "pair_side": (np.reshape(pair_side or [(0, 0)], (-1, 2)), wp.vec2i),
+            "pair_block": (pair_block or [0], wp.int32),
+            "couple_start": (couple_start, wp.int32),
+            "couple_row": (couple_row if len(couple_row) else [0], wp.int32),
+            "couple_column": (couple_column or [0], wp.int32),
+            "couple_pair": (couple_pair, wp.int32),
+            "colour": (self.colour_host, wp.int32),
+            "colour_cluster": (np.argsort(self.colour_host, kind="stable"), wp.int32),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(self.data, name, self.model.array("constraints", np.asarray(values), dtype))
+
+    def _cluster_rows(self) -> np.ndarray:
+        """Split runs of coupled rows that are too large for a dense inverse into their joints; first row of each."""
         sizes = np.bincount(self.cluster_host)
-        first = np.concatenate([[0], np.cumsum(sizes)])
-        # rows share vectors: a pin's three rows are of one
+        joint = np.zeros(self.count, dtype=np.int64)
+        for k, rows in enumerate(self.rows_of):
+            joint[rows] = k
+        split = (sizes > DENSE)[self.cluster_host]
+        label = np.where(split, self.count + joint, self.cluster_host)
+        starts = np.flatnonzero(np.concatenate([[True], label[1:] != label[:-1]]))
+        self.cluster_host = np.cumsum(np.concatenate([[0], (label[1:] != label[:-1]).astype(int)]))
+        return np.concatenate([starts, [self.count]])
+
+    def _shared_vectors(self) -> list[dict[int, list[tuple[tuple[int, int], int]]]]:
+        """For each row the rows that it shares slots with: pairs of sides and the block of both vectors.
+
+        Blocks sum w w' D^-1 over the slots; rows share vectors (a pin's three rows are of one), so blocks are few.
+        """
+        free = self.model.free_host.any(axis=1)
         number: dict[int, int] = {}
         weights: list[dict[int, float]] = []
-        vectors = []
+        rows_of_vector: list[list[tuple[int, int]]] = []
+        sides: list[list[tuple[int, int]]] = []
         for k, row in enumerate(self.rows):
             own = []
             for side, vector in enumerate((row.a, row.b, row.a2)):
@@ -270,51 +334,62 @@ class Constraints:
                     continue
                 if id(vector) not in number:
                     slots, w, _ = self._entries[3 * k + side]
-                    number[id(vector)] = len(weights)
                     merged: dict[int, float] = {}
                     for s, x in zip(slots.tolist(), w.tolist()):
                         if free[s]:
                             merged[s] = merged.get(s, 0.0) + x
+                    number[id(vector)] = len(weights)
                     weights.append(merged)
+                    rows_of_vector.append([])
                 own.append((side, number[id(vector)]))
-            vectors.append(own)
+                rows_of_vector[own[-1][1]].append((k, side))
+            sides.append(own)
+        of_slot: dict[int, list[int]] = {}
+        for v, merged in enumerate(weights):
+            for s in merged:
+                of_slot.setdefault(s, []).append(v)
         blocks: dict[tuple[int, int], int] = {}
+        near: list[list[tuple[int, int]]] = []
         block_start, block_slot, block_weight = [0], [], []
-        pair_start, pair_side, pair_block = [0], [], []
-        for c, n in enumerate(sizes):
-            for i in range(first[c], first[c] + n):
-                for j in range(first[c], first[c] + n):
-                    for side_i, u in vectors[i]:
-                        for side_j, v in vectors[j]:
-                            key = (min(u, v), max(u, v))
-                            if key not in blocks:
-                                small, other = sorted((weights[u], weights[v]), key=len)
-                                common = [(s, x * other[s]) for s, x in small.items() if s in other]
-                                blocks[key] = len(block_start) - 1 if common else -1
-                                if common:
-                                    block_slot += [s for s, _ in common]
-                                    block_weight += [x for _, x in common]
-                                    block_start.append(len(block_slot))
-                            if blocks[key] >= 0:
-                                pair_side.append((side_i, side_j))
-                                pair_block.append(blocks[key])
-                    pair_start.append(len(pair_block))
+        for u, merged in enumerate(weights):
+            own_blocks = []
+            for v in sorted({v for s in merged for v in of_slot[s]}):
+                key = (min(u, v), max(u, v))
+                if key not in blocks:
+                    common = [(s, x * weights[v][s]) for s, x in merged.items() if s in weights[v]]
+                    blocks[key] = len(block_start) - 1
+                    block_slot += [s for s, _ in common]
+                    block_weight += [x for _, x in common]
+                    block_start.append(len(block_slot))
+                own_blocks.append((v, blocks[key]))
+            near.append(own_blocks)
+        out: list[dict[int, list[tuple[tuple[int, int], int]]]] = []
+        for own in sides:
+            columns: dict[int, list[tuple[tuple[int, int], int]]] = {}
+            for side, u in own:
+                for v, block in near[u]:
+                    for other, other_side in rows_of_vector[v]:
+                        columns.setdefault(other, []).append(((side, other_side), block))
+            out.append(columns)
         self.block_count = len(block_start) - 1
-        self.matrix_entries = int((sizes**2).sum())
-        self.cluster_sizes = sizes
-        m, data = self.model, self.data
-        tables: dict[str, tuple[Any, Any]] = {
-            "cluster_start": (first, wp.int32),
-            "matrix_start": (np.concatenate([[0], np.cumsum(sizes**2)[:-1]]), wp.int32),
-            "pair": (pair_start, wp.int32),
-            "pair_side": (np.reshape(pair_side or [(0, 0)], (-1, 2)), wp.vec2i),
-            "pair_block": (pair_block or [0], wp.int32),
-            "block_start": (block_start, wp.int32),
-            "block_slot": (block_slot or [0], wp.int32),
-            "block_weight": (block_weight or [0.0], wp.float64),
-        }
-        for name, (values, dtype) in tables.items():
-            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
+        m = self.model
+        self.data.block_start = m.array("constraints", np.asarray(block_start), wp.int32)
+        self.data.block_slot = m.array("constraints", np.asarray(block_slot or [0]), wp.int32)
+        self.data.block_weight = m.array("constraints", np.asarray(block_weight or [0.0]), wp.float64)
+        return out
+
+    def _colour_clusters(self, row: np.ndarray, column: np.ndarray) -> None:
+        """Greedy colouring of coupled clusters; `colour_sizes` counts those of each colour."""
+        n = len(self.cluster_sizes)
+        near: list[set[int]] = [set() for _ in range(n)]
+        for a, b in zip(self.cluster_host[row].tolist(), self.cluster_host[column].tolist()):
+            near[a].add(b)
+        colour = np.full(n, -1)
+        for k in range(n):
+            taken = {int(colour[j]) for j in near[k]}
+            colour[k] = next(c for c in itertools.count() if c not in taken)
+        self.colour_host = colour
+        self.colour_sizes = np.bincount(colour)
 
     def _fill_joints(self) -> None:
         m = self.model
@@ -323,6 +398,11 @@ class Constraints:
         place = m.reference + position[:, None] * origin
         anchors = [joint.anchor.entries() for joint in self.joints]
         data = joint_struct()()
+        side = np.where(self.child_host, 1, 0)
+        for rows in self.rows_of:
+            own = slice(self.start_host[3 * rows[0]], self.start_host[3 * rows[-1] + 3])
+            if not self.child_host[own].any():  # the child is in space: it feels what the parent does, reversed
+                side[own] = -1
         tables: dict[str, tuple[Any, Any]] = {
             "first": ([rows[0] for rows in self.rows_of], wp.int32),
             "last": ([rows[-1] + 1 for rows in self.rows_of], wp.int32),
@@ -330,7 +410,7 @@ class Constraints:
             "anchor_start": (np.concatenate([[0], np.cumsum([len(a[0]) for a in anchors])]), wp.int32),
             "anchor_slot": (np.concatenate([a[0] for a in anchors] + [np.zeros(1)]), wp.int32),
             "anchor_weight": (np.concatenate([a[1] for a in anchors] + [np.zeros(1)]), wp.float64),
-            "role": (np.where(self.child_host, 1 + position[self.slot_host], 0), wp.int32),
+            "role": (side * (1 + position[self.slot_host]), wp.int32),
             "place": (place[self.slot_host], wp.vec3d),
         }
         for name, (values, dtype) in tables.items():

@@ -169,9 +169,10 @@ def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
     label = f"surface {surface.name!r} of body {body.name!r}" if surface.name else f"a surface of body {body.name!r}"
     t = assembly.facet_tables(surface)
     x = body.reference[t.conn] + (body.slot_kind[t.conn] == 0)[:, :, None] * body.origin
-    dA = np.linalg.norm(
-        np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x)), axis=2
-    ) * t.weights
+    dA = (
+        np.linalg.norm(np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x)), axis=2)
+        * t.weights
+    )
     share = (dA / dA.sum()).ravel()
     X = np.einsum("fqi,fik->fqk", t.shape, x).reshape(-1, 3)
     mean, at_points, span = _fit(share, X)

@@ -11,7 +11,7 @@ from .bodies import Body, MaterialPoint
 from .errors import ModelError
 from .surfaces import element_functions
 
-__all__ = ["locate"]
+__all__ = ["element_boxes", "locate"]
 
 
 def locate(body: Body, X: Any) -> MaterialPoint:
@@ -40,7 +40,9 @@ def locate(body: Body, X: Any) -> MaterialPoint:
             residual = np.einsum("es,esk->ek", s, E) - x
             J = np.einsum("esk,esl->ekl", E, ds)
             step = np.linalg.solve(J, residual[:, :, None])[:, :, 0]
-            xi = np.clip(xi - step, -2.0, 3.0)
+            last, xi = xi, np.clip(xi - step, -2.0, 3.0)
+            if np.abs(xi - last).max() < 1e-14:
+                break
         s, _ = _own_point(body, near, xi)
         miss = np.linalg.norm(np.einsum("es,esk->ek", s, E) - x, axis=1) / size
         outside = parent.outside(xi) + miss
@@ -75,11 +77,16 @@ def _own_point(body: Body, elements: np.ndarray, xi: np.ndarray) -> tuple[np.nda
 
 def _near(body: Body, x: np.ndarray) -> tuple[np.ndarray, float]:
     """Elements whose drawn box, grown by a tenth, holds x; and the size of the largest (m)."""
+    low, high, size = body.element_boxes
+    return np.flatnonzero(np.all((low - 0.1 * size <= x) & (high + 0.1 * size >= x), axis=1)), size
+
+
+def element_boxes(body: Body) -> tuple[np.ndarray, np.ndarray, float]:
+    """Corners (E, 3) of the boxes of the elements in the reference, and the longest side of any, m."""
     E = body.reference[body.connectivity] + (body.slot_kind[body.connectivity] == 0)[:, :, None] * body.origin
     coords = E
     if body.family.has_gradients:
         s, _ = element_functions(body, np.arange(len(E)), body.family.lattice.points)
         coords = np.einsum("eps,esk->epk", s, E, optimize=True)
     low, high = coords.min(axis=1), coords.max(axis=1)
-    size = float(np.max(high - low))
-    return np.flatnonzero(np.all((low - 0.1 * size <= x) & (high + 0.1 * size >= x), axis=1)), size
+    return low, high, float(np.max(high - low))

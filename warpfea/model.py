@@ -419,8 +419,7 @@ class Model:
                 for j in (self.constraints.joints if self.constraints else ())
             ],
             "features": [k for k, on in features.items() if on],
-            "left_out": [k for k, on in features.items() if not on]
-            + ["contact", "friction", "per-world parameters"],
+            "left_out": [k for k, on in features.items() if not on] + ["contact", "friction", "per-world parameters"],
             "blocks": [
                 {
                     "element": b.key.family,

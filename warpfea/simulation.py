@@ -525,8 +525,9 @@ class Simulation(Results):
             if other is joint:
                 return k
         names = [j.name for j in known]
-        raise ModelError(f"expected a joint of this model (from add_joint, add_constraint, weld), got {joint!r}; it has "
-                         f"{names}")
+        raise ModelError(
+            f"expected a joint of this model (from add_joint, add_constraint, weld), got {joint!r}; it has {names}"
+        )
 
     def contact_report(self, *pair: Any) -> Any:
         """Contact is not part of this version."""

@@ -17,6 +17,9 @@ from .surfaces import named_faces
 
 __all__ = ["make_weld"]
 
+PER_ELEMENT = 2.0
+MOST_PARTS = 8
+
 
 def make_weld(first: NodeSet | SurfaceSet, second: SurfaceSet | Body, name: str) -> Joint:
     """Compose a weld; see ModelBuilder.weld."""
@@ -49,7 +52,7 @@ def _face(nodes: NodeSet) -> SurfaceSet | None:
 def _mortar(face: SurfaceSet, holder: Body, what: str) -> tuple[list[Vector], Vector]:
     """One vector per slot i of the face: int phi_i (x - x_holder) dA / int |phi_i| dA."""
     body = face.body
-    t = assembly.facet_tables(face)
+    t = assembly.facet_tables(face, _parts(face, holder))
     x = body.reference[t.conn] + (body.slot_kind[t.conn] == 0)[:, :, None] * body.origin
     normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
     dA = np.linalg.norm(normal, axis=2) * t.weights
@@ -70,6 +73,16 @@ def _mortar(face: SurfaceSet, holder: Body, what: str) -> tuple[list[Vector], Ve
             gaps.append(_gap(body, holder, test @ own / size, test @ other / size))
     mean = share / share.sum()
     return gaps, _anchor(body, mean @ own, mean @ X.reshape(-1, 3))
+
+
+def _parts(face: SurfaceSet, holder: Body) -> int:
+    """Parts to split a face in, so that the kinks of the holder's functions between its elements are seen."""
+    t = assembly.facet_tables(face)
+    x = face.body.reference[t.conn]
+    normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
+    area = float((np.linalg.norm(normal, axis=2) @ t.weights).max())
+    size = np.cbrt(float(np.median(assembly.element_volumes(holder))))
+    return int(np.clip(np.ceil(PER_ELEMENT * np.sqrt(area) / size), 1, MOST_PARTS))
 
 
 def _pins(nodes: NodeSet, holder: Body, what: str) -> tuple[list[Vector], Vector]:

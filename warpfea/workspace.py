@@ -77,7 +77,9 @@ class Workspace:
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
         self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
         joints = len(model.constraints.joints) if model.constraints else 0
-        self.report = self.array("report", (B, len(REPORT) + 6 * len(model.probes) + JOINT_COLUMNS * joints), wp.float64)
+        self.report = self.array(
+            "report", (B, len(REPORT) + 6 * len(model.probes) + JOINT_COLUMNS * joints), wp.float64
+        )
         self.any_flag = self.array("any_flag", (4,), wp.int32)
         C = model.component_count
         sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)

@@ -8,7 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import roots_jacobi
 
-__all__ = ["TET_RULES", "Rule", "box_rule", "conical_tet", "conical_triangle", "square_rule", "tet_rule", "triangle_6"]
+__all__ = [
+    "TET_RULES",
+    "Rule",
+    "box_rule",
+    "composite",
+    "conical_tet",
+    "conical_triangle",
+    "square_rule",
+    "tet_rule",
+    "triangle_6",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,3 +158,15 @@ def box_rule(counts: tuple[int, int, int], ranges: Ranges) -> Rule:
 def square_rule(n: int) -> Rule:
     """Product Gauss rule of n^2 points on the unit square."""
     return _product(f"square{n}", (n, n), ((0.0, 1.0), (0.0, 1.0)))
+
+
+def composite(rule: Rule, parts: int) -> Rule:
+    """A rule on the unit square or triangle repeated on `parts` x `parts` equal parts of it, for integrands with kinks."""
+    if parts == 1:
+        return rule
+    cells = [(np.array([i, j]), 1.0) for i in range(parts) for j in range(parts)]
+    if rule.weights.sum() < 0.75:  # the triangle: upright parts, and turned ones between them
+        cells = [(np.array([i, j]), 1.0) for i in range(parts) for j in range(parts - i)]
+        cells += [(np.array([i + 1, j + 1]), -1.0) for i in range(parts - 1) for j in range(parts - 1 - i)]
+    points = np.concatenate([(corner + sign * rule.points) / parts for corner, sign in cells])
+    return Rule(f"{rule.name}/{parts}", points, np.tile(rule.weights, len(cells)) / parts**2, rule.degree)

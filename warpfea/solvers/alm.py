@@ -41,6 +41,7 @@ def allocate(model: Model, work: Workspace) -> Any:
         "violation": ((B, model.component_count), wp.float64),
         "block": ((B, max(con.block_count, 1)), wp.mat33d),
         "matrix": ((B, con.matrix_entries), wp.float64),
+        "coupling": ((B, max(con.couple_count, 1)), wp.float64),
     }
     for name, var in multiplier_struct().vars.items():
         if isinstance(var.type, wp.array):
@@ -89,6 +90,7 @@ class ConstraintSolver:
         data, mul = self.constraints.data, w.multipliers
         launch(k.pair_blocks, (m.worlds, self.constraints.block_count), [data, w.inverse, active, mul])
         launch(k.assemble_matrix, self.dim, [data, active, mul])
+        launch(k.assemble_coupling, (m.worlds, self.constraints.couple_count), [data, active, mul])
         if penalty:
             launch(k.penalty, self.dim, [data, w.step.dq_dv, active, mul])
         if not self.deflate:
@@ -111,7 +113,15 @@ class ConstraintSolver:
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         data, mul = self.constraints.data, w.multipliers
         launch(k.restrict, self.dim, [data, mul, z, active])
-        launch(k.solve_clusters, self.dim, [data, mul, active])
+        sizes = self.constraints.colour_sizes
+        if len(sizes) == 1:
+            launch(k.solve_clusters, self.dim, [data, mul, active])
+        else:
+            first = np.concatenate([[0], np.cumsum(sizes)])
+            for c in range(len(sizes)):
+                launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 1, active])
+            for c in range(len(sizes) - 2, -1, -1):
+                launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
         launch(k.project, (m.worlds, m.slots), [data, mul, w.inverse, r, active, z, w.rows])
 
     def predict(self, active: wp.array) -> None:
