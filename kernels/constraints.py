@@ -1,4 +1,4 @@
-"""Holonomic constraints by augmented Lagrangian: rows c(q, t) = 0 m, their Jacobian and curvature, and multipliers in N.
+"""Holonomic constraints by augmented Lagrangian: rows c(q, t) = 0 m, their derivatives, and multipliers in N.
 
 Every constraint is made of vectors a = sum_k w_k e_k, linear in the slots (a difference of two points, a material
 direction, a constant), three at most per row:
@@ -132,7 +132,7 @@ def joint_struct():
 def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels of the constraints for one precision of the slots."""
     p = precision(dtype)
-    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    vec3, mat33 = p.vec3, p.mat33
     f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers, Joints = constraint_struct(), multiplier_struct(), joint_struct()
     module = kernel_module(f"constraints_{dtype}")
@@ -494,7 +494,7 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """One pivot of Gauss-Jordan in every large cluster, a thread per row; the pivot's row is left to `scale_row`."""
+        """One pivot of Gauss-Jordan in every large cluster, a thread per row; the pivot's is left to `scale_row`."""
         world, k, i = wp.tid()
         cluster = large[k]
         n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
@@ -561,8 +561,8 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """One colour of a symmetric block Gauss-Seidel sweep over coupled clusters.
 
-        It stands for (G + L) G^-1 (G + L^T) >= J D^-1 J^T + 1/((dq/dv) rho), G the clusters' own matrices: with more than
-        the right matrix the preconditioner stays positive definite.
+        It stands for (G + L) G^-1 (G + L^T) >= J D^-1 J^T + 1/((dq/dv) rho), G the clusters' own matrices: with more
+        than the right matrix the preconditioner stays positive definite.
         """
         world, k = wp.tid()
         if active[world] == 0:

@@ -96,6 +96,40 @@ def solid(element):
     return b, body
 
 
+def mechanism():
+    """A driven beam, a T10 block welded to its end, a plate on a hinge, a rod to the ground: all kinds of rows."""
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=1e7, nu=0.3, density=1000.0)
+    arm = b.add_beam(
+        [(0, 0, 0), (0.5, 0, 0)], elements=2, section=wf.Rectangle(0.05, 0.05), normal=(0, 0, 1), material=law
+    )
+    block = b.add_solid(
+        wf.mesh.box((0.1, 0.1, 0.1), cells=(2, 1, 1)), transform=(np.eye(3), (0.5, -0.05, -0.05)), material=law
+    )
+    grid = wf.mesh.grid((0.4, 0.1), cells=(2, 1))
+    plate = b.add_shell(grid, thickness=0.02, material=law, transform=(np.eye(3), (0.6, -0.05, 0)))
+    b.add_joint("revolute", parent=wf.GROUND, child=arm.start, axis=(0, 1, 0), drive=([0, 1], [0, 3.0]))
+    b.weld(arm.end, block)
+    b.add_joint("revolute", parent=block.surface("x+"), child=plate.edge("x-"), anchor=(0.6, 0, 0), axis=(0, 1, 0))
+    b.add_joint("distance", parent=wf.GROUND, child=plate.at((1.0, 0, 0)), anchor=(1.0, 0, 0.5))
+    b.add_probe("tip", plate.edge("x+"))
+    return b, plate
+
+
+def chain():
+    """Links of one T10 cell on revolute joints: more coupled rows than one inverse takes, swept by colour."""
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=1e7, nu=0.3, density=1000.0)
+    end = wf.GROUND
+    for k in range(16):
+        mesh = wf.mesh.box((0.1, 0.05, 0.05), cells=(1, 1, 1))
+        link = b.add_solid(mesh, transform=(np.eye(3), (0.1 * k, 0, 0)), material=law)
+        b.add_joint("revolute", parent=end, child=link.surface("x-"), axis=(0, 1, 0))
+        end = link.surface("x+")
+    b.add_probe("tip", end)
+    return b, link
+
+
 ANCF = {
     "3243 tied": lambda: beam("tied"),
     "3243 split": lambda: beam("split"),
@@ -113,6 +147,8 @@ CASES = {
     "S3 neo-hookean": lambda: cantilever(wf.NeoHookean(mu=3e5, k=1e6, density=1000.0)),
     "curved rod, all loads": loaded,
     **ANCF,
+    "mechanism": mechanism,
+    "T10 chain": chain,
 }
 
 

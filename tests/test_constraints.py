@@ -122,7 +122,7 @@ EXTRA = {
 
 @pytest.mark.parametrize("case", [*CASES, *EXTRA], ids=str)
 def test_jacobian_and_curvature_match_differences(case):
-    kind, pair, drive = EXTRA[case] if case in EXTRA else (*case, None)
+    kind, pair, drive = EXTRA.get(case) or (*case, None)
     model, _ = joined(kind, pair, drive)
     rng = np.random.default_rng(3)
     u = random_pose(model, rng)

@@ -30,6 +30,8 @@ def cost(feature=None, **simulation):
         b.drive(body.nodes("x+"), displacement=(0, 0, 0))
     if feature == "rotation":
         b.drive(body.nodes("x+"), rotation=wf.Rotation((0, 0, 0), (1, 0, 0), 0.0))
+    if feature == "joint":
+        b.add_joint("distance", parent=wf.GROUND, child=body.at((1, 0.1, 0.1)), anchor=(1, 0.1, 2))
     if feature == "probe":
         b.add_probe("p", body.surface("x+"))
     if feature == "second body":
@@ -47,7 +49,7 @@ def cost(feature=None, **simulation):
 
 
 FEATURES = ["gravity", "incremental", "explicit", "rate", "free group", "traction", "pressure", "field", "drive"]
-FEATURES += ["rotation", "probe", "second body", "second law"]
+FEATURES += ["joint", "rotation", "probe", "second body", "second law"]
 
 
 @pytest.mark.parametrize("feature", FEATURES)
@@ -80,7 +82,8 @@ def test_bare_step_uses_few_modules():
     _, kernels, modules, _, model = cost(ledger=False)
     assert len(modules) <= 9
     assert not any("follower" in k or "drive" in k or "evaluate_laws" in k or "dead_load" in k for k in kernels)
-    assert {"gravity", "body forces", "follower pressure", "driven nodes"} <= set(model.info()["left_out"])
+    assert not any("constraint" in name for name in modules)
+    assert {"constraints", "gravity", "body forces", "follower pressure", "driven nodes"} <= set(model.info()["left_out"])
 
 
 def test_table_path_only_where_elements_are_curved():

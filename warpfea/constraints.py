@@ -151,6 +151,10 @@ class Constraints:
         self.model = model
         self.joints = list(joints)
         self.kernels = constraint_kernels(model.dtype)
+        self.data: Any = None
+        self.joint_data: Any = None
+        self.cluster_sizes = self.colour_sizes = np.zeros(0, dtype=np.int64)
+        self.colour_host = self.cluster_host = np.zeros(0, dtype=np.int64)
         self.rows = [row for joint in self.joints for row in joint.rows]
         self.count = len(self.rows)
 
@@ -180,7 +184,6 @@ class Constraints:
 
     def build(self, component: np.ndarray, add_law: Any) -> None:
         """Upload; `component` of each slot, `add_law` numbers a time law."""
-        m = self.model
         self._order(component)
         self._fill_terms(add_law)
         self._fill_pairs()
@@ -189,7 +192,7 @@ class Constraints:
     def _order(self, component: np.ndarray) -> None:
         """Sort the joints by component and cluster."""
         groups = self.slot_groups()
-        free = self.model.free_host.any(axis=1)
+        free = np.any(self.model.free_host > 0.0, axis=1)
         joint_of = np.concatenate([np.full(len(g), k) for k, g in enumerate(groups)])
         slot = np.concatenate(groups)
         keep = free[slot]
@@ -258,7 +261,7 @@ class Constraints:
         self._entries = entries
 
     def _fill_pairs(self) -> None:
-        """For every pair of rows that share slots the pairs of vectors that do: dense within clusters, else couplings."""
+        """For each pair of rows that share slots the pairs of vectors that do: dense in clusters, else couplings."""
         first = self._cluster_rows()
         shared = self._shared_vectors()
         n = np.diff(first)
@@ -322,7 +325,7 @@ class Constraints:
 
         Blocks sum w w' D^-1 over the slots; rows share vectors (a pin's three rows are of one), so blocks are few.
         """
-        free = self.model.free_host.any(axis=1)
+        free = np.any(self.model.free_host > 0.0, axis=1)
         number: dict[int, int] = {}
         weights: list[dict[int, float]] = []
         rows_of_vector: list[list[tuple[int, int]]] = []

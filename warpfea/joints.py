@@ -88,8 +88,8 @@ class Attachment:
         lost = np.linalg.norm(n - self.known @ n)
         if lost > 1e-6:
             raise ModelError(
-                f"{what}: {self.label} does not tell how the direction {np.round(n, 6).tolist()} turns; give a surface, "
-                "a material point, or more nodes that span it"
+                f"{what}: {self.label} does not tell how the direction {np.round(n, 6).tolist()} turns; give a "
+                "surface, a material point, or more nodes that span it"
             )
 
     def weakness(self, n: np.ndarray) -> float:
@@ -99,21 +99,24 @@ class Attachment:
 
 def attach(thing: Any, what: str, *, child: bool) -> Attachment:
     """The attachment of a handle, or of a fixed place (3,). ModelError for anything else."""
-    I, O = np.eye(3), np.zeros((3, 3))
+    all_known, none_weak = np.eye(3), np.zeros((3, 3))
     if isinstance(thing, Ground):
-        return Attachment(None, np.full(3, np.nan), *_none(), I, O, "the ground", child)
+        return Attachment(None, np.full(3, np.nan), *_none(), all_known, none_weak, "the ground", child)
     if isinstance(thing, MaterialPoint):
         label = f"the point {np.round(thing.X, 6).tolist()} of body {thing.body.name!r}"
         weak = _weak(thing.body, thing.axes)
-        return Attachment(thing.body, thing.X, thing.slots, thing.weights, thing.gradients, I, weak, label, child)
+        return Attachment(
+            thing.body, thing.X, thing.slots, thing.weights, thing.gradients, all_known, weak, label, child
+        )
     if isinstance(thing, NodeSet):
         return _of_nodes(thing, child)
     if isinstance(thing, SurfaceSet):
         return _of_surface(thing, child)
     if isinstance(thing, (tuple, list, np.ndarray)):
-        return Attachment(None, vector(thing, what), *_none(), I, O, "a fixed point", child)
+        return Attachment(None, vector(thing, what), *_none(), all_known, none_weak, "a fixed point", child)
     raise ModelError(
-        f"{what}: expected wf.GROUND, body.at(X), body.nodes(...), body.surface(...), beam.start or beam.end, got {thing!r}"
+        f"{what}: expected wf.GROUND, body.at(X), body.nodes(...), body.surface(...), beam.start or beam.end, got "
+        f"{thing!r}"
     )
 
 
@@ -256,8 +259,8 @@ def make_joint(
         else:
             angle = _angle(n, u, w, P, Q, what)
     if law is not None and angle is not None:
-        a, a2, b = angle
-        rows.append(Row(TURN, a, b, 1.0, a2, law, angular=True))
+        first, second, turned = angle
+        rows.append(Row(TURN, first, turned, 1.0, second, law, angular=True))
     elif law is not None and travel is not None:
         rows.append(Row(DOT, *travel, law=law))
     return Joint(name, kind, rows, x_c, _between(P, Q), angle, travel)
@@ -282,7 +285,11 @@ def _right_side(law: TimeLaw | None, component: int = 0) -> dict[str, Any]:
 
 def _dp(a: Vector, b: Vector) -> Row:
     """Perpendicular directions; the cosine times the model's size is the violation."""
-    return Row(DOT, a, b, 1.0 / (np.linalg.norm(a.value) * np.linalg.norm(b.value)), angular=True)
+    return Row(DOT, a, b, _scale(a, b), angular=True)
+
+
+def _scale(a: Vector, b: Vector) -> float:
+    return 1.0 / float(np.linalg.norm(a.value) * np.linalg.norm(b.value))
 
 
 def _locked(P: Attachment, Q: Attachment, what: str) -> list[Row]:
@@ -439,5 +446,4 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
     for label, v in (("P and Q", a), ("R and T", b)):
         if np.linalg.norm(v.value) <= 1e-9 * max(float(np.abs(p.X).max()) for p in places):
             raise ModelError(f"{what}: its points {label} coincide, so that it has no direction")
-    scale = 1.0 / (np.linalg.norm(a.value) * np.linalg.norm(b.value))
-    return Joint(name, kind, [Row(DOT, a, b, scale, angular=True, **_right_side(law))], x[3], between)
+    return Joint(name, kind, [Row(DOT, a, b, _scale(a, b), angular=True, **_right_side(law))], x[3], between)

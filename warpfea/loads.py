@@ -86,7 +86,7 @@ class Loads:
         self._build_drives()
         self._pushed: list[np.ndarray] = []
         self._offset = 0
-        self.followers = [self._build_pressure(p) for p in model.description.pressures]
+        self.followers: list[FollowerPart] = [self._build_pressure(p) for p in model.description.pressures]
         self.followers += [self._build_moment(p) for p in model.description.moments]
         self.fields = [p for f in model.description.body_forces for p in self._build_field(f)]
         self._build_pushed()

@@ -334,11 +334,11 @@ class Model:
         for label in range(self.component_count):
             slots = np.flatnonzero(self.component == label)
             parts = np.unique(self.part[slots])
-            modes = np.zeros((len(parts), 6, self.slots, 3))
+            motions = np.zeros((len(parts), 6, self.slots, 3))
             for k, part in enumerate(parts):
                 own = np.flatnonzero(self.part == part)
-                modes[k][:, own] = assembly.rigid_modes(self.reference[own], self.slot_kind[own])
-            modes = modes.reshape(6 * len(parts), -1)
+                motions[k][:, own] = assembly.rigid_modes(self.reference[own], self.slot_kind[own])
+            modes = motions.reshape(6 * len(parts), -1)
             modes /= np.linalg.norm(modes, axis=1)[:, None]
             held = modes[:, (self.free_host == 0.0).ravel()]
             if ties is not None:
@@ -489,7 +489,7 @@ class Model:
         return self.evaluation.constraint_jacobian(state, world)
 
     def constraint_curvature(self, state: State, multipliers: Any, direction: Any) -> np.ndarray:
-        """Product of sum multipliers_i d2c_i/dq2 with a direction (slots, 3), [world, slot, 3]; multipliers (rows,), N."""
+        """sum multipliers_i d2c_i/dq2 times a direction (slots, 3), [world, slot, 3]; multipliers (rows,), N."""
         return self.evaluation.constraint_curvature(state, np.asarray(multipliers), np.asarray(direction))
 
     def set_gravity(self, gravity: Any) -> None:

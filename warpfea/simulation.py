@@ -459,8 +459,9 @@ class Simulation(Results):
         """Energy ledger, each (B,), J.
 
         kinetic, strain and potential (of gravity, from the reference) are current values. work (by loads, supports,
-        fields and driven joints, also given apart), viscous, contact, friction and integrator add up from the start; ledger_residual is
-        change of energy + losses - work, which equals `unbalanced`, the sum of g . dq that the solver's tolerance left.
+        fields and driven joints, also given apart), viscous, contact, friction and integrator add up from the start;
+        ledger_residual is change of energy + losses - work, which equals `unbalanced`, the sum of g . dq that the
+        solver's tolerance left.
         """
         if not self.stepper.ledger:
             raise ModelError("energies: the simulation was made with ledger=False")
@@ -505,15 +506,17 @@ class Simulation(Results):
         return out
 
     def violation(self, joint: Joint) -> np.ndarray:
-        """Largest violation of a joint's constraints in the present state, (B,), m; angles count times the model's size."""
+        """Largest violation of a joint's rows in the present state, (B,), m; angles count times the model's size."""
         k = self._joint(joint)
         constraints = self.model.constraints
         assert constraints is not None
         return np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
 
     def joint_value(self, joint: Joint) -> np.ndarray:
-        """Angle (rad) of a revolute, cylindrical or driven joint, travel (m) of a translational, length (m) of a distance
-        joint, (B,); of a driven angle with its full turns, else between -pi and pi."""
+        """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
+
+        (B,), in the present state; a driven angle counts its full turns, another lies between -pi and pi.
+        """
         self._joint(joint)
         constraints = self.model.constraints
         assert constraints is not None

@@ -84,7 +84,7 @@ class Workspace:
         C = model.component_count
         sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
         self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
-        self.multipliers = allocate(model, self)
+        self.multipliers: Any = allocate(model, self)
         self.constraint_work = self.array("constraint_work", (2, B) if model.constraints else (1, 1), wp.float64)
         optional = () if model.constraints else ("constraint_sums", "stepped", "outer")
         self.newton = self._struct(

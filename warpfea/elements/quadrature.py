@@ -161,7 +161,7 @@ def square_rule(n: int) -> Rule:
 
 
 def composite(rule: Rule, parts: int) -> Rule:
-    """A rule on the unit square or triangle repeated on `parts` x `parts` equal parts of it, for integrands with kinks."""
+    """A rule on the unit square or triangle repeated on parts x parts equal parts of it, for integrands with kinks."""
     if parts == 1:
         return rule
     cells = [(np.array([i, j]), 1.0) for i in range(parts) for j in range(parts)]

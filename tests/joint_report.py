@@ -1,0 +1,217 @@
+"""Cost and stability of constraints: `python tests/joint_report.py --out tests/results/joints_cpu.json`.
+
+cost        a chain of m links and m revolute joints that hangs and swings to the side, m = 10, 100, 1000: ms per step
+            and iterations, for the default ("newton" multipliers, constraint directions deflated) and for the classical
+            augmented Lagrangian on block Jacobi ("before").
+stability   mass ratios to 1e4, E from 1e4 to 1e12 Pa, steps from 1e-5 to 1e-2 s; a door on four hinges; a parallelogram
+            linkage driven through its dead points. A case passes when every step is accepted and the violation stays
+            within 1e-8 of the model's size, or when a named error of warpfea ends it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import shlex
+import statistics
+import sys
+import time as clock
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warpfea as wf
+from warpfea.bench import _commit, _versions, machine
+
+wp.config.log_level = 30
+
+METHODS = {
+    "default": {},
+    "outer, deflated": {"multipliers": "outer"},
+    "before: outer, block Jacobi": {"multipliers": "outer", "preconditioner": "block-jacobi"},
+}
+RATIOS = (1.0, 1e2, 1e4)
+MODULI = (1e4, 1e6, 1e8, 1e10, 1e12)
+STEPS = (1e-5, 1e-4, 1e-3, 1e-2)
+
+
+def chain(links: int, *, E: float = 7e8, ratio: float = 1.0, length: float = 0.5, side: float = 0.05) -> Any:
+    """Links of one 3243 element on revolute joints, the last `ratio` times as dense; they hang and swing sideways."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    end: Any = wf.GROUND
+    rate = 5.0 / (links * length)  # rad/s: the end moves at 5 m/s
+    for k in range(links):
+        law = wf.SVK(E=E, nu=0.33, density=2700.0 * (ratio if k == links - 1 else 1.0))
+        link = b.add_beam(
+            [(0, 0, -k * length), (0, 0, -(k + 1) * length)],
+            elements=1,
+            section=wf.Rectangle(side, side),
+            normal=(1, 0, 0),
+            material=law,
+        )
+        b.add_joint("revolute", parent=end, child=link.start, anchor=(0, 0, -k * length), axis=(0, 1, 0))
+        b.set_initial(link, velocity=lambda X: np.cross((0, rate, 0), X))
+        end = link.end
+    b.add_probe("tip", end)
+    return b
+
+
+def door(E: float) -> wf.ModelBuilder:
+    """A door of T10 on four hinges with the ground, swinging; 15 of their 20 rows are redundant for a rigid door."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    mesh = wf.mesh.box((0.8, 0.04, 2.0), cells=(2, 1, 4))
+    body = b.add_solid(mesh, material=wf.SVK(E=E, nu=0.3, density=600.0), name="door")
+    for z in (0.25, 0.75, 1.25, 1.75):
+        near = body.nodes(lambda X, z=z: (X[:, 0] < 0.41) & (np.abs(X[:, 2] - z) < 0.26))
+        b.add_joint("revolute", parent=wf.GROUND, child=near, anchor=(0, 0.02, z), axis=(0, 0, 1))
+    b.set_initial(body, velocity=lambda X: np.cross((0, 0, 1.0), X - np.array([0, 0.02, 0])))
+    return b
+
+
+def parallelogram(E: float, turns: float = 0.625, seconds: float = 0.05) -> wf.ModelBuilder:
+    """A four-bar with equal cranks, driven through the pose with all bars in line, where the Jacobian loses rank."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    law = wf.SVK(E=E, nu=0.3, density=2700.0)
+
+    def bar(start: Any, end: Any) -> Any:
+        return b.add_beam([start, end], elements=1, section=wf.Rectangle(0.02, 0.02), normal=(0, 1, 0), material=law)
+
+    crank, coupler = bar((0, 0, 0), (0, 0, 0.2)), bar((0, 0, 0.2), (0.5, 0, 0.2))
+    rocker = bar((0.5, 0, 0), (0.5, 0, 0.2))
+    y = (0, 1, 0)
+    times = np.linspace(0.0, seconds, 401)
+    s = times / seconds
+    angle = 2.0 * np.pi * turns * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    b.add_joint("revolute", parent=wf.GROUND, child=crank.start, axis=y, drive=(times, angle), name="motor")
+    b.add_joint("revolute", parent=crank.end, child=coupler.start, axis=y)
+    b.add_joint("revolute", parent=coupler.end, child=rocker.end, axis=y)
+    b.add_joint("revolute", parent=wf.GROUND, child=rocker.start, axis=y)
+    b.add_probe("tip", rocker.end)
+    return b
+
+
+def run(
+    builder: wf.ModelBuilder,
+    *,
+    dt: float,
+    steps: int,
+    device: Any,
+    dtype: str = "float64",
+    integrator: str = "bdf2",
+    capture: bool = True,
+    **solver: Any,
+) -> dict[str, Any]:
+    """Step, and tell what it took; a named error is an outcome."""
+    model = builder.finalize(device=device, dtype=dtype)
+    row: dict[str, Any] = {"unknowns": int(model.free_slots.sum()), "rows": model.constraints.count, "dt": dt}
+    outcome, halvings, done = "converged", 0, 0
+    times = []
+    try:
+        sim = wf.Simulation(
+            model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(max_pcg=20000, **solver), capture=capture
+        )
+        for _ in range(steps):
+            began = clock.perf_counter()
+            report = sim.step()
+            times.append(clock.perf_counter() - began)
+            halvings += int(report.halvings[0])
+            done += 1
+    except wf.Error as error:
+        outcome = f"{type(error).__name__}: {str(error)[:160]}"
+    n = max(done, 1)
+    energies = sim.energies()
+    scale = max(float(np.abs(energies[k][0])) for k in ("kinetic", "strain", "potential", "work"))
+    row |= {
+        "steps": done,
+        "outcome": outcome,
+        "ms_per_step": 1e3 * statistics.median(times[min(5, len(times) - 1) :]) if times else None,
+        "newton": float(sim.totals["newton"][0]) / n,
+        "pcg": float(sim.totals["pcg"][0]) / n,
+        "halvings": halvings,
+        "violation": float(sim.max_violation) / model.size,
+        "residual": float(sim.max_residual),
+        "ledger_residual": float(energies["ledger_residual"][0]) / max(scale, 1e-300),
+    }
+    if model.probes and done:
+        row["tip"] = sim.probe("tip").position[0, -1].tolist()
+    return row
+
+
+def cost(device: Any, sizes: list[int], steps: int) -> list[dict[str, Any]]:
+    """Rows of the cost part; the tips of the methods are compared with the default's."""
+    out = []
+    for m in sizes:
+        tip = None
+        for dtype in ("float64", "float32"):
+            for name, solver in METHODS.items():
+                if dtype == "float32" and name != "default":
+                    continue
+                row = {"joints": m, "method": name, "dtype": dtype}
+                row |= run(chain(m), dt=1e-3, steps=steps, device=device, dtype=dtype, **solver)
+                if "tip" in row:
+                    tip = tip or row["tip"]
+                    row["tip_difference"] = float(np.abs(np.subtract(row.pop("tip"), tip)).max())
+                out.append(row)
+                show(row)
+    return out
+
+
+def stability(device: Any, steps: int) -> list[dict[str, Any]]:
+    """Rows of the stability part."""
+    out = []
+
+    def add(problem: str, builder: wf.ModelBuilder, dt: float, count: int, **labels: Any) -> None:
+        row = {"problem": problem, **labels} | run(builder, dt=dt, steps=count, device=device)
+        row.pop("tip", None)
+        row.pop("ms_per_step")
+        out.append(row)
+        show(row)
+
+    for ratio in RATIOS:
+        for E in MODULI:
+            for dt in STEPS:
+                add("two links", chain(2, E=E, ratio=ratio), dt, steps, E=E, ratio=ratio)
+    for dt in STEPS:
+        add("ten links", chain(10, E=1e10, ratio=1e4), dt, steps, E=1e10, ratio=1e4)
+    for E in (1e6, 1e9, 1e12):
+        for dt in STEPS:
+            add("door on four hinges", door(E), dt, steps, E=E, ratio=1.0)
+    for E in (1e8, 1e10, 1e12):
+        for count in (100, 1000):
+            add("parallelogram through its dead points", parallelogram(E), 0.05 / count, count, E=E, ratio=1.0)
+    return out
+
+
+def show(row: dict[str, Any]) -> None:
+    words = [f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()]
+    print("  ".join(words), flush=True)
+
+
+def main(arguments: list[str]) -> int:
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--out", required=True, help="result file, .json")
+    p.add_argument("--device", default=None)
+    p.add_argument("--joints", type=int, nargs="*", default=[10, 100, 1000])
+    p.add_argument("--steps", type=int, default=40, help="steps of each case")
+    p.add_argument("--only", choices=("cost", "stability"), default=None)
+    o = p.parse_args(arguments)
+    content: dict[str, Any] = {
+        "schema": 1,
+        "command": shlex.join(["python", "tests/joint_report.py", *arguments]),
+        "commit": _commit(),
+        "machine": machine(o.device),
+        "versions": _versions(),
+        "settings": {"steps": o.steps, "integrator": "bdf2", "constraint_tol": 1e-8, "cost_dt": 1e-3},
+    }
+    if o.only != "stability":
+        content["cost"] = cost(o.device, o.joints, o.steps)
+    if o.only != "cost":
+        content["stability"] = stability(o.device, o.steps)
+    pathlib.Path(o.out).write_text(json.dumps(content, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
