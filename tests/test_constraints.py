@@ -318,6 +318,19 @@ def test_a_world_keeps_its_own_multipliers():
         assert (alone[1][0] == both[1][k]).all()
 
 
+def test_a_reset_world_begins_its_drive_again():
+    model, joint = joined("revolute", ("ground", "beam"), ([0, 1], [0, 1.0]), axis=(0, 1, 0), worlds=2)
+    sim = wf.Simulation(model, dt=0.01)
+    sim.step(5)
+    first = sim.joint_record(joint).force[0].copy()
+    work = sim.energies()["work_joints"].copy()
+    sim.reset([True, False])
+    sim.step(5)
+    assert (sim.joint_record(joint).force[0, 5:] == first).all()
+    assert sim.energies()["work_joints"][0] == work[0]
+    assert np.isfinite(sim.energies()["work_joints"]).all()
+
+
 def test_multipliers_survive_a_checkpoint(tmp_path):
     model, joint = joined("revolute", ("ground", "beam"), ([0, 1], [0, 1.0]), axis=(0, 1, 0))
     sim = wf.Simulation(model, dt=0.01)

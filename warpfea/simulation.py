@@ -433,6 +433,8 @@ class Simulation(Results):
             array[mask] = fresh[name][mask] if name in fresh else np.asarray(spec.initial)
         self.state.load(values)
         self._stepped[mask] = False
+        if self.model.constraints:
+            self.stepper.begin_constraints()
         if self.stepper.ledger:
             self.stepper.begin_ledger(mask)
 

@@ -81,7 +81,7 @@ class Stepper:
         self.backup = state.like() if solver.max_halvings > 0 else None
         self._load_modules()
         if model.constraints:
-            self._start_targets()
+            self.begin_constraints()
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -102,7 +102,7 @@ class Stepper:
         self.u_before = state.previous_displacement if self.integrator.multistep else state.displacement
         self.v_before = state.previous_velocity if self.integrator.multistep else state.velocity
 
-    def _start_targets(self) -> None:
+    def begin_constraints(self) -> None:
         """Right sides at the state's time, where the state does not know them, and the violation at the start."""
         m, w, state = self.model, self.work, self.state
         constraints = self.newton.constraints
