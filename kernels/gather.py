@@ -63,6 +63,21 @@ def gather_kernels(
                 s += x * x / f64(D[k])
         return s
 
+    @wp.func
+    def constraint_forces(con: Constraints, mul: Multipliers, world: int, slot: int) -> wp.mat33d:
+        """J^T of the trial's lambda, of rho c, and of the held lambda + rho c, as rows."""
+        tie = wp.vec3d()
+        squeeze = wp.vec3d()
+        merit = wp.vec3d()
+        for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
+            term = con.slot_term[k]
+            row = term / 3
+            d = con.slot_weight[k] * mul.gradient[world, term]
+            tie += mul.trial[world, row] * d
+            squeeze += mul.excess[world, row] * d
+            merit += mul.merit[world, row] * d
+        return wp.matrix_from_rows(tie, squeeze, merit)
+
     @wp.kernel(module=module)
     def gather_force(
         topo: Topology,
@@ -130,24 +145,12 @@ def gather_kernels(
         residual_force = a + f - load
         descent = a + f - held
         if wp.static(constrained):
-            if con.slot_start[slot + 1] > con.slot_start[slot]:
-                tie = wp.vec3d()
-                squeeze = wp.vec3d()
-                merit = wp.vec3d()
-                for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
-                    term = con.slot_term[k]
-                    row = term / 3
-                    d = con.slot_weight[k] * mul.gradient[world, term]
-                    tie += mul.trial[world, row] * d
-                    squeeze += mul.excess[world, row] * d
-                    merit += mul.merit[world, row] * d
-                residual_force += vec3(tie)
-                gradient[world, slot] = residual_force + vec3(squeeze)
-                descent += vec3(merit)
-                for k in range(3):
-                    magnitude[k] = magnitude[k] + T(wp.abs(tie[k]))
-            else:
-                gradient[world, slot] = residual_force
+            tie = constraint_forces(con, mul, world, slot)
+            residual_force += vec3(tie[0])
+            gradient[world, slot] = residual_force + vec3(tie[1])
+            descent += vec3(tie[2])
+            for k in range(3):
+                magnitude[k] = magnitude[k] + T(wp.abs(tie[0][k]))
         inertia[world, slot] = a
         internal[world, slot] = f
         g[world, slot] = residual_force

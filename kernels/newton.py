@@ -93,6 +93,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
+    # constraints are stiff: a loose first solve costs more iterations than it saves
+    FIRST_FORCING = wp.constant(0.01 if constrained else 0.1)
     module = kernel_module(f"newton_{dtype}{'_constrained' if constrained else ''}")
 
     @wp.func
@@ -213,8 +215,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         phi = objective(ctl, world) + ctl.slot_sums[7, world]
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = magnitude(ctl, world)
-        # constraints are stiff: a loose first solve costs more iterations than it saves
-        ctl.forcing[world] = f64(wp.static(1.0e-2 if constrained else 0.1))
+        ctl.forcing[world] = f64(FIRST_FORCING)
         if ctl.domain_J[world] <= f64(0.0):
             fail(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):

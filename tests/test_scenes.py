@@ -14,7 +14,21 @@ import warpfea as wf
 from warpfea.scene import Scene, find, load_file, names
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-BUILTIN = ["cantilever", "hook", "mixed", "pendulum", "plate_pendulum", "rollup", "spin", "twist"]
+BUILTIN = [
+    "cantilever",
+    "chain",
+    "double_pendulum",
+    "four_bar",
+    "hook",
+    "hung_plate",
+    "mixed",
+    "pendulum",
+    "plate_pendulum",
+    "rollup",
+    "slider_crank",
+    "spin",
+    "twist",
+]
 
 
 @wf.scene(dt=1e-3, t_end=0.01)
@@ -197,7 +211,7 @@ def test_the_registry_lists_without_importing():
 
 def test_names_and_find():
     assert names() == BUILTIN
-    with pytest.raises(wf.ModelError, match="no scene 'crane'; there are cantilever, hook, mixed"):
+    with pytest.raises(wf.ModelError, match="no scene 'crane'; there are cantilever, chain, double_pendulum"):
         find("crane")
 
 
@@ -207,7 +221,7 @@ def test_every_scene_is_described_and_builds(name):
     assert scene.description.endswith(".")
     assert all(p.doc and not p.required for p in scene.parameters.values())
     builder = scene()
-    assert builder.description.supports or name == "spin"  # floats
+    assert builder.description.supports or builder.description.joints or name == "spin"  # floats
     assert builder.description.probes
     assert scene.picture is None or scene.picture < scene.t_end
 

@@ -83,6 +83,7 @@ def save_checkpoint(sim: Simulation, path: str | os.PathLike[str]) -> None:
         "dt": sim.dt,
         "steps": sim.steps,
         "max_residual": sim.max_residual,
+        "max_violation": sim.max_violation,
         "probes": [probe.name for probe in sim.model.probes],
     }
     arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
@@ -128,6 +129,7 @@ def load_checkpoint(sim: Simulation, path: str | os.PathLike[str]) -> None:
     sim.totals = {name: np.array(a) for name, a in totals.items()}
     sim.steps = int(meta["steps"])
     sim.max_residual = float(meta["max_residual"])
+    sim.max_violation = float(meta.get("max_violation", 0.0))
     sim._history = list(history)
     sim.last = sim._idle_report()
 

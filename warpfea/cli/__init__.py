@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from ..errors import ConvergenceError, Error, OutputError
+from ..errors import ConstraintError, ConvergenceError, Error, OutputError
 
 __all__ = ["main"]
 
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _describe(error: Exception) -> tuple[int, str]:
     """Exit code and one line for an error."""
     text = " ".join(str(error).split())
-    if isinstance(error, ConvergenceError):
+    if isinstance(error, (ConvergenceError, ConstraintError)):
         return NOT_CONVERGED, text
     if isinstance(error, OutputError):
         return OUTPUT_FAILED, text

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
 from ..checkpoint import Checkpoint, load_checkpoint, read_meta
-from ..errors import ConvergenceError, OutputError
+from ..errors import ConstraintError, ConvergenceError, OutputError
 from ..outputs import Output, check_folder, check_target
 from ..simulation import Simulation
 from . import DONE
@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
         try:
             sim.run(t_end, outputs=outputs, progress=progress(options))
             status = "done"
-        except ConvergenceError:
+        except (ConvergenceError, ConstraintError):
             status = "not converged"
             raise
         except OutputError:

@@ -13,7 +13,7 @@ from .console import number, quiet_warp, size, table, write_json
 from .parser import UsageError
 from .run import check_targets
 from .source import find_scene, progress, resolve
-from .summary import plain
+from .summary import MANY, plain
 
 __all__ = ["info", "render", "scenes"]
 
@@ -77,14 +77,8 @@ def info(options: argparse.Namespace) -> int:
 def _info_table(content: dict[str, Any]) -> str:
     c = content
     rows = [["scene", c["scene"]], ["device", f"{c['device']}, {c['dtype']}, {c['integrator']}"]]
-    for body in c["bodies"]:
-        rows.append(
-            [
-                f"body {body['name']}",
-                f"{body['elements']} {body['element']} elements, {body['quadrature']}, {body['nodes']} nodes, "
-                + ", ".join(body["materials"]),
-            ]
-        )
+    rows += _body_rows(c["bodies"])
+    rows += _joint_rows(c["joints"])
     rows.append(["model", f"{c['unknowns']} unknowns, {number(c['mass'])} kg"])
     rows.append(["used", ", ".join(c["features"])])
     rows.append(["left out", ", ".join(c["left_out"])])
@@ -101,6 +95,34 @@ def _info_table(content: dict[str, Any]) -> str:
         of_module.setdefault(module, []).append(kernel)
     rows += [["", f"{module}: {', '.join(kernels)}"] for module, kernels in of_module.items()]
     return table(rows)
+
+
+def _body_rows(bodies: list[dict[str, Any]]) -> list[list[str]]:
+    """A row for each body; of many a row for all alike."""
+    texts = {}
+    for body in bodies:
+        rules, materials = ", ".join(body["quadrature"]), ", ".join(body["materials"])
+        what = f"{body['elements']} {body['element']} elements, {rules}, {body['nodes']} nodes, {materials}"
+        texts[body["name"]] = what
+    if len(bodies) <= MANY:
+        return [[f"body {name}", what] for name, what in texts.items()]
+    alike: dict[str, list[str]] = {}
+    for name, what in texts.items():
+        alike.setdefault(what, []).append(name)
+    return [
+        [f"body {names[0]}", what] if len(names) == 1 else [f"{len(names)} bodies", f"{what} each"]
+        for what, names in alike.items()
+    ]
+
+
+def _joint_rows(joints: list[dict[str, Any]]) -> list[list[str]]:
+    """A row for each joint; many are counted by kind."""
+    if len(joints) <= MANY:
+        return [[f"joint {j['name']}", f"{j['kind']}, {j['rows']} equations, {j['between']}"] for j in joints]
+    counts: dict[str, list[int]] = {}
+    for j in joints:
+        counts.setdefault(j["kind"], []).append(j["rows"])
+    return [["joints", ", ".join(f"{len(n)} {kind} ({sum(n)} equations)" for kind, n in counts.items())]]
 
 
 def render(options: argparse.Namespace) -> int:

@@ -37,13 +37,18 @@ KEYS = (
     "versions",
     "left_out",
 )
+MANY = 12
+"""Joints that are listed one by one."""
+WORST = 4
+"""Joints listed of more."""
 
 
 def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wall_s: float) -> dict[str, Any]:
     """The summary of a run of one world, SI units.
 
     `t_end` is the time that was reached, `wall_s` the seconds from building to the closing of files, `compile_s` those
-    of them in which the simulation was made; energies, probes and the violation of constraints are the last values.
+    of them in which the simulation was made; energies and probes are the last values, `violation` the largest of the
+    constraints in any step, m.
     """
     probes = {}
     for probe in sim.model.probes:
@@ -68,7 +73,7 @@ def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wal
         "max_residual": sim.max_residual,
         "energies": {name: float(values[0]) for name, values in sim.energies().items()},
         "probes": probes,
-        "violation": 0.0,
+        "violation": sim.max_violation,
         "versions": versions(),
         "left_out": sim.model.info()["left_out"],
     }
@@ -122,7 +127,8 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
         [
             "iterations",
             f"{s['newton_iterations'] / steps:.1f} Newton and {s['pcg_iterations'] / steps:.0f} PCG per step, "
-            f"residual up to {_text(s['max_residual'], 2)}",
+            f"residual up to {_text(s['max_residual'], 2)}"
+            + (f", violation up to {_text(s['violation'], 2)} m" if sim.model.constraints else ""),
         ],
     ]
     e = s["energies"]
@@ -133,8 +139,27 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
     for name, values in s["probes"].items():
         u = ", ".join(_text(x) for x in values["displacement"])
         rows.append([f"probe {name}", f"displaced by ({u}) m"])
+    rows += _joints(sim)
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return table(rows)
+
+
+def _joints(sim: Simulation) -> list[list[str]]:
+    """A row for each joint at the end; of many the most violated ones and a count."""
+    joints = sim.model.constraints.joints if sim.model.constraints else []
+    violation = np.array([sim.violation(joint)[0] for joint in joints])
+    shown = range(len(joints)) if len(joints) <= MANY else np.argsort(-violation, kind="stable")[:WORST]
+    rows = []
+    for k in shown:
+        text = f"{joints[k].kind}, violation {_text(violation[k], 2)} m"
+        record = sim.joint_record(joints[k])
+        if record.time.size:
+            force, moment = (float(np.linalg.norm(values[0, -1])) for values in (record.force, record.moment))
+            text += f", force {_text(force)} N, moment {_text(moment)} N m"
+        rows.append([f"joint {joints[k].name}", text])
+    if len(rows) < len(joints):
+        rows.append(["joints", f"{len(joints)} in all, of which these are violated most"])
+    return rows
 
 
 def _text(value: float | None, digits: int = 4) -> str:
