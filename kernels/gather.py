@@ -64,6 +64,15 @@ def gather_kernels(
         return s
 
     @wp.func
+    def spread(u: vec3, free: vec3, D: vec3, dq: f64) -> f64:
+        """Squared D norm of the velocity that makes all of u: times eps^2, what its rounding does to the residual."""
+        s = f64(0.0)
+        for k in range(3):
+            x = f64(u[k]) / dq
+            s += f64(free[k]) * f64(D[k]) * x * x
+        return s
+
+    @wp.func
     def constraint_forces(con: Constraints, mul: Multipliers, world: int, slot: int) -> wp.mat33d:
         """J^T of the trial's lambda, of rho c, and of the held lambda + rho c, as rows."""
         tie = wp.vec3d()
@@ -168,15 +177,10 @@ def gather_kernels(
         rows[4, world, slot] = f64(kinetic - work)
         rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
         rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), direction[world, slot]))
-        refreshed = T(0.0)
+        rows[7, world, slot] = f64(0.0)
         if wp.static(nonpotential):
-            refreshed = wp.dot(pushed_held[world, slot] - pushed[world, slot], vs)
-        rows[7, world, slot] = f64(refreshed)
-        spread = f64(0.0)
-        for k in range(3):
-            x = f64(u[world, slot][k]) / dq_dv[world]
-            spread += f64(free[k]) * f64(D[k]) * x * x
-        rows[8, world, slot] = spread
+            rows[7, world, slot] = f64(wp.dot(pushed_held[world, slot] - pushed[world, slot], vs))
+        rows[8, world, slot] = spread(u[world, slot], free, D, dq_dv[world])
 
     @wp.kernel(module=module)
     def product(
