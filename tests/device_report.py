@@ -97,7 +97,7 @@ def solid(element):
 
 
 def mechanism():
-    """A driven beam, a T10 block welded to its end, a plate on a hinge, a rod to the ground: all kinds of rows."""
+    """A driven beam, a T10 block and a plate welded on, a beam on a hinge, a rod to the ground: all kinds of rows."""
     b = wf.ModelBuilder()
     law = wf.SVK(E=1e7, nu=0.3, density=1000.0)
     arm = b.add_beam(
@@ -110,10 +110,14 @@ def mechanism():
     plate = b.add_shell(grid, thickness=0.02, material=law, transform=(np.eye(3), (0.6, -0.05, 0)))
     b.add_joint("revolute", parent=wf.GROUND, child=arm.start, axis=(0, 1, 0), drive=([0, 1], [0, 3.0]))
     b.weld(arm.end, block)
-    b.add_joint("revolute", parent=block.surface("x+"), child=plate.edge("x-"), anchor=(0.6, 0, 0), axis=(0, 1, 0))
-    b.add_joint("distance", parent=wf.GROUND, child=plate.at((1.0, 0, 0)), anchor=(1.0, 0, 0.5))
-    b.add_probe("tip", plate.edge("x+"))
-    return b, plate
+    b.weld(plate.edge("x-"), block)
+    flap = b.add_beam(
+        [(1.0, 0, 0), (1.3, 0, 0)], elements=2, section=wf.Rectangle(0.02, 0.02), normal=(0, 0, 1), material=law
+    )
+    b.add_joint("revolute", parent=plate.edge("x+"), child=flap.start, axis=(0, 1, 0))
+    b.add_joint("distance", parent=wf.GROUND, child=flap.end, anchor=(1.3, 0, 0.5))
+    b.add_probe("tip", flap.end)
+    return b, flap
 
 
 def chain():

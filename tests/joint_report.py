@@ -102,18 +102,16 @@ def run(
     device: Any,
     dtype: str = "float64",
     integrator: str = "bdf2",
-    capture: bool = True,
+    worlds: int = 1,
     **solver: Any,
 ) -> dict[str, Any]:
     """Step, and tell what it took; a named error is an outcome."""
-    model = builder.finalize(device=device, dtype=dtype)
+    model = builder.finalize(device=device, dtype=dtype, worlds=worlds)
     row: dict[str, Any] = {"unknowns": int(model.free_slots.sum()), "rows": model.constraints.count, "dt": dt}
     outcome, halvings, outer, done = "converged", 0, 0, 0
     times = []
     try:
-        sim = wf.Simulation(
-            model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(max_pcg=20000, **solver), capture=capture
-        )
+        sim = wf.Simulation(model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(max_pcg=20000, **solver))
         for _ in range(steps):
             began = clock.perf_counter()
             report = sim.step()
@@ -157,6 +155,13 @@ def cost(device: Any, sizes: list[int], steps: int) -> list[dict[str, Any]]:
                     row["tip_difference"] = float(np.abs(np.subtract(row.pop("tip"), tip)).max())
                 out.append(row)
                 show(row)
+    if wp.get_device(device).is_cuda:
+        for worlds in (100, 1000):
+            row = {"joints": min(sizes), "E": 7e8, "method": "default", "dtype": "float64", "worlds": worlds}
+            row |= run(chain(min(sizes)), dt=1e-3, steps=steps, device=device, worlds=worlds)
+            row.pop("tip")
+            out.append(row)
+            show(row)
     return out
 
 

@@ -355,7 +355,7 @@ def test_ledger_books_the_work_of_drives():
         [(0, 0, 0), (1, 0, 0)], elements=1, section=wf.Rectangle(0.05, 0.04), normal=(0, 0, 1),
         material=wf.SVK(E=1e13, nu=0.3, density=1000.0),
     )  # fmt: skip
-    b.add_joint("revolute", parent=wf.GROUND, child=rod.start, axis=(0, 1, 0), drive=wave_up)
+    motor = b.add_joint("revolute", parent=wf.GROUND, child=rod.start, axis=(0, 1, 0), drive=wave_up)
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator="bdf2", solver=wf.NewtonPCG(tol=1e-10))
     sim.step(150)
     e = {name: value[0] for name, value in sim.energies().items()}
@@ -363,6 +363,9 @@ def test_ledger_books_the_work_of_drives():
     assert e["kinetic"] == pytest.approx(0.5 * mass / 3 * rate**2, rel=0.01)
     assert e["work_joints"] == pytest.approx(e["kinetic"] + e["strain"] + e["integrator"], rel=1e-6)
     assert abs(e["ledger_residual"]) < 1e-8 * e["work_joints"]
+    record = sim.joint_record(motor)
+    angle = 0.5 * (1.0 - np.cos(2.0 * np.append(0.0, record.time)))
+    assert record.moment[0, :, 1] @ np.diff(angle) == pytest.approx(e["work_joints"], rel=1e-6)
 
 
 @wp.func

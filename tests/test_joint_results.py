@@ -24,7 +24,8 @@ def test_cost_of_joints_is_told(result):
     rows = result["cost"]
     methods = ("default", "block Jacobi", "outer, deflated", "before: outer, block Jacobi")
     for m in (10, 100, 1000):
-        own = {r["method"]: r for r in rows if r["joints"] == m and r["E"] == 7e8 and r["dtype"] == "float64"}
+        single = [r for r in rows if "worlds" not in r and r["joints"] == m and r["E"] == 7e8]
+        own = {r["method"]: r for r in single if r["dtype"] == "float64"}
         assert set(own) == set(methods)
         for row in own.values():
             assert row["outcome"] == "converged"
@@ -33,7 +34,7 @@ def test_cost_of_joints_is_told(result):
             assert row["tip_difference"] < 1e-7 * 0.5 * m
         assert own["default"]["pcg"] < 0.8 * own["before: outer, block Jacobi"]["pcg"]
         assert own["default"]["newton"] <= own["before: outer, block Jacobi"]["newton"]
-        single = [r for r in rows if r["joints"] == m and r["dtype"] == "float32"]
+        single = [r for r in single if r["dtype"] == "float32"]
         assert single[0]["outcome"] == "converged"
         assert single[0]["violation"] <= 1e-5
 

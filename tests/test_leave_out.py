@@ -83,7 +83,9 @@ def test_bare_step_uses_few_modules():
     assert len(modules) <= 9
     assert not any("follower" in k or "drive" in k or "evaluate_laws" in k or "dead_load" in k for k in kernels)
     assert not any("constraint" in name for name in modules)
-    assert {"constraints", "gravity", "body forces", "follower pressure", "driven nodes"} <= set(model.info()["left_out"])
+    assert {"constraints", "gravity", "body forces", "follower pressure", "driven nodes"} <= set(
+        model.info()["left_out"]
+    )
 
 
 def test_table_path_only_where_elements_are_curved():

@@ -120,6 +120,7 @@ class Simulation(Results):
 
     Raises:
         ModelError: dt or an option out of range.
+        ConstraintError: joints that are open at the start.
     """
 
     def __init__(
@@ -223,6 +224,7 @@ class Simulation(Results):
 
         Raises:
             ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
+            ConstraintError: the same, and it is the constraints that can't be satisfied; it names them.
         """
         for _ in range(count):
             self.stepper.run()
@@ -368,7 +370,7 @@ class Simulation(Results):
             progress: show a bar on stderr; by default when stderr is a terminal.
 
         Raises:
-            ConvergenceError, OutputError: the outputs hold what came before.
+            ConvergenceError, ConstraintError, OutputError: the outputs hold what came before.
             KeyboardInterrupt: after Ctrl-C, once outputs are closed.
         """
         if not math.isfinite(t_end):

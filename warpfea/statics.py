@@ -84,6 +84,7 @@ def solve_static(
     Raises:
         ModelError: a body is not supported, or an option is out of range.
         ConvergenceError: a load step was not accepted after all halvings.
+        ConstraintError: the same, and it is the constraints that can't be satisfied.
     """
     if not (isinstance(load_steps, (int, np.integer)) and load_steps >= 1):
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number")
