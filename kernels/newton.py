@@ -75,6 +75,7 @@ def control_struct():
         stepped: wp.array(dtype=wp.int32)  # the trial was accepted
         outer: wp.array(dtype=wp.int32)  # multiplier updates of this step
         constraint_tol: wp.float64  # m
+        open: wp.array(dtype=wp.float64)  # largest violation over its tolerance; with constraints
         slack: wp.float64  # norm of PCG over the norm that is judged, across constraints
         classical: wp.int32  # multipliers change in an outer loop
         tol: wp.float64
@@ -110,6 +111,13 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         if wp.static(constrained):
             stored += ctl.constraint_sums[2, world]
         return ctl.slot_sums[5, world] + stored / ctl.dq_dv[world]
+
+    @wp.func
+    def largest_violation(ctl: Control, world: int) -> f64:
+        largest = f64(0.0)
+        for c in range(ctl.components):
+            largest = wp.max(largest, ctl.violation[world, c])
+        return largest
 
     @wp.func
     def measure(ctl: Control, world: int):
@@ -150,6 +158,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             ratio = norm / wp.max(scale, f64(1.0e-300))
             largest = wp.max(largest, ratio)
             excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))
+        if wp.static(constrained):
+            ctl.open[world] = largest_violation(ctl, world) / ctl.constraint_tol
         ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
         ctl.relative[world] = largest
         ctl.excess[world] = excess
@@ -166,10 +176,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
     @wp.func
     def unsatisfied(ctl: Control, world: int) -> bool:
         """Whether forces balance but constraints do not hold: more iterations only raise the multipliers."""
-        largest = f64(0.0)
-        for c in range(ctl.components):
-            largest = wp.max(largest, ctl.violation[world, c])
-        return ctl.relative[world] <= f64(1.0e3) * ctl.tol and largest > ctl.constraint_tol
+        return ctl.relative[world] <= f64(1.0e3) * ctl.tol and ctl.open[world] > f64(1.0)
 
     @wp.func
     def settle(ctl: Control, world: int):
@@ -303,10 +310,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         ctl.stepped[world] = 0
         if running[world] == 0 or ctl.failed[world] != 0:
             return
-        largest = f64(0.0)
-        for c in range(ctl.components):
-            largest = wp.max(largest, ctl.violation[world, c])
-        if largest <= tol:
+        if largest_violation(ctl, world) <= tol:
             return
         if ctl.outer[world] >= limit:
             ctl.failed[world] = FAIL_CONSTRAINT

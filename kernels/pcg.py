@@ -130,7 +130,11 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
             if newton.classical == 0:
                 goal = goal * newton.slack
             goal = wp.min(goal, newton.forcing[world] * wp.sqrt(wp.max(rz, f64(0.0))))
-            ctl.target[world] = wp.max(goal, f64(0.1) * newton.slack * newton.solve_accept[world])
+            least = f64(0.1) * newton.slack * newton.solve_accept[world]
+            if newton.classical == 0:
+                # a loose tolerance of the forces must not leave constraints open
+                least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
+            ctl.target[world] = wp.max(goal, least)
         if rz > ctl.target[world] * ctl.target[world] and ctl.max_iterations > 0:
             ctl.active[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)

@@ -390,6 +390,24 @@ def test_ways_to_find_the_multipliers_agree(solver):
     assert run(solver) == pytest.approx(run(wf.NewtonPCG()), abs=1e-7)
 
 
+@pytest.mark.parametrize("tol", [1e-5, 1e-3, 1e-2])
+def test_a_loose_tolerance_of_forces_does_not_open_joints(tol):
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    end = wf.GROUND
+    for k in range(10):
+        link = b.add_beam(
+            [(0.2 * k, 0, 0), (0.2 * (k + 1), 0, 0)], elements=1, section=wf.Rectangle(0.02, 0.02), normal=(0, 0, 1),
+            material=wf.SVK(E=1e9, nu=0.3, density=1e6 if k == 9 else 1000.0),
+        )  # fmt: skip
+        b.add_joint("revolute", parent=end, child=link.start, axis=(0, 1, 0))
+        end = link.end
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=0.02, integrator="bdf2", solver=wf.NewtonPCG(tol=tol))
+    halvings = sum(sim.step().halvings[0] for _ in range(20))
+    assert halvings == 0
+    assert sim.max_violation <= 1e-8 * sim.model.size
+    assert sim.totals["newton"][0] < 20 * 8
+
+
 def test_float32_holds_its_tolerance():
     model, joint = joined("revolute", ("ground", "surface"), dtype="float32", axis=(0, 1, 0))
     sim = wf.Simulation(model, dt=1e-3)
@@ -583,8 +601,11 @@ def test_handles_of_another_model_are_refused():
     _, other = joined("fixed", ("ground", "surface"))
     sim = wf.Simulation(model, dt=1e-3)
     for ask in (sim.joint_force, sim.violation, sim.joint_record, sim.joint_value):
-        with pytest.raises(wf.ModelError, match="expected a joint of this model"):
-            ask(other)
+        for what in (other, "elbow"):
+            with pytest.raises(wf.ModelError, match="expected a joint of this model"):
+                ask(what)
+        if ask != sim.joint_value:
+            ask("fixed_1")
 
 
 def test_a_mechanism_without_support_has_no_statics():

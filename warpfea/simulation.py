@@ -448,16 +448,15 @@ class Simulation(Results):
         if name not in names:
             raise ModelError(f"probe {name!r} is unknown; there are {names}")
         k = names.index(name)
-        table = self._table()
-        d, v = table[:, :, 1 + 6 * k : 4 + 6 * k], table[:, :, 4 + 6 * k : 7 + 6 * k]
+        table = self._table([0, *range(1 + 6 * k, 7 + 6 * k)])
+        d, v = table[:, :, 1:4], table[:, :, 4:7]
         return ProbeRecord(table[0, :, 0], self.model.probes[k].X + d, d, v)
 
-    def _table(self) -> np.ndarray:
-        """(B, steps, 1 + columns) all that was recorded."""
-        m = self.model
+    def _table(self, columns: list[int]) -> np.ndarray:
+        """(B, steps, columns) of what was recorded: time, then the columns of the report from the probes on."""
         if self._history:
-            return np.stack(self._history, axis=1)
-        return np.zeros((m.worlds, 0, 1 + self.stepper.work.report.shape[1] - len(REPORT)))
+            return np.stack([rows[:, columns] for rows in self._history], axis=1)
+        return np.zeros((self.model.worlds, 0, len(columns)))
 
     def energies(self) -> dict[str, np.ndarray]:
         """Energy ledger, each (B,), J.
@@ -490,50 +489,51 @@ class Simulation(Results):
         total[~self._stepped] = np.nan
         return total
 
-    def joint_record(self, joint: Joint) -> JointRecord:
-        """What has been recorded of a joint, one entry per step."""
-        k = self._joint(joint)
-        table = self._table()
-        first = 1 + 6 * len(self.model.probes) + JOINT_COLUMNS * k
-        own = table[:, :, first : first + JOINT_COLUMNS]
-        return JointRecord(table[0, :, 0], own[:, :, :3], own[:, :, 3:6], own[:, :, 6])
+    def joint_record(self, joint: Joint | str) -> JointRecord:
+        """What has been recorded of a joint (handle or name), one entry per step."""
+        first = 1 + 6 * len(self.model.probes) + JOINT_COLUMNS * self._joint(joint).index
+        columns = [0, *range(first, first + JOINT_COLUMNS)]
+        table = self._table(columns)
+        return JointRecord(table[0, :, 0], table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
 
-    def joint_force(self, joint: Joint) -> np.ndarray:
+    def joint_force(self, joint: Joint | str) -> np.ndarray:
         """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
 
         (B, 6) in world axes; `joint_record` has them over time. NaN as for `reaction`.
         """
-        k = self._joint(joint)
+        k = self._joint(joint).index
         first = len(REPORT) + 6 * len(self.model.probes) + JOINT_COLUMNS * k
         out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
         out[~self._stepped] = np.nan
         return out
 
-    def violation(self, joint: Joint) -> np.ndarray:
+    def violation(self, joint: Joint | str) -> np.ndarray:
         """Largest violation of a joint's rows in the present state, (B,), m; angles count times the model's size."""
-        k = self._joint(joint)
+        k = self._joint(joint).index
         constraints = self.model.constraints
         assert constraints is not None
         return np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
 
-    def joint_value(self, joint: Joint) -> np.ndarray:
+    def joint_value(self, joint: Joint | str) -> np.ndarray:
         """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
 
         (B,), in the present state; a driven angle counts its full turns, another lies between -pi and pi.
         """
-        self._joint(joint)
+        known = self._joint(joint)
         constraints = self.model.constraints
         assert constraints is not None
-        return constraints.measure(joint, self.state)
+        return constraints.measure(known, self.state)
 
-    def _joint(self, joint: Joint) -> int:
+    def _joint(self, joint: Joint | str) -> Joint:
+        """A joint of this model, by handle or name."""
         known = self.model.constraints.joints if self.model.constraints else []
-        for k, other in enumerate(known):
-            if other is joint:
-                return k
+        for other in known:
+            if other is joint or other.name == joint:
+                return other
         names = [j.name for j in known]
         raise ModelError(
-            f"expected a joint of this model (from add_joint, add_constraint, weld), got {joint!r}; it has {names}"
+            f"expected a joint of this model (a handle from add_joint, add_constraint or weld, or a name), "
+            f"got {joint!r}; it has {names}"
         )
 
     def contact_report(self, *pair: Any) -> Any:

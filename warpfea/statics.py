@@ -52,6 +52,14 @@ class StaticResult:
         """Force of the supports, (B, 3), N."""
         return self.simulation.reaction(nodes)
 
+    def joint_force(self, joint: Any) -> np.ndarray:
+        """Force and moment of a joint on its child, (B, 6), N and N m."""
+        return self.simulation.joint_force(joint)
+
+    def violation(self, joint: Any) -> np.ndarray:
+        """Largest violation of a joint, (B,), m."""
+        return self.simulation.violation(joint)
+
     def node_gradients(self, body: Any) -> np.ndarray:
         """(B, nodes, 3, 3) deformation gradient at the nodes of a body with gradient slots."""
         return self.simulation.node_gradients(body)

@@ -86,7 +86,7 @@ class Workspace:
         self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
         self.multipliers: Any = allocate(model, self)
         self.constraint_work = self.array("constraint_work", (2, B) if model.constraints else (1, 1), wp.float64)
-        optional = () if model.constraints else ("constraint_sums", "stepped", "outer")
+        optional = () if model.constraints else ("constraint_sums", "stepped", "outer", "open")
         self.newton = self._struct(
             control_struct(), B, skip=("violation", *optional),
             history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
