@@ -52,7 +52,7 @@ class NewtonPCG:
     max_halvings: int = 8
     preconditioner: str = "auto"
     multipliers: str = "newton"
-    penalty: float = 100.0
+    penalty: float = 1000.0
     max_outer: int = 100
 
     def __post_init__(self) -> None:
