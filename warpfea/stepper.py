@@ -154,7 +154,8 @@ class Stepper:
             out |= {b.kernels.viscous_force.module for b in m.blocks if b.key.damping == "explicit"}
             out |= {b.kernels.strain_history.module for b in m.blocks if b.key.damping == "incremental"}
         if m.constraints:
-            out.add(m.constraints.kernels.module)
+            assert self.newton.constraints is not None
+            out |= {m.constraints.kernels.module, self.newton.constraints.deflation.module}
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.constraints import SUM_ROWS, multiplier_struct
+from ..kernels.deflation import deflation_kernels
 
 if TYPE_CHECKING:
     from ..launch import Launcher
@@ -60,6 +61,7 @@ class ConstraintSolver:
         self.model, self.work, self.launch = model, work, launch
         self.constraints = model.constraints
         self.kernels = self.constraints.kernels
+        self.deflation = deflation_kernels(model.dtype)
         self.deflate = deflate
         self.dim = (model.worlds, self.constraints.count)
         work.multipliers.classical = int(classical)
@@ -84,7 +86,7 @@ class ConstraintSolver:
 
     def build(self, active: wp.array, *, penalty: bool = False) -> None:
         """Matrices of the clusters from the inverse diagonal blocks; `penalty`: set rho from them."""
-        m, w, k, launch = self.model, self.work, self.kernels, self.launch
+        m, w, k, launch = self.model, self.work, self.deflation, self.launch
         if not (self.deflate or penalty):
             return
         data, mul = self.constraints.data, w.multipliers
@@ -110,7 +112,7 @@ class ConstraintSolver:
 
     def precondition(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z, and r.z per slot."""
-        m, w, k, launch = self.model, self.work, self.kernels, self.launch
+        m, w, k, launch = self.model, self.work, self.deflation, self.launch
         data, mul = self.constraints.data, w.multipliers
         launch(k.restrict, self.dim, [data, mul, z, active])
         sizes = self.constraints.colour_sizes
