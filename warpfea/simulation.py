@@ -14,9 +14,8 @@ from . import integrators
 from .bodies import NodeSet
 from .constraints import Joint
 from .errors import ConstraintError, ConvergenceError, ModelError
-from .evaluation import lowest_jacobian
+from .failures import check_closed, step_error
 from .kernels.constraints import JOINT_COLUMNS
-from .kernels.newton import FAIL_CONSTRAINT, FAIL_CURVATURE, FAIL_ITERATIONS, FAIL_JACOBIAN, FAIL_LINE_SEARCH, FAIL_NAN
 from .kernels.step import LEDGER, REPORT, STATUS
 from .results import Results
 from .run_loop import close_all, interruptible, step_bar
@@ -27,20 +26,7 @@ from .stepper import Stepper
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["ProbeRecord", "Simulation", "StepReport"]
-
-REASONS = {
-    FAIL_ITERATIONS: "Newton's method did not converge",
-    FAIL_LINE_SEARCH: "the line search found no decrease",
-    FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
-    FAIL_NAN: "a force or energy was not finite",
-    FAIL_CURVATURE: "no descent direction was found",
-    FAIL_CONSTRAINT: "constraints could not be satisfied",
-}
-
-
-OPEN = 1e-4
-"""Violation at the start, over the model's size, that a dynamic run refuses to snap shut."""
+__all__ = ["JointRecord", "ProbeRecord", "Simulation", "StepReport"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +172,7 @@ class Simulation(Results):
             ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, on_compile=on_compile,
         )  # fmt: skip
         self.compile_s = clock.perf_counter() - began
-        self._check_start()
+        check_closed(self)
         self.steps = 0
         self.last: StepReport | None = None
         self.totals = {"newton": np.zeros(model.worlds, int), "pcg": np.zeros(model.worlds, int)}
@@ -278,80 +264,12 @@ class Simulation(Results):
 
     def _failure(self, world: int) -> ConvergenceError | ConstraintError:
         """The error for a failed world; its status is cleared so that a caller may try again with another dt."""
-        assert self.last is not None
-        work = self.stepper.work
-        code = int(self.last.failure[world])
-        count = int(work.newton.iterations.numpy()[world]) + 1
-        history = work.newton.history.numpy()[world, :count].tolist()
-        if code == FAIL_JACOBIAN:
-            element, where = lowest_jacobian(self.model, work.u.numpy()[world].astype(float))
-        else:
-            element, where = self._worst_element(world)
-        time = float(self.last.time[world])
-        halvings = min(int(self.last.halvings[world]), self.solver.max_halvings)
+        error = step_error(self, world)
         status = self.state.status.numpy()
         status[status == STATUS["failed"]] = STATUS["running"]
         self.state.status.assign(status)
         self.last = None
-        if code == FAIL_CONSTRAINT:
-            return self._unsatisfied(world, time, halvings)
-        return ConvergenceError(
-            f"step from t = {time:.6g} s with dt = {self._dt:g} s was not accepted in world {world}: "
-            f"{REASONS.get(code, 'unknown reason')} after {halvings} halvings; relative residuals "
-            f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}",
-            time=time, world=world, residuals=history, element=element, state=self.state,
-        )  # fmt: skip
-
-    def _unsatisfied(self, world: int, time: float, halvings: int) -> ConstraintError:
-        """The error for constraints that stay violated although the forces balance."""
-        names, values = self._violated(self.stepper.work.multipliers.value.numpy()[world])
-        listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
-        return ConstraintError(
-            f"step from t = {time:.6g} s with dt = {self._dt:g} s: constraints could not be satisfied in world {world} "
-            f"after {halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or "
-            f"with supports, or ask for what the bodies can't reach (tolerance "
-            f"{self.stepper.newton.constraint_tol:.3g} m)",
-            joints=names, violations=values, time=time, world=world, state=self.state,
-        )  # fmt: skip
-
-    def _violated(self, values: np.ndarray, tol: float | None = None) -> tuple[list[str], list[float]]:
-        """Names of the joints whose rows (rows,) exceed the tolerance, the worst first, and by how much, m."""
-        constraints = self.model.constraints
-        assert constraints is not None
-        tol = self.stepper.newton.constraint_tol if tol is None else tol
-        worst = np.array([np.abs(values[rows]).max() for rows in constraints.rows_of])
-        order = [k for k in np.argsort(-worst, kind="stable") if not worst[k] <= tol]
-        return [constraints.joints[k].name for k in order], [float(worst[k]) for k in order]
-
-    def _check_start(self) -> None:
-        """Raise ConstraintError where a dynamic run would begin with open joints and snap them shut."""
-        constraints = self.model.constraints
-        if constraints is None or self.integrator.static:
-            return
-        for world, values in enumerate(self.stepper.work.multipliers.value.numpy()):
-            names, worst = self._violated(values, OPEN * self.model.size)
-            if names:
-                raise ConstraintError(
-                    f"joint {names[0]!r} is {worst[0]:.3g} m off at the start in world {world}, "
-                    f"t = {self.time[world]:.6g} s, and would snap shut in the first step; begin its drive at the "
-                    "present value, move the bodies, or assemble them with solve_static",
-                    joints=names, violations=worst, world=world, time=float(self.time[world]), state=self.state,
-                )  # fmt: skip
-
-    def _worst_element(self, world: int) -> tuple[int, str]:
-        """Model index and a description of the element whose slots carry the largest residual."""
-        m = self.model
-        g = np.abs(self.stepper.work.g.numpy()[world] * m.free_host).max(axis=1)
-        g = np.where(np.isfinite(g), g, np.inf)
-        best, index, text = -1.0, -1, "element unknown"
-        for block in m.blocks:
-            for part in block.parts:
-                values = g[part.conn + part.body.slot_offset].max(axis=1)
-                k = int(np.argmax(values))
-                if values[k] > best:
-                    best, index = float(values[k]), part.body.element_offset + int(part.elements[k])
-                    text = f"element {int(part.elements[k])} of body {part.body.name!r} (residual {best:.3g} N)"
-        return index, text
+        return error
 
     def run(
         self,
