@@ -36,6 +36,8 @@ DISTANCE = 1
 TURN = 2
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
+MOST_TURN = 2.0
+"""rad that a driven angle may change by in a substep."""
 SUM_ROWS = 3
 """Rows summed per world with an evaluation: the augmented potential with the multipliers held, with the new ones, and
 its magnitude."""
@@ -88,7 +90,9 @@ def multiplier_struct():
     class Multipliers:
         value: wp.array2d(dtype=wp.float64)  # c, m
         target: wp.array2d(dtype=wp.float64)  # f
+        last: wp.array2d(dtype=wp.float64)  # f of the last accepted step
         gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector
+        scale: wp.array2d(dtype=wp.float64)  # of the row, negative where a turn is more than a right angle off
         force: wp.array2d(dtype=wp.float64)  # lambda, N
         change: wp.array2d(dtype=wp.float64)  # of lambda with a full Newton step
         trial: wp.array2d(dtype=wp.float64)  # lambda at the trial of the line search
@@ -225,6 +229,8 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
                 # more than a right angle off: the sine vanishes at a half turn too, which is no solution
                 c = wp.sign(c) * f64(2.0) * scale - c
                 scale = -scale
+            if wp.abs(f - mul.last[world, row]) > f64(MOST_TURN):
+                c = f64(2.0) * con.scale[row]  # turns can't be told apart: the step must be halved
         else:
             c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
         G = gradients(kind, scale, f, slope, b, a2)
@@ -236,6 +242,7 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         if mul.classical == 0:
             new = held + alpha[world] * mul.change[world, row]
         mul.value[world, row] = c
+        mul.scale[world, row] = scale
         mul.target[world, row] = f
         mul.merit[world, row] = held + rho * c
         if mul.classical == 0:
@@ -273,7 +280,7 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         Gc = mul.gradient[world, 3 * row + 2]
         change = wp.dot(Ga, a) + wp.dot(Gb, b) + wp.dot(Gc, a2)
         f = mul.target[world, row]
-        scale = con.scale[row]
+        scale = mul.scale[world, row]
         if kind == DISTANCE:
             n = Ga / scale
             size = wp.abs(mul.value[world, row] / scale + f)
@@ -286,11 +293,17 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         mul.product[world, 3 * row + 2] = tight * Gc + force * bend[2]
 
     @wp.kernel(module=module)
-    def load_multipliers(state: wp.array2d(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers):
-        """Warm start: the forces of the last accepted step."""
+    def load_multipliers(
+        state: wp.array2d(dtype=f64),
+        travel: wp.array2d(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        mul: Multipliers,
+    ):
+        """Warm start: the forces and right sides of the last accepted step."""
         world, row = wp.tid()
         if active[world] == 0:
             return
+        mul.last[world, row] = travel[world, row]
         mul.force[world, row] = state[world, row]
         mul.trial[world, row] = state[world, row]
         mul.change[world, row] = f64(0.0)
@@ -301,12 +314,16 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Constraints,
         mul: Multipliers,
         direction: wp.array2d(dtype=vec3),
+        quiet: wp.array2d(dtype=wp.int32),
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
     ):
-        """Change of lambda that belongs to a full Newton step, rho (c + (dq/dv) J p)."""
+        """Change of lambda that belongs to a full Newton step, rho (c + (dq/dv) J p); none in converged components."""
         world, row = wp.tid()
-        if active[world] != 0:
+        if active[world] == 0:
+            return
+        mul.change[world, row] = f64(0.0)
+        if quiet[world, con.component[row]] == 0:
             after = mul.value[world, row] + dq_dv[world] * directional(con, mul, direction, world, row)
             mul.change[world, row] = mul.stiffness[world, row] * after
 

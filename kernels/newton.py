@@ -176,7 +176,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
     @wp.func
     def unsatisfied(ctl: Control, world: int) -> bool:
         """Whether forces balance but constraints do not hold: more iterations only raise the multipliers."""
-        return ctl.relative[world] <= f64(1.0e3) * ctl.tol and ctl.open[world] > f64(1.0)
+        balanced = wp.max(ctl.tol, wp.min(f64(1.0e3) * ctl.tol, f64(1.0e-4)))
+        return ctl.relative[world] <= balanced and ctl.open[world] > f64(1.0)
 
     @wp.func
     def settle(ctl: Control, world: int):
@@ -201,7 +202,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         if not (within and why != FAIL_NAN):
             ctl.failed[world] = why
             if wp.static(constrained):
-                if why != FAIL_NAN and unsatisfied(ctl, world):
+                if why != FAIL_NAN and why != FAIL_JACOBIAN and unsatisfied(ctl, world):
                     ctl.failed[world] = FAIL_CONSTRAINT
 
     @wp.kernel(module=module)

@@ -128,8 +128,9 @@ def chain():
     for k in range(16):
         mesh = wf.mesh.box((0.1, 0.05, 0.05), cells=(1, 1, 1))
         link = b.add_solid(mesh, transform=(np.eye(3), (0.1 * k, 0, 0)), material=law)
-        b.add_joint("revolute", parent=end, child=link.surface("x-"), axis=(0, 1, 0))
-        end = link.surface("x+")
+        whole = link.nodes(lambda X: X[:, 0] > -1.0)
+        b.add_joint("revolute", parent=end, child=whole, anchor=(0.1 * k, 0.025, 0.025), axis=(0, 1, 0))
+        end = whole
     b.add_probe("tip", end)
     return b, link
 

@@ -415,6 +415,218 @@ def test_float32_holds_its_tolerance():
     assert sim.violation(joint)[0] <= 1e-5 * model.size
 
 
+def two_chains(moduli):
+    """Chains of two links that do not touch; the later ones stand 5 m aside."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    tips = []
+    for k, E in enumerate(moduli):
+        end = wf.GROUND
+        for link in range(2):
+            x = [(0.5 * link, 5.0 * k, 0), (0.5 * (link + 1), 5.0 * k, 0)]
+            beam = b.add_beam(
+                x, elements=1, section=wf.Rectangle(0.05, 0.05), normal=(0, 0, 1),
+                material=wf.SVK(E=E, nu=0.3, density=2700.0),
+            )  # fmt: skip
+            b.add_joint("revolute", parent=end, child=beam.start, anchor=x[0], axis=(0, 1, 0))
+            end = beam.end
+        tips.append(beam)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator="bdf2")
+    halvings = sum(sim.step().halvings[0] for _ in range(30))
+    return [sim.positions(tip)[0] - [0, 5.0 * k, 0] for k, tip in enumerate(tips)], sim.totals["newton"][0], halvings
+
+
+def test_a_converged_mechanism_is_left_alone_by_another():
+    both, newton, halvings = two_chains([1e11, 1e5])
+    for k, E in enumerate((1e11, 1e5)):
+        alone, own, _ = two_chains([E])
+        assert np.abs(both[k] - alone[0]).max() < 1e-9
+        assert newton <= own + 30
+    assert halvings == 0
+
+
+@pytest.mark.parametrize("sag", [0.0, 1e-4, 1e-2, 5e-2])
+def test_a_slightly_curved_face_is_held_as_a_flat_one(sag):
+    """A column on a fixed joint at its foot, bent by a load at its head: as stiff however little the foot is curved."""
+    mesh = wf.mesh.box((0.1, 0.1, 0.6), cells=(2, 2, 6))
+    X = mesh.points.copy()
+    bow = 1.0 - ((X[:, 0] - 0.05) ** 2 + (X[:, 1] - 0.05) ** 2) / 0.05**2
+    X[:, 2] -= sag * 0.1 * bow * (1.0 - X[:, 2] / 0.6)
+    column = wf.mesh.Mesh(X, mesh.cells, "tetra10", name="column")
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = b.add_solid(column, material=wf.SVK(E=1e8, nu=0.3))
+    b.add_joint("fixed", parent=wf.GROUND, child=body.surface(lambda c: c[:, 2] < 1e-3))
+    b.add_point_load(body.nodes(lambda X: X[:, 2] > 0.6 - 1e-9), (20.0, 0, 0))
+    b.add_probe("tip", body.nodes(lambda X: X[:, 2] > 0.6 - 1e-9))
+    tip = wf.solve_static(b.finalize(device="cpu"), load_steps=1).probe("tip").displacement[0, -1, 0]
+    # the face's mean is held, not its points: a curved one gives a little
+    assert tip == pytest.approx(20.0 * 0.6**3 / (3 * 1e8 * 0.1**4 / 12), rel=0.06 if sag < 0.05 else 0.12)
+
+
+def spun(rate, dt, **options):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    rod = b.add_beam(
+        [(0, 0, 0), (0.1, 0, 0)], elements=1, section=wf.Rectangle(0.02, 0.02), normal=(0, 0, 1),
+        material=wf.SVK(E=1e9, nu=0.3, density=1000.0),
+    )  # fmt: skip
+    motor = b.add_joint(
+        "revolute", parent=wf.GROUND, child=rod.start, axis=(0, 1, 0), drive=([0, 10], [0, 10 * rate]), name="motor"
+    )
+    b.set_initial(rod, velocity=lambda X: np.cross((0, rate, 0), X))
+    return wf.Simulation(b.finalize(device="cpu"), dt=dt, **options), motor, rod
+
+
+def test_a_drive_of_more_than_half_a_turn_per_step_is_not_taken_for_less():
+    sim, motor, rod = spun(2 * np.pi, 1.0)
+    report = sim.step()
+    assert report.halvings[0] >= 2
+    assert sim.joint_value(motor)[0] == pytest.approx(2 * np.pi, abs=1e-7)
+    assert sim.energies()["kinetic"][0] > 1e-3
+    sim, motor, rod = spun(2 * np.pi, 1.0, solver=wf.NewtonPCG(max_halvings=0))
+    with pytest.raises(wf.Error, match=r"'motor'|not accepted"):
+        sim.step()
+
+
+def test_results_of_statics_know_their_own_time():
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    rod = b.add_beam(
+        [(0, 0, 0), (1, 0, 0)], elements=2, section=wf.Rectangle(0.05, 0.05), normal=(0, 0, 1), material=LAW
+    )
+    motor = b.add_joint("revolute", parent=wf.GROUND, child=rod.start, axis=(0, 1, 0), drive=([0, 1], [0, 7.0]))
+    static = wf.solve_static(b.finalize(device="cpu"), load_steps=4)
+    assert static.violation(motor)[0] < 1e-8
+    assert static.simulation.joint_value(motor)[0] == pytest.approx(7.0, abs=1e-8)
+    assert static.joint_force(motor).shape == (1, 6)
+
+
+SINGLE = {
+    "DP1": lambda p, q: (p.at((0, 0, 0)), p.at((1, 0.2, 0.2)), q.at((1, 0, 0)), q.surface("x+")),
+    "DP1 with places": lambda p, q: (p.at((0, 0, 0)), p.surface("x+"), (0, 0, 0), (0, 1, 2)),
+    "DP2": lambda p, q: (p.at((0, 0, 0)), p.at((1, 0.2, 0.2)), p.at((0.5, 0.1, 0)), q.at((2, 0, 0))),
+    "DIST": lambda p, q: (p.at((0.2, 0.1, 0.1)), q.surface("x+")),
+    "DIST of one body": lambda p, q: (p.at((0.2, 0.1, 0.1)), p.surface("x+")),
+    "PIN": lambda p, q: (p.at((0.2, 0.1, 0.1)), q.surface("x+")),
+}
+
+
+@wp.func
+def path(t: wp.float64) -> wp.vec3d:
+    return wp.vec3d(wp.float64(-1.8), wp.sin(t), wp.float64(0.1))
+
+
+@pytest.mark.parametrize("case", SINGLE)
+@pytest.mark.parametrize("sort", ["constant", "samples", "function"])
+def test_single_constraints_match_their_definition_and_differences(case, sort):
+    kind = case.split()[0]
+    b, p, q = bodies()
+    points = SINGLE[case](p, q)
+    if kind == "PIN":
+        value = {"constant": (1.0, 2.0, 3.0), "samples": ([0, 1], [(1, 2, 3), (2, 3, 4)]), "function": path}[sort]
+    else:
+        value = {"constant": 0.7, "samples": ([0, 1], [0.7, 1.7]), "function": wave}[sort]
+    joint = b.add_constraint(kind, points=points, value=value)
+    model = b.finalize(device="cpu")
+    rng = np.random.default_rng(5)
+    u = random_pose(model, rng)
+    x, position = places(model)
+
+    def place(point):
+        if isinstance(point, tuple):
+            return np.array(point, dtype=float)
+        if isinstance(point, wf.MaterialPoint):
+            return point.weights @ (x + u)[point.body.slots[point.slots]]
+        slots, weights = wf.assembly.surface_weights(point)
+        return weights @ (x + u)[point.body.slots[slots]] / weights.sum()
+
+    P = [place(point) for point in points]
+    f = np.array([1.0, 2.0, 3.0]) if kind == "PIN" else 0.7
+    if sort == "function" and kind == "PIN":
+        f = np.array([-1.8, 0.0, 0.1])
+    if kind == "PIN":
+        expected = P[0] - P[1] - f
+    elif kind == "DIST":
+        expected = [np.linalg.norm(P[1] - P[0]) - f]
+    else:
+        scale = model.size / np.prod([np.linalg.norm(v.value) for v in (joint.rows[0].a, joint.rows[0].b)])
+        expected = [scale * ((P[1] - P[0]) @ (P[3] - P[2]) - f)]
+    state = state_at(model, u)
+    assert model.constraint_values(state)[0] == pytest.approx(np.array(expected), abs=1e-12)
+    d = rng.normal(size=u.shape)
+    h = 1e-5
+    ahead, behind = (state_at(model, u + k * h * d) for k in (1, -1))
+    J = model.constraint_jacobian(state)
+    slope = (model.constraint_values(ahead) - model.constraint_values(behind))[0] / (2 * h)
+    assert J @ d.ravel() == pytest.approx(slope, abs=1e-8 * np.abs(slope).max())
+    lam = rng.normal(size=model.constraints.count)
+    bend = (model.constraint_jacobian(ahead) - model.constraint_jacobian(behind)).T @ lam / (2 * h)
+    product = model.constraint_curvature(state, lam, d)[0].ravel()
+    assert product == pytest.approx(bend, abs=1e-8 * max(np.abs(bend).max(), 1e-3))
+
+
+def test_reaction_of_dp2_is_that_on_its_last_point():
+    """A block kept at its height by a DP2: the force is its weight."""
+    b = wf.ModelBuilder(gravity=(0, 0, -10.0))
+    stiff = wf.SVK(E=1e12, nu=0.3, density=1000.0)
+    held, block = box(b, (0, 0, 0), (1, 0.2, 0.2), law=stiff), box(b, (1, 0, 0), (2, 0.2, 0.2))
+    b.clamp(held.nodes(lambda X: X[:, 2] < 1e-9))
+    points = (held.at((0, 0, 0)), held.at((0, 0, 0.2)), held.at((0, 0, 0.2)), block.surface("z+"))
+    joint = b.add_constraint("DP2", points=points, value=0.0)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=0.05)
+    sim.step(60)
+    assert sim.joint_record(joint).force[0, -20:].mean(axis=0) == pytest.approx([0, 0, 400.0], abs=8.0)
+
+
+def test_failed_worlds_with_constraints_are_frozen():
+    model = pair_of_rods(2.2).model
+    sim = wf.Simulation(model, dt=1e-3, on_failure="freeze", solver=wf.NewtonPCG(max_halvings=1))
+    for _ in range(4):
+        sim.step()
+    assert list(sim.status) == [1]
+    joint = model.constraints.joints[0]
+    assert np.isnan(sim.joint_force(joint)).all()
+    assert np.isnan(sim.joint_record(joint).force[0, -1]).all()
+
+
+def test_records_can_be_left_out():
+    model, joint = joined("revolute", ("ground", "beam"), ([0, 1], [0, 1.0]), axis=(0, 1, 0))
+    sim = wf.Simulation(model, dt=0.01, record=False)
+    sim.step(5)
+    assert sim.joint_record(joint).time == pytest.approx([0.05])
+
+
+def test_a_reset_to_an_open_state_is_refused():
+    model, _ = joined("spherical", ("ground", "surface"))
+    sim = wf.Simulation(model, dt=0.01)
+    moved_state = state_at(model, 0.3 + np.zeros((model.slots, 3)) * (model.slot_kind == 0)[:, None])
+    with pytest.raises(wf.ConstraintError, match="snap shut"):
+        sim.reset(state=moved_state)
+
+
+def test_joints_at_the_origin_do_not_mind_rounding():
+    b = wf.ModelBuilder()
+    block = b.add_solid(wf.mesh.box((0.3, 0.3, 0.3), cells=(1, 1, 1), origin=(-0.3, -0.15, -0.15)), material=LAW)
+    beam = b.add_beam(
+        [(0, 0, 0), (1, 0, 0)], elements=2, section=wf.Rectangle(0.05, 0.05), normal=(0, 0, 1), material=LAW
+    )
+    b.add_joint("revolute", parent=block.surface("x+"), child=beam.start, axis=(0, 1, 0))
+    b.add_constraint("PIN", points=(block.surface("x+"), beam.start))
+    near = beam.at((3e-17, 0, 0))
+    with pytest.raises(wf.ModelError, match="coincide"):
+        b.add_constraint("DIST", points=(block.surface("x+"), near))
+    assert b.finalize(device="cpu").constraints.count == 8
+
+
+@pytest.mark.parametrize("swap", [False, True])
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0)])
+def test_a_hinge_asks_only_for_directions_that_are_known(swap, axis):
+    """Nodes in a plane do not tell how its normal turns; a hinge finds another way round."""
+    b = wf.ModelBuilder()
+    body = box(b, (0, 0, 0), (1, 0.2, 0.2))
+    sides = (wf.GROUND, body.nodes("x-"))
+    parent, child = sides[::-1] if swap else sides
+    b.add_joint("revolute", parent=parent, child=child, axis=axis, anchor=(0, 0.1, 0.1))
+    assert b.finalize(device="cpu").constraints.count == 5
+
+
 # welds
 
 
@@ -585,6 +797,20 @@ BAD = {
     ),
     "all in space": (lambda b, p, q: b.add_constraint("PIN", points=((0, 0, 0), (0, 0, 0))), r"none of its points"),
     "weld outside": (lambda b, p, q: b.weld(p.surface("x-"), q), r"lies outside .*must lie in the other body"),
+    "weld to the wrong surface": (
+        lambda b, p, q: b.weld(p.surface("x+"), q.surface("x+")),
+        r"is not on surface 'x\+' of body 'two'",
+    ),
+    "same place": (
+        lambda b, p, q: b.add_joint("fixed", parent=p.surface("x+"), child=p.surface("x+")),
+        r"are the same place",
+    ),
+    "axis2 of a rod": (
+        lambda b, p, q: b.add_joint("distance", parent=p.at((0, 0, 0)), child=q.at((1, 0, 0)), axis2=(1, 0, 0)),
+        r"only universal joints have an axis2",
+    ),
+    "no name": (lambda b, p, q: b.add_joint("fixed", name="", **ends(p, q)), r"joint name '' is no text"),
+    "name of a list": (lambda b, p, q: b.add_joint("fixed", name=["a"], **ends(p, q)), r"is no text"),
     "weld itself": (lambda b, p, q: b.weld(p.surface("x-"), p), r"both sides are body 'one'"),
 }
 
@@ -621,13 +847,13 @@ def test_rows_are_sparse():
     b = wf.ModelBuilder()
     end = wf.GROUND
     for k in range(20):
-        body = box(b, (k, 0, 0), (k + 1, 0.2, 0.2))
-        b.add_joint("revolute", parent=end, child=body.surface("x-"), axis=(0, 1, 0))
-        end = body.surface("x+")
+        whole = box(b, (k, 0, 0), (k + 1, 0.2, 0.2)).nodes(lambda X: X[:, 0] > -1)
+        b.add_joint("revolute", parent=end, child=whole, anchor=(k, 0.1, 0.1), axis=(0, 1, 0))
+        end = whole
     model = b.finalize(device="cpu")
     J = model.constraint_jacobian(model.state())
     assert isinstance(J, sp.csr_matrix)
-    assert np.diff(J.indptr).max() <= 3 * 3 * 20
+    assert np.diff(J.indptr).max() <= 3 * 2 * 27
     constraints = model.constraints
     assert constraints.cluster_sizes.max() == 5  # too many coupled rows for one inverse: joints are swept by colour
     assert len(constraints.colour_sizes) == 2

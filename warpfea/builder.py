@@ -499,7 +499,7 @@ class ModelBuilder:
             kind: "DP1", (Q - P).(T - R) = f m^2; "DP2", the same with R on the body of P and Q; "DIST", |P - Q| = f m,
                 positive; "PIN", P - Q = f (3,) m.
             points: P, Q (, R, T): material points, nodes or surfaces (their mean), or fixed places (x, y, z), m.
-            value: f, a time law; by default 0 of DP1, DP2 and PIN, and the present distance of DIST.
+            value: f, a time law; by default 0 of DP1, DP2 and PIN, and the reference distance of DIST.
             name: unique name.
 
         Raises:
@@ -536,10 +536,10 @@ class ModelBuilder:
         taken = {joint.name for joint in self.description.joints}
         if name is None:
             return next(n for k in itertools.count(1) if (n := f"{kind}_{k}") not in taken)
-        if not isinstance(name, str) or name in taken:
-            raise ModelError(
-                f"joint name {name!r} is used twice" if name in taken else f"joint name {name!r} is no text"
-            )
+        if not isinstance(name, str) or not name:
+            raise ModelError(f"joint name {name!r} is no text")
+        if name in taken:
+            raise ModelError(f"joint name {name!r} is used twice")
         return name
 
     def _join(self, joint: Joint) -> Joint:

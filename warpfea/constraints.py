@@ -48,9 +48,6 @@ class Vector:
         flipped = tuple(Part(p.body, p.slots, -p.weights, p.child) for p in other.parts)
         return Vector(self.value - other.value, self.parts + flipped)
 
-    def __neg__(self) -> Vector:
-        return constant(np.zeros(3)) - self
-
     def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Model slots, weights and child flags, negligible weights left out. After finalize."""
         if not self.parts:
@@ -115,7 +112,7 @@ class Joint:
         rows: its scalar constraints.
         anchor: where it acts on the child, for the reaction's moment.
         angle: vectors (a, a2, b) whose angle from a towards a2 is the joint's, or None.
-        travel: vectors (a, b): the joint's travel is a.b / |b| - its reference value, or None.
+        travel: vectors (a, b): the joint's travel is a.b, b the parent's axis F n, or None.
         between: what it ties, for messages.
     """
 
@@ -130,11 +127,6 @@ class Joint:
 
     def __repr__(self) -> str:
         return f"Joint({self.name!r}, {self.kind}, {self.between})"
-
-    def bodies(self) -> list[Body]:
-        """Bodies that its rows act on."""
-        found = {id(p.body): p.body for row in self.rows for vector in row.terms for p in vector.parts}
-        return list(found.values())
 
 
 class Constraints:
@@ -212,7 +204,6 @@ class Constraints:
             clusters += [cluster[k]] * n
             components += [own[k]] * n
         self.rows = rows
-        self.cluster_host = np.unique(clusters, return_inverse=True)[1]
         # renumber in order of appearance, so that clusters are runs of rows
         seen: dict[int, int] = {}
         self.cluster_host = np.array([seen.setdefault(int(c), len(seen)) for c in clusters])
@@ -449,26 +440,38 @@ class Constraints:
         columns = (3 * self.slot_host[:, None] + np.arange(3)).ravel()
         return sp.csr_matrix((data.ravel(), (rows, columns)), shape=(self.count, 3 * self.model.slots))
 
-    def measure(self, joint: Joint, state: Any) -> np.ndarray:
-        """Angle (rad), travel or length (m) of a joint, (worlds,)."""
-        target = self.model.evaluation.constraints(state)[2]
+    def measure(self, joint: Joint, what: str | None, state: Any) -> np.ndarray:
+        """ "angle" (rad), "travel" or "length" (m) of a joint, (worlds,); ModelError where it has none."""
+        length = joint.rows[0].a if joint.rows[0].kind == DISTANCE else None
+        has = {"angle": joint.angle, "travel": joint.travel, "length": length}
+        known = [name for name, vectors in has.items() if vectors]
+        what = what or next(iter(known), None)
+        if what not in known:
+            raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no {what or 'angle, travel or length'}")
+        target = self.targets(state)
         out = []
         for world, u in enumerate(state.displacement.numpy().astype(float)):
-            if joint.angle:
-                a, a2, b = (self._present(v, u) for v in joint.angle)
+            if what == "length":
+                out.append(np.linalg.norm(self._present(length, u)))
+            elif what == "travel":
+                gap, axis = (self._present(v, u) for v in joint.travel or ())
+                out.append(gap @ axis)
+            else:
+                a, a2, b = (self._present(v, u) for v in joint.angle or ())
                 angle = np.arctan2(b @ a2, b @ a)
                 driven = [k for k in self.rows_of[joint.index] if self.rows[k].kind == TURN]
                 if driven:
                     angle += 2.0 * np.pi * np.round((target[world, driven[0]] - angle) / (2.0 * np.pi))
                 out.append(angle)
-            elif joint.travel:
-                gap, axis = (self._present(v, u) for v in joint.travel)
-                out.append(gap @ axis / np.linalg.norm(axis))
-            elif joint.rows[0].kind == DISTANCE:
-                out.append(np.linalg.norm(self._present(joint.rows[0].a, u)))
-            else:
-                raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no angle, travel or length")
         return np.array(out)
+
+    def targets(self, state: Any) -> np.ndarray:
+        """Right sides (worlds, rows) that the state was brought to; of a state that never stepped those of its time."""
+        at_time = self.model.evaluation.constraints(state)[2]
+        if "constraint_target" not in state.names:
+            return at_time
+        reached = state.constraint_target.numpy()
+        return np.where(np.isnan(reached), at_time, reached)
 
     @staticmethod
     def _present(vector: Vector, u: np.ndarray) -> np.ndarray:

@@ -103,7 +103,7 @@ class Evaluation:
             for kernel, law in loads.function_laws:
                 self.launch(kernel, B, [law, state.time, self._all(), value])
         mul = multiplier_struct()()
-        for name in ("value", "target", "force", "change", "trial", "merit", "excess", "stiffness"):
+        for name in ("value", "target", "last", "scale", "force", "change", "trial", "merit", "excess", "stiffness"):
             setattr(mul, name, self._zeros((B, con.count), wp.float64))
         for name in ("gradient", "product"):
             setattr(mul, name, self._zeros((B, 3 * con.count), wp.vec3d))
@@ -111,6 +111,7 @@ class Evaluation:
         mul.violation = self._zeros((B, m.component_count), wp.float64)
         if multipliers is not None:
             mul.force.assign(np.tile(multipliers, (B, 1)))
+        mul.last.fill_(np.nan)  # any turn is as good as another
         alpha = self._zeros((B,), wp.float64)
         args = [con.data, state.displacement, value, alpha, self._all(), mul]
         self.launch(con.kernels.evaluate, (B, con.count), args)

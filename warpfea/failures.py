@@ -57,11 +57,13 @@ def step_error(sim: Simulation, world: int) -> ConvergenceError | ConstraintErro
     )  # fmt: skip
 
 
-def check_closed(sim: Simulation) -> None:
-    """Raise ConstraintError where a dynamic run would begin with open joints and snap them shut."""
+def check_closed(sim: Simulation, mask: np.ndarray | None = None) -> None:
+    """Raise ConstraintError where a dynamic run would begin with open joints and snap them shut; in worlds (B,)."""
     if sim.model.constraints is None or sim.integrator.static:
         return
     for world, values in enumerate(sim.stepper.work.multipliers.value.numpy()):
+        if mask is not None and not mask[world]:
+            continue
         names, worst = _violated(sim.model, values, OPEN * sim.model.size)
         if names:
             time = float(sim.time[world])

@@ -11,7 +11,7 @@ A material direction n of a body is F n, linear in the slots, in place of a chor
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,12 @@ __all__ = ["GROUND", "JOINTS", "Ground", "attach", "make_constraint", "make_join
 JOINTS = ("spherical", "universal", "revolute", "cylindrical", "translational", "fixed", "distance")
 NEEDS_AXIS = ("universal", "revolute", "cylindrical", "translational")
 DRIVEN = ("revolute", "translational", "distance")
+COINCIDENT = 1e-9
+"""Distance of places that are one, over the size of their bodies."""
+FLAT_SURFACE, FLAT_NODES = 1e-2, 1e-3
+"""Variance of places across their plane, over that in it, below which a fit does not tell how its normal turns."""
+ACROSS = 0.5
+UNKNOWN = 10.0
 CONSTRAINTS = {"DP1": 4, "DP2": 4, "DIST": 2, "PIN": 2}
 
 
@@ -51,7 +57,8 @@ class Attachment:
         X: (3,) reference position, m.
         slots, weights, gradients: (n,), (n,), (n, 3): x = sum weights e, F = sum e gradients^T.
         known: (3, 3) projector on the directions n for which F n is known.
-        weak: (3, 3) projector on those that bend at a point for next to nothing: a beam's axis, a shell's tangents.
+        weak: (3, 3) projector on those that bend at a point for next to nothing: a beam's axis, a shell's tangents;
+            less (`ACROSS`) of a solid's face.
         label: for messages.
         child: the joint's child side.
     """
@@ -72,7 +79,7 @@ class Attachment:
         if self.body is None:
             return constant(at)
         weights = self.weights
-        if np.linalg.norm(arm) > 1e-12 * max(np.abs(at).max(), np.abs(self.X).max()):
+        if np.linalg.norm(arm) > COINCIDENT * self.size:
             self._check(arm / np.linalg.norm(arm), what)
             weights = weights + self.gradients @ arm
         return Vector(at, (Part(self.body, self.slots, weights, self.child),))
@@ -93,8 +100,27 @@ class Attachment:
             )
 
     def weakness(self, n: np.ndarray) -> float:
-        """0 for a direction that the section, director or solid carries, 1 for one that it does not."""
-        return float(np.linalg.norm(self.weak @ n)) if self.body else 0.0
+        """0 for a direction that the section, director or solid carries, 1 for one that it does not; 10: not known."""
+        if self.body is None:
+            return 0.0
+        return float(np.linalg.norm(self.weak @ n) + UNKNOWN * (np.linalg.norm(n - self.known @ n) > 1e-6))
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the body's box, m; 0 of the ground."""
+        if self.body is None:
+            return 0.0
+        low, high = self.body.mesh.bounding_box()
+        return float(np.linalg.norm(np.asarray(high) - np.asarray(low)))
+
+    def same_as(self, other: Attachment) -> bool:
+        """Whether both are the same place of the same body."""
+        return (
+            self.body is not None
+            and self.body is other.body
+            and np.array_equal(self.slots, other.slots)
+            and np.array_equal(self.weights, other.weights)
+        )
 
 
 def attach(thing: Any, what: str, *, child: bool) -> Attachment:
@@ -132,13 +158,13 @@ def _weak(body: Body, axes: np.ndarray) -> np.ndarray:
     return columns @ columns.T
 
 
-def _fit(weights: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fit(weights: np.ndarray, X: np.ndarray, flat: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Affine least-squares fit of points X (n, 3): mean (3,), gradients (n, 3), projector on what they span."""
     mean = weights @ X
     arm = X - mean
     C = arm.T @ (weights[:, None] * arm)
     values, vectors = np.linalg.eigh(C)
-    good = vectors[:, values > 1e-10 * max(values.max(), 1e-300)]
+    good = vectors[:, values > flat * max(values.max(), 1e-300)]
     good = good if values.max() > 0.0 else good[:, :0]
     inverse = good @ np.diag(1.0 / np.diag(good.T @ C @ good)) @ good.T if good.size else np.zeros((3, 3))
     return mean, weights[:, None] * arm @ inverse, good @ good.T
@@ -151,7 +177,7 @@ def _of_nodes(nodes: NodeSet, child: bool) -> Attachment:
     position = support_slots(nodes, "position")
     X = body.reference[position] + body.origin
     weights = np.full(len(position), 1.0 / len(position))
-    mean, gradients, span = _fit(weights, X)
+    mean, gradients, span = _fit(weights, X, FLAT_NODES)
     weak = np.zeros((3, 3))
     full = nodes.indices[body.node_slot_count[nodes.indices] == 4]
     if len(full) and np.linalg.norm(span - np.eye(3)) > 1e-9:
@@ -178,7 +204,7 @@ def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
     )
     share = (dA / dA.sum()).ravel()
     X = np.einsum("fqi,fik->fqk", t.shape, x).reshape(-1, 3)
-    mean, at_points, span = _fit(share, X)
+    mean, at_points, span = _fit(share, X, FLAT_SURFACE)
     n = body.slot_count
     weights, gradients = np.zeros(n), np.zeros((n, 3))
     np.add.at(weights, t.conn, np.einsum("fq,fqi->fi", dA / dA.sum(), t.shape))
@@ -195,6 +221,8 @@ def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
             h = np.einsum("fq,fqsk->fsk", dA[rows] / dA.sum(), assembly.gradients(ds, J)) @ rest
             np.add.at(gradients, body.connectivity[members], h)
             weak = rest @ _weak(body, assembly.orthonormal(J[0, 0])) @ rest
+        if body.family.solid:  # the mean of F across a face feels the strain at it, the fit in its plane does not
+            weak = ACROSS * rest
     slots = np.flatnonzero((weights != 0.0) | gradients.any(axis=1))
     return Attachment(body, mean, slots, weights[slots], gradients[slots], np.eye(3), weak, label, child)
 
@@ -212,6 +240,10 @@ def make_joint(
     P, Q = attach(parent, f"{what}: parent", child=False), attach(child, f"{what}: child", child=True)
     if P.body is None and Q.body is None:
         raise ModelError(f"{what}: neither parent nor child is a body")
+    if P.same_as(Q):
+        raise ModelError(f"{what}: parent and child are the same place, {P.label}")
+    if axis2 is not None and kind != "universal":
+        raise ModelError(f"{what}: only universal joints have an axis2")
     law = None
     if drive is not None:
         if kind not in DRIVEN:
@@ -225,12 +257,9 @@ def make_joint(
         raise ModelError(f"{what}: a {kind} joint {'needs an axis' if axis is None else 'has no axis'}")
     at = _anchor(what, P, Q, anchor)
     n = None if axis is None else _unit(axis, f"{what}: axis")
-    if axis2 is not None and kind != "universal":
-        raise ModelError(f"{what}: only universal joints have an axis2")
     x_p, x_c = P.position(at, what), Q.position(at, what)
-    gap = x_c - x_p
-    gap = Vector(np.zeros(3), gap.parts)
-    rows = []
+    gap = Vector(np.zeros(3), (x_c - x_p).parts)
+    rows: list[Row] = []
     angle = travel = None
     if kind in ("spherical", "universal", "revolute", "fixed"):
         rows += pin_rows(gap)
@@ -258,7 +287,9 @@ def make_joint(
             rows.append(_dp(P.direction(a, what), Q.direction(b, what)))
         else:
             angle = _angle(n, u, w, P, Q, what)
-    if law is not None and angle is not None:
+    if law is not None and kind == "revolute":
+        if angle is None:
+            raise ModelError(f"{what}: {P.label} and {Q.label} do not tell the angle about the axis; give more nodes")
         first, second, turned = angle
         rows.append(Row(TURN, first, turned, 1.0, second, law, angular=True))
     elif law is not None and travel is not None:
@@ -296,8 +327,8 @@ def _locked(P: Attachment, Q: Attachment, what: str) -> list[Row]:
     """Three DP1 between two triads that agree, the pairs chosen among directions that both sides carry."""
     triads = [np.eye(3)]
     for side in (Q, P):
-        if side.body is not None and not side.body.family.solid:
-            values, vectors = np.linalg.eigh(side.weak)
+        if side.body is not None and side.weak.any():
+            _, vectors = np.linalg.eigh(side.weak)
             triads.append(vectors.T)
     best = None
     for triad in triads:
@@ -329,23 +360,17 @@ def _pair(n: np.ndarray, P: Attachment, Q: Attachment) -> tuple[np.ndarray, np.n
 
 def _angle(
     n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attachment, what: str
-) -> tuple[Vector, Vector, Vector]:
-    """Vectors (a, a2, b): the child has turned about n by the angle of b from a towards a2."""
-    best: tuple[float, tuple[Vector, Vector, Vector]] | None = None
+) -> tuple[Vector, Vector, Vector] | None:
+    """Vectors (a, a2, b): the child has turned about n by the angle of b from a towards a2; None: not known."""
+    options = []
     for first, second in ((u, w), (w, -u)):
-        both = P.weakness(u) + P.weakness(w)
-        cost = both + Q.weakness(first)
-        if best is None or cost < best[0] - 1e-9:
-            vectors = P.direction(first, what), P.direction(second, what), Q.direction(first, what)
-            best = (cost, vectors)
-        both = Q.weakness(u) + Q.weakness(w)
-        cost = both + P.weakness(first)
-        if cost < best[0] - 1e-9:
-            # seen from the child, the parent turns the other way
-            vectors = Q.direction(first, what), Q.direction(-second, what), P.direction(first, what)
-            best = (cost, vectors)
-    assert best is not None
-    return best[1]
+        for pair, other, sign in ((P, Q, 1.0), (Q, P, -1.0)):  # seen from the child, the parent turns the other way
+            cost = pair.weakness(u) + pair.weakness(w) + other.weakness(first)
+            options.append((round(cost, 9), len(options), pair, other, first, sign * second))
+    cost, _, pair, other, first, second = min(options, key=lambda option: option[:2])
+    if cost >= UNKNOWN:
+        return None
+    return pair.direction(first, what), pair.direction(second, what), other.direction(first, what)
 
 
 def _anchor(what: str, P: Attachment, Q: Attachment, anchor: Any) -> np.ndarray:
@@ -354,7 +379,7 @@ def _anchor(what: str, P: Attachment, Q: Attachment, anchor: Any) -> np.ndarray:
     at = Q.X if Q.body is not None else P.X
     if P.body is not None and Q.body is not None:
         apart = float(np.linalg.norm(P.X - Q.X))
-        if apart > 1e-9 * max(np.abs(P.X).max(), np.abs(Q.X).max(), 1e-300):
+        if apart > COINCIDENT * max(P.size, Q.size):
             raise ModelError(f"{what}: {P.label} and {Q.label} are {apart:.6g} m apart; say where: anchor=")
     return at
 
@@ -370,13 +395,13 @@ def _distance(what: str, name: str, P: Attachment, Q: Attachment, anchor: Any, l
             ends.append(side.position(side.X, what))
     if anchor is not None and P.body is not None and Q.body is not None:
         raise ModelError(f"{what}: a distance joint between two bodies ends at their points; it has no anchor")
-    return Joint(name, "distance", [_dist(what, ends[0], ends[1], law)], ends[1], _between(P, Q))
+    return Joint(name, "distance", [_dist(what, ends[0], ends[1], law, max(P.size, Q.size))], ends[1], _between(P, Q))
 
 
-def _dist(what: str, p: Vector, q: Vector, law: TimeLaw | None) -> Row:
+def _dist(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: float) -> Row:
     gap = q - p
     length = float(np.linalg.norm(gap.value))
-    if length <= 1e-9 * max(np.abs(p.value).max(), np.abs(q.value).max(), 1e-300):
+    if length <= COINCIDENT * size:
         raise ModelError(f"{what}: its two points coincide, so that the distance has no direction; pin them instead")
     if law is not None and len(law.values) and law.values[:, 0].min() <= 0.0:
         raise ModelError(f"{what}: the distance must be positive, the law falls to {law.values[:, 0].min():g} m")
@@ -421,7 +446,11 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
     for k, point in enumerate(points):
         if isinstance(point, Ground):
             raise ModelError(f"{what}: a point of the ground is given by its place (x, y, z)")
-        places.append(attach(point, f"{what}: point {k + 1}", child=k >= count // 2))
+        places.append(attach(point, f"{what}: point {k + 1}", child=k == count - 1))
+    first, last = places[0], places[-1]
+    if count == 4 and places[2].body is last.body is not first.body:
+        places[2] = replace(places[2], child=True)  # DP1 acts on the last point's body with a couple
+    size = max(p.size for p in places)
     if all(p.body is None for p in places):
         raise ModelError(f"{what}: none of its points belongs to a body")
     x = [p.position(p.X, what) for p in places]
@@ -431,7 +460,7 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
         gap = x[0] - x[1]
         apart = float(np.linalg.norm(gap.value))
         if law is None:
-            if apart > 1e-9 * max(np.abs(x[0].value).max(), np.abs(x[1].value).max(), 1e-300):
+            if apart > COINCIDENT * size:
                 raise ModelError(
                     f"{what}: its points are {apart:.6g} m apart in the reference; value=(x, y, z) prescribes P - Q"
                 )
@@ -439,11 +468,11 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
         return Joint(name, kind, pin_rows(gap, law), x[1], between)
     law = None if value is None else time_law(value, f"{what}: value", scalar=True)
     if kind == "DIST":
-        return Joint(name, kind, [_dist(what, x[0], x[1], law)], x[1], between)
+        return Joint(name, kind, [_dist(what, x[0], x[1], law, size)], x[1], between)
     a, b = x[1] - x[0], x[3] - x[2]
     if kind == "DP2" and places[2].body is not places[0].body:
         raise ModelError(f"{what}: its third point must be on the body of the first two; use DP1")
     for label, v in (("P and Q", a), ("R and T", b)):
-        if np.linalg.norm(v.value) <= 1e-9 * max(float(np.abs(p.X).max()) for p in places):
+        if np.linalg.norm(v.value) <= COINCIDENT * size:
             raise ModelError(f"{what}: its points {label} coincide, so that it has no direction")
     return Joint(name, kind, [Row(DOT, a, b, _scale(a, b), angular=True, **_right_side(law))], x[3], between)

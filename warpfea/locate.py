@@ -14,8 +14,10 @@ from .surfaces import element_functions
 __all__ = ["element_boxes", "locate"]
 
 
-def locate(body: Body, X: Any) -> MaterialPoint:
+def locate(body: Body, X: Any, slack: float = 1e-9) -> MaterialPoint:
     """Find X (3,), m, in the reference of a body, by Newton's method in every element near it.
+
+    A point outside by no more than `slack` of an element's size is found by the element's functions there.
 
     Raises:
         ModelError: X is not three finite numbers, or lies outside of the body.
@@ -48,7 +50,7 @@ def locate(body: Body, X: Any) -> MaterialPoint:
         outside = parent.outside(xi) + miss
         k = int(np.argmin(outside))
         best = (float(outside[k]), int(near[k]), xi[k])
-    if best[0] > max(1e-9, 1e-12 * float(np.abs(x).max()) / size):
+    if best[0] > max(slack, 1e-12 * float(np.abs(x).max()) / size):
         low, high = body.mesh.bounding_box()
         raise ModelError(
             f"body {body.name!r}: point {x.tolist()} lies outside of it (its nodes fill the box "

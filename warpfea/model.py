@@ -333,16 +333,18 @@ class Model:
             ties = self.constraints.jacobian(start)
         for label in range(self.component_count):
             slots = np.flatnonzero(self.component == label)
-            parts = np.unique(self.part[slots])
-            motions = np.zeros((len(parts), 6, self.slots, 3))
-            for k, part in enumerate(parts):
-                own = np.flatnonzero(self.part == part)
-                motions[k][:, own] = assembly.rigid_modes(self.reference[own], self.slot_kind[own])
+            parts, part = np.unique(self.part[slots], return_inverse=True)
+            motions = np.zeros((len(parts), 6, len(slots), 3))
+            for k in range(len(parts)):
+                own = np.flatnonzero(part == k)
+                motions[k][:, own] = assembly.rigid_modes(self.reference[slots[own]], self.slot_kind[slots[own]])
             modes = motions.reshape(6 * len(parts), -1)
             modes /= np.linalg.norm(modes, axis=1)[:, None]
-            held = modes[:, (self.free_host == 0.0).ravel()]
+            held = modes[:, (self.free_host[slots] == 0.0).ravel()]
             if ties is not None:
-                held = np.hstack([held, (ties @ modes.T).T / self.size])
+                columns = (3 * slots[:, None] + np.arange(3)).ravel()
+                rows = np.flatnonzero(self.constraints.component_host == label) if self.constraints else []
+                held = np.hstack([held, (ties[rows][:, columns] @ modes.T).T / self.size])
             values = np.linalg.svd(held, compute_uv=False) if held.size else np.zeros(0)
             free = len(modes) - int(np.sum(values > 1e-9))
             if free:

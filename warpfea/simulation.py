@@ -99,6 +99,7 @@ class Simulation(Results):
         constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
             float64, 1e-5 in float32.
         ledger: keep the energy ledger.
+        record: keep what probes and joints tell of every step, else of the last alone.
         capture: record a step as one graph, on the GPU and on the CPU.
         on_compile: called with (modules ready, modules in all, name) while kernels compile.
         on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
@@ -119,6 +120,7 @@ class Simulation(Results):
         solver: NewtonPCG | None = None,
         constraint_tol: float | None = None,
         ledger: bool = True,
+        record: bool = True,
         capture: bool = True,
         on_failure: str | None = None,
         on_compile: Callable[[int, int, str], None] | None = None,
@@ -129,12 +131,15 @@ class Simulation(Results):
         if on_failure not in (None, "raise", "freeze"):
             raise ModelError(f"on_failure = {on_failure!r} is neither 'raise' nor 'freeze'")
         self.on_failure = on_failure
+        self.record = record
 
     @classmethod
-    def _static(cls, model: Model, state: State, solver: NewtonPCG, dt: float) -> Simulation:
+    def _static(
+        cls, model: Model, state: State, solver: NewtonPCG, dt: float, constraint_tol: float | None
+    ) -> Simulation:
         """The same loop for load steps of statics."""
         self = cls.__new__(cls)
-        self._start(model, state, integrators.INTEGRATORS["static"], solver, False, True)
+        self._start(model, state, integrators.INTEGRATORS["static"], solver, False, True, None, constraint_tol)
         self.dt = dt
         self.on_failure = "raise"
         return self
@@ -178,6 +183,7 @@ class Simulation(Results):
         self.totals = {"newton": np.zeros(model.worlds, int), "pcg": np.zeros(model.worlds, int)}
         self.max_residual = 0.0
         self.max_violation = 0.0
+        self.record = True
         self._stepped = np.zeros(model.worlds, dtype=bool)
         self._history: list[np.ndarray] = []
 
@@ -247,7 +253,9 @@ class Simulation(Results):
             self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
             self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
         if self._recorded:
-            self._history.append(rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy())
+            if not self.record:
+                self._history.clear()
+            self._history.append(self._row(rows))
         if fresh.any():
             fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
             if fatal:
@@ -256,6 +264,12 @@ class Simulation(Results):
                     if self._recorded:
                         self._history.pop()
                 raise self._failure(int(np.flatnonzero(fresh)[0]))
+
+    def _row(self, rows: np.ndarray) -> np.ndarray:
+        """What is kept of a report: time, probes, and joints, which a world that did not step does not tell."""
+        row = rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy()
+        row[~self._stepped, 1 + 6 * len(self.model.probes) :] = np.nan
+        return row
 
     @property
     def _recorded(self) -> bool:
@@ -355,6 +369,7 @@ class Simulation(Results):
         self._stepped[mask] = False
         if self.model.constraints:
             self.stepper.begin_constraints()
+            check_closed(self, mask)
         if self.stepper.ledger:
             self.stepper.begin_ledger(mask)
 
@@ -368,7 +383,7 @@ class Simulation(Results):
         k = names.index(name)
         table = self._table([0, *range(1 + 6 * k, 7 + 6 * k)])
         d, v = table[:, :, 1:4], table[:, :, 4:7]
-        return ProbeRecord(table[0, :, 0], self.model.probes[k].X + d, d, v)
+        return ProbeRecord(table[:, :, 0].max(axis=0), self.model.probes[k].X + d, d, v)
 
     def _table(self, columns: list[int]) -> np.ndarray:
         """(B, steps, columns) of what was recorded: time, then the columns of the report from the probes on."""
@@ -412,7 +427,7 @@ class Simulation(Results):
         first = 1 + 6 * len(self.model.probes) + JOINT_COLUMNS * self._joint(joint).index
         columns = [0, *range(first, first + JOINT_COLUMNS)]
         table = self._table(columns)
-        return JointRecord(table[0, :, 0], table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
+        return JointRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
 
     def joint_force(self, joint: Joint | str) -> np.ndarray:
         """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
@@ -430,17 +445,22 @@ class Simulation(Results):
         k = self._joint(joint).index
         constraints = self.model.constraints
         assert constraints is not None
-        return np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
+        values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
+        # where the last step has brought it, the right sides are that step's: statics runs in a time of its own
+        column = len(REPORT) + 6 * len(self.model.probes) + JOINT_COLUMNS * k + 6
+        return np.where(self._stepped, self.stepper.work.report.numpy()[:, column], values)
 
-    def joint_value(self, joint: Joint | str) -> np.ndarray:
+    def joint_value(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
         """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
 
-        (B,), in the present state; a driven angle counts its full turns, another lies between -pi and pi.
+        (B,), in the present state; a driven angle counts its full turns, another lies between -pi and pi. `what`:
+        "angle", "travel" or "length", where a joint has several. Travel is along the parent's axis, per unit of its
+        reference.
         """
         known = self._joint(joint)
         constraints = self.model.constraints
         assert constraints is not None
-        return constraints.measure(known, self.state)
+        return constraints.measure(known, what, self.state)
 
     def _joint(self, joint: Joint | str) -> Joint:
         """A joint of this model, by handle or name."""

@@ -76,6 +76,7 @@ def solve_static(
     tol: float | None = None,
     solver: NewtonPCG | None = None,
     state: State | None = None,
+    constraint_tol: float | None = None,
     progress: bool | None = False,
 ) -> StaticResult:
     """Find the static equilibrium.
@@ -87,6 +88,7 @@ def solve_static(
         load_steps: number of load steps.
         tol: relative residual, by default the solver's.
         solver: NewtonPCG options; by default with room for slender bodies, max_pcg = 20000.
+        constraint_tol: as of Simulation.
         state: start; by default model.state(). It is copied.
 
     Raises:
@@ -105,7 +107,7 @@ def solve_static(
         options = replace(options, tol=tol)
     start = model.state() if state is None else state.like()
     start.time.zero_()
-    sim = Simulation._static(model, start, options, 1.0 / load_steps)
+    sim = Simulation._static(model, start, options, 1.0 / load_steps, constraint_tol)
     sim.run(1.0, progress=progress)
     assert sim.last is not None
     start.time.zero_()  # what starts from the equilibrium starts at t = 0

@@ -112,7 +112,7 @@ class Stepper:
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
         self._laws(active)
         w.u.assign(state.displacement)
-        constraints.start(state.constraint_force, active)
+        constraints.start(state.constraint_force, state.constraint_target, active)
         constraints.evaluate(active)
         known = state.constraint_target.numpy()
         state.constraint_target.assign(np.where(np.isnan(known), w.multipliers.target.numpy(), known))
@@ -219,7 +219,7 @@ class Stepper:
         self._damping(running)
         constraints = self.newton.constraints
         if constraints:
-            constraints.start(state.constraint_force, running)
+            constraints.start(state.constraint_force, state.constraint_target, running)
         self.newton.run()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
         if self.backup is not None:

@@ -19,6 +19,10 @@ __all__ = ["make_weld"]
 
 PER_ELEMENT = 2.0
 MOST_PARTS = 8
+NEAR = 0.5
+"""Distance from a surface's points, over its size, at which a face is not meant to be on it."""
+SLACK = 1e-4
+"""Gap that is bridged, over an element's size: files hold rounded coordinates."""
 
 
 def make_weld(first: NodeSet | SurfaceSet, second: SurfaceSet | Body, name: str) -> Joint:
@@ -29,12 +33,13 @@ def make_weld(first: NodeSet | SurfaceSet, second: SurfaceSet | Body, name: str)
     if body is holder:
         raise ModelError(f"{what}: both sides are body {body.name!r}")
     face = first if isinstance(first, SurfaceSet) else _face(first)
+    within = second if isinstance(second, SurfaceSet) else None
     if face is not None:
-        gaps, anchor = _mortar(face, holder, what)
+        gaps, anchor = _mortar(face, holder, within, what)
         label = f"surface {face.name!r} of body {body.name!r}" if face.name else f"a surface of body {body.name!r}"
     else:
         assert isinstance(first, NodeSet)
-        gaps, anchor = _pins(first, holder, what)
+        gaps, anchor = _pins(first, holder, within, what)
         label = f"{len(gaps)} nodes of body {body.name!r}"
     rows = [row for gap in gaps for row in pin_rows(gap)]
     return Joint(name, "weld", rows, anchor, f"body {holder.name!r} and {label}")
@@ -49,7 +54,7 @@ def _face(nodes: NodeSet) -> SurfaceSet | None:
     return None if faces is None else SurfaceSet(body, faces, nodes.name)
 
 
-def _mortar(face: SurfaceSet, holder: Body, what: str) -> tuple[list[Vector], Vector]:
+def _mortar(face: SurfaceSet, holder: Body, within: SurfaceSet | None, what: str) -> tuple[list[Vector], Vector]:
     """One vector per slot i of the face: int phi_i (x - x_holder) dA / int |phi_i| dA."""
     body = face.body
     t = assembly.facet_tables(face, _parts(face, holder))
@@ -57,6 +62,7 @@ def _mortar(face: SurfaceSet, holder: Body, what: str) -> tuple[list[Vector], Ve
     normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
     dA = np.linalg.norm(normal, axis=2) * t.weights
     X = np.einsum("fqi,fik->fqk", t.shape, x)
+    _check_near(X.reshape(-1, 3), within, what)
     n, m = body.slot_count, holder.slot_count
     F, Q, _ = t.shape.shape
     own, other = np.zeros((F * Q, n)), np.zeros((F * Q, m))
@@ -85,11 +91,12 @@ def _parts(face: SurfaceSet, holder: Body) -> int:
     return int(np.clip(np.ceil(PER_ELEMENT * np.sqrt(area) / size), 1, MOST_PARTS))
 
 
-def _pins(nodes: NodeSet, holder: Body, what: str) -> tuple[list[Vector], Vector]:
+def _pins(nodes: NodeSet, holder: Body, within: SurfaceSet | None, what: str) -> tuple[list[Vector], Vector]:
     """Nodes at their places in the holder."""
     body = nodes.body
     slots = support_slots(nodes, "position")
     places = body.reference[slots] + body.origin
+    _check_near(places, within, what)
     gaps = []
     for slot, X in zip(slots, places):
         own, other = np.zeros(body.slot_count), np.zeros(holder.slot_count)
@@ -102,9 +109,26 @@ def _pins(nodes: NodeSet, holder: Body, what: str) -> tuple[list[Vector], Vector
     return gaps, _anchor(body, mean, places.mean(axis=0))
 
 
+def _check_near(X: np.ndarray, within: SurfaceSet | None, what: str) -> None:
+    """Raise ModelError for points (n, 3) off the box of the surface that was named."""
+    if within is None:
+        return
+    body, t = within.body, assembly.facet_tables(within)
+    at = body.reference[t.conn] + (body.slot_kind[t.conn] == 0)[:, :, None] * body.origin
+    x = np.einsum("fqi,fik->fqk", t.shape, at).reshape(-1, 3)
+    low, high = x.min(axis=0), x.max(axis=0)
+    slack = NEAR * float(np.linalg.norm(high - low))
+    off = np.flatnonzero(((low - slack > X) | (high + slack < X)).any(axis=1))
+    if len(off):
+        raise ModelError(
+            f"{what}: the point {np.round(X[off[0]], 6).tolist()} of the first face is not on surface {within.name!r} "
+            f"of body {body.name!r}"
+        )
+
+
 def _locate(holder: Body, X: np.ndarray, what: str) -> Any:
     try:
-        return locate(holder, X)
+        return locate(holder, X, slack=SLACK)
     except ModelError as error:
         raise ModelError(f"{what}: {error}; the welded face must lie in the other body") from None
 

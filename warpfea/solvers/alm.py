@@ -72,9 +72,10 @@ class ConstraintSolver:
         self.large = model.array("constraints", large, wp.int32) if self.largest else None
         self.large_count = len(large)
 
-    def start(self, multipliers: wp.array, active: wp.array) -> None:
-        """Warm start of an attempt from the state's multipliers; rho is not known yet."""
-        self.launch(self.kernels.load_multipliers, self.dim, [multipliers, active, self.work.multipliers])
+    def start(self, multipliers: wp.array, travel: wp.array, active: wp.array) -> None:
+        """Warm start of an attempt from the state's multipliers and right sides; rho is not known yet."""
+        args = [multipliers, travel, active, self.work.multipliers]
+        self.launch(self.kernels.load_multipliers, self.dim, args)
 
     def evaluate(self, active: wp.array) -> None:
         """c, J and the augmented potential's rows at work.u."""
@@ -129,7 +130,7 @@ class ConstraintSolver:
     def predict(self, active: wp.array) -> None:
         """The multipliers' part of the Newton step in work.direction."""
         w = self.work
-        args = [self.constraints.data, w.multipliers, w.direction, w.step.dq_dv, active]
+        args = [self.constraints.data, w.multipliers, w.direction, w.newton.quiet, w.step.dq_dv, active]
         self.launch(self.kernels.predict_change, self.dim, args)
 
     def adopt(self, flags: wp.array) -> None:
