@@ -36,8 +36,8 @@ DISTANCE = 1
 TURN = 2
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
-MOST_TURN = 2.0
-"""rad that a driven angle may change by in a substep."""
+MOST_TURN = 1.0
+"""rad that a driven angle may change by in a substep: from further off, a body may be crushed instead of turned."""
 SUM_ROWS = 3
 """Rows summed per world with an evaluation: the augmented potential with the multipliers held, with the new ones, and
 its magnitude."""

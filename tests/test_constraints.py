@@ -834,9 +834,20 @@ def test_handles_of_another_model_are_refused():
             ask("fixed_1")
 
 
+@wp.func
+def mixed_precision(t: wp.float64) -> wp.float64:
+    return 0.5 * t
+
+
+def test_a_law_that_does_not_compile_is_named():
+    model, _ = joined("revolute", ("ground", "beam"), mixed_precision, axis=(0, 1, 0))
+    with pytest.raises(wf.ModelError, match=r"mixed_precision.*write it in the precision"):
+        wf.Simulation(model, dt=1e-3)
+
+
 def test_a_mechanism_without_support_has_no_statics():
     model, _ = joined("revolute", ("ground", "surface"))
-    with pytest.raises(wf.ModelError, match="leave 1 rigid motions free"):
+    with pytest.raises(wf.ModelError, match="leave 1 rigid motion free"):
         wf.solve_static(model)
     model, _ = joined("fixed", ("ground", "surface"))
     assert wf.solve_static(model, load_steps=1).report.converged.all()

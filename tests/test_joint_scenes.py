@@ -239,5 +239,6 @@ def test_readme_shows_how_joints_are_made_and_read():
 @pytest.mark.parametrize("code", readme_code(), ids=lambda code: str(len(code)))
 def test_readme_code_runs(code, tmp_path):
     env = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True)
+    (tmp_path / "example.py").write_text(code)
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

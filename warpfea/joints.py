@@ -380,7 +380,10 @@ def _anchor(what: str, P: Attachment, Q: Attachment, anchor: Any) -> np.ndarray:
     if P.body is not None and Q.body is not None:
         apart = float(np.linalg.norm(P.X - Q.X))
         if apart > COINCIDENT * max(P.size, Q.size):
-            raise ModelError(f"{what}: {P.label} and {Q.label} are {apart:.6g} m apart; say where: anchor=")
+            raise ModelError(
+                f"{what}: {P.label} and {Q.label} are {apart:.6g} m apart; say where: anchor=, which keeps the gap (to "
+                "close it, pin both with value=(0, 0, 0) and call solve_static)"
+            )
     return at
 
 

@@ -350,8 +350,9 @@ class Model:
             if free:
                 body = next(b for b in self.bodies if b.slot_offset <= slots[0] < b.slot_offset + b.slot_count)
                 raise ModelError(
-                    f"body {body.name!r} is not supported: supports and joints leave {free} rigid motions free, and "
-                    "statics has no unique answer; clamp or drive more nodes"
+                    f"body {body.name!r} is not supported: supports and joints leave {free} rigid "
+                    f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "
+                    "not counted): clamp or drive more nodes, or let a damped dynamic run come to rest"
                 )
 
     # what users call

@@ -394,6 +394,9 @@ class Simulation(Results):
     def energies(self) -> dict[str, np.ndarray]:
         """Energy ledger, each (B,), J.
 
+        work_joints is the force at the end of each substep times the drive's travel, as the scheme has it; `integrator`
+        takes what that differs from the exact work, and may be negative.
+
         kinetic, strain and potential (of gravity, from the reference) are current values. work (by loads, supports,
         fields and driven joints, also given apart), viscous, contact, friction and integrator add up from the start;
         ledger_residual is change of energy + losses - work, which equals `unbalanced`, the sum of g . dq that the

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
+from .errors import ModelError
 from .integrators import Integrator
 from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_kernels
 from .launch import Launcher
@@ -171,9 +172,24 @@ class Stepper:
             load = partial(wp.force_load, m.device, max_workers=0)
             waiting = {pool.submit(load, [module]): name for name, module in modules.items()}
             for done, future in enumerate(as_completed(waiting)):
-                future.result()
+                self._raise_of(future, waiting[future])
                 if self.on_compile:
                     self.on_compile(done + 1, len(waiting), waiting[future])
+
+    @staticmethod
+    def _raise_of(future: Future[Any], name: str) -> None:
+        """Errors of compilation; those of a user's function as such."""
+        try:
+            future.result()
+        except Exception as error:
+            if ".law_" in name or ".field_" in name:
+                reason = str(error).strip().splitlines()[-1]
+                raise ModelError(
+                    f"Warp can't compile a wp.func given as a time law or field ({name.rpartition('.')[2]}): {reason}; "
+                    "write it in the precision of its annotations, such as def f(t: wp.float64) -> wp.float64: return "
+                    "wp.float64(2.0) * t"
+                ) from error
+            raise
 
     def run(self) -> None:
         """Do one step of every running world."""
