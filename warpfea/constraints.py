@@ -452,6 +452,7 @@ class Constraints:
         out = []
         for world, u in enumerate(state.displacement.numpy().astype(float)):
             if what == "length":
+                assert length is not None
                 out.append(np.linalg.norm(self._present(length, u)))
             elif what == "travel":
                 gap, axis = (self._present(v, u) for v in joint.travel or ())

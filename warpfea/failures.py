@@ -69,8 +69,8 @@ def check_closed(sim: Simulation, mask: np.ndarray | None = None) -> None:
             time = float(sim.time[world])
             raise ConstraintError(
                 f"joint or constraint {names[0]!r} is {worst[0]:.3g} m off at the start in world {world}, "
-                f"t = {time:.6g} s, and would snap shut in the first step; begin its drive at the present value, move the bodies, or assemble "
-                "them with solve_static",
+                f"t = {time:.6g} s, and would snap shut in the first step; begin its drive at the present value, move "
+                "the bodies, or assemble them with solve_static",
                 joints=names, violations=worst, world=world, time=time, state=sim.state,
             )  # fmt: skip
 

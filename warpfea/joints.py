@@ -362,7 +362,7 @@ def _angle(
     n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attachment, what: str
 ) -> tuple[Vector, Vector, Vector] | None:
     """Vectors (a, a2, b): the child has turned about n by the angle of b from a towards a2; None: not known."""
-    options = []
+    options: list[Any] = []
     for first, second in ((u, w), (w, -u)):
         for pair, other, sign in ((P, Q, 1.0), (Q, P, -1.0)):  # seen from the child, the parent turns the other way
             cost = pair.weakness(u) + pair.weakness(w) + other.weakness(first)

@@ -343,7 +343,8 @@ class Model:
             held = modes[:, (self.free_host[slots] == 0.0).ravel()]
             if ties is not None:
                 columns = (3 * slots[:, None] + np.arange(3)).ravel()
-                rows = np.flatnonzero(self.constraints.component_host == label) if self.constraints else []
+                assert self.constraints is not None
+                rows = np.flatnonzero(self.constraints.component_host == label)
                 held = np.hstack([held, (ties[rows][:, columns] @ modes.T).T / self.size])
             values = np.linalg.svd(held, compute_uv=False) if held.size else np.zeros(0)
             free = len(modes) - int(np.sum(values > 1e-9))
