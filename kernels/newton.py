@@ -154,7 +154,11 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             if loud:
                 solve += g2
                 solve_accept = wp.min(solve_accept, accept)
-                floor_excess = wp.max(floor_excess, norm / (f64(2.0) * ctl.eps * wp.sqrt(spread) + f64(1.0e-300)))
+                rounding = f64(2.0) * ctl.eps * wp.sqrt(spread)
+                if wp.static(constrained):
+                    if ctl.classical != 0:  # the residual holds rho c, and so kappa times the rounding of places
+                        rounding = rounding / (ctl.slack * ctl.slack)
+                floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
             ratio = norm / wp.max(scale, f64(1.0e-300))
             largest = wp.max(largest, ratio)
             excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))

@@ -1,0 +1,665 @@
+"""Numbers of joints and constraints against mechanisms that were computed without warpfea.
+
+    python tests/mechanism_report.py --out tests/results/mechanisms.json
+
+The references are those of tests/mechanism_models.py and closed forms; tests/test_mechanisms.py reads the result file
+and holds it against the bars. All options of the solver are the defaults unless a row names others. `--only` does
+single parts and leaves the others in the file as they are. `no_drift` takes minutes: it keeps a checkpoint in build/,
+and the same command goes on from it after an interruption.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import itertools
+import json
+import os
+import pathlib
+import shlex
+import sys
+import time as clock
+
+import numpy as np
+import warp as wp
+
+import warpfea as wf
+from warpfea.bench import _commit, _versions, machine
+
+HERE = pathlib.Path(__file__).resolve().parent
+spec = importlib.util.spec_from_file_location("mechanism_models", HERE / "mechanism_models.py")
+models = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(models)
+
+X, Y, Z = np.eye(3)
+STEEL = 7870.0
+EVERY = lambda X: X[:, 0] > -np.inf  # noqa: E731
+PLANE = [0, 2]
+
+
+def work(sim, seconds):
+    """What a run took."""
+    n = sim.steps
+    return {"steps": n, "ms_per_step": 1e3 * seconds / n, "newton_per_step": float(sim.totals["newton"][0]) / n,
+            "pcg_per_step": float(sim.totals["pcg"][0]) / n,
+            "violation_over_size": sim.max_violation / sim.model.size}  # fmt: skip
+
+
+def timed(sim, steps):
+    """Do the steps; seconds."""
+    began = clock.perf_counter()
+    sim.step(steps)
+    return clock.perf_counter() - began
+
+
+def place(sim, name):
+    """A probe in the plane of the mechanism, (steps, 2)."""
+    return sim.probe(name).position[0][:, PLANE]
+
+
+# slider-crank
+
+
+def slider_crank(device, *, speed, E, dt, stiff=None, elements=4, shear=5.0 / 6.0):
+    """The slider-crank of mechanism_models.STANDARD in the x-z plane with a rod of modulus E, at crank angle 0 with the
+    rigid mechanism's velocities; crank and slider, a box of 2 cm, of modulus `stiff`."""
+    data = models.STANDARD
+    r, L, a, side = data["crank"], data["rod"], 0.02, data["side"]
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+
+    def law(E, density=data["density"]):
+        return wf.SVK(E=E, nu=0.3, density=density)
+
+    stiff = stiff or E
+    crank = b.add_beam([0 * X, r * X], elements=1, section=wf.Rectangle(0.02, 0.02), normal=Z, material=law(stiff),
+                       name="crank")  # fmt: skip
+    rod = b.add_beam([r * X, (r + L) * X], elements=elements, section=wf.Rectangle(side, side, shear=shear), normal=Z,
+                     material=law(E), name="rod")  # fmt: skip
+    box = wf.mesh.box((a, a, a), cells=(1, 1, 1), origin=(r + L - a / 2, -a / 2, -a / 2))
+    slider = b.add_solid(box, material=law(stiff, data["slider_mass"] / a**3), name="slider")
+    whole = slider.nodes(EVERY)
+    b.add_joint("revolute", parent=wf.GROUND, child=crank.start, axis=-Y, drive=([0.0, 1e3], [0.0, 1e3 * speed]))
+    b.add_joint("revolute", parent=crank.end, child=rod.start, axis=-Y)
+    b.add_joint("revolute", parent=whole, child=rod.end, axis=-Y, anchor=(r + L) * X)
+    b.add_joint("translational", parent=wf.GROUND, child=whole, axis=X)
+    b.set_initial(crank, velocity=lambda P: speed * np.cross(-Y, P))
+    b.set_initial(rod, velocity=lambda P: speed * r * (Z + np.cross(Y, P - r * X) / L))
+    for name, point in (("slider", whole), ("start", rod.start), ("middle", rod.at((r + L / 2) * X)), ("end", rod.end)):
+        b.add_probe(name, point)
+    return wf.Simulation(b.finalize(device=device), dt=dt, integrator="bdf2")
+
+
+def deflection(sim):
+    """Middle of the rod from the chord between its pins, positive to the left of it, m."""
+    chord = place(sim, "end") - place(sim, "start")
+    middle = place(sim, "middle") - place(sim, "start")
+    return (chord[:, 0] * middle[:, 1] - chord[:, 1] * middle[:, 0]) / np.linalg.norm(chord, axis=1)
+
+
+def rigid_slider_crank(device, quick):
+    """A slider-crank so stiff that it follows the closed form, over a turn and a bit; no gravity, bdf2.
+
+    Errors are over the length of crank + rod; `deformation` is the largest of the rod's bending and stretch over its
+    length and of the crank's stretch over its own."""
+    r, L = models.STANDARD["crank"], models.STANDARD["rod"]
+    cases = [(15.0, E, 400) for E in (2e10, 2e11, 2e12, 2e13, 2e14)] + [(15.0, 2e13, 100), (150.0, 2e15, 400)]
+    rows = []
+    for speed, E, count in [(15.0, 2e13, 100)] if quick else cases:
+        sim = slider_crank(device, speed=speed, E=E, dt=2.0 * np.pi / speed / count, elements=2)
+        seconds = timed(sim, count + count // 50)
+        time = sim.probe("slider").time
+        pin, slider, _ = models.slider_crank_kinematics(speed * time, r, L)
+        start, end = place(sim, "start"), place(sim, "end")
+        bend = np.abs(deflection(sim)).max() / L
+        stretch = np.abs(np.linalg.norm(end - start, axis=1) / L - 1.0).max()
+        crank = np.abs(np.linalg.norm(start, axis=1) / r - 1.0).max()
+        rows.append({
+            "speed": speed, "E": E, "dt": sim.dt, "turns": float(speed * time[-1] / (2.0 * np.pi)),
+            "deformation": float(max(bend, stretch, crank)),
+            "slider_error": float(np.abs(place(sim, "slider")[:, 0] - slider).max() / (r + L)),
+            "pin_error": float(np.linalg.norm(start - pin, axis=1).max() / (r + L)),
+            "off_line": float(np.abs(sim.probe("slider").position[0][:, 1:]).max() / (r + L)),
+            **work(sim, seconds),
+        })  # fmt: skip
+    return rows
+
+
+STIFF = 2e14
+"""Of the crank and the slider beside the elastic rod, Pa."""
+
+
+def flexible_slider_crank(device, quick):
+    """Deflection of the middle of the elastic rod of mechanism_models.STANDARD over its first turn, bdf2, over the
+    largest of the reference (`floating_frame_slider_crank`, 6 modes).
+
+    `from_model` is the distance from the reference, `from_limit` that from the limit of the series: of the time steps
+    by Richardson's rule at order 2, of the mesh at the order that the last three runs show. `order` is that of
+    successive differences, at the 500 times that all runs of a series share. The rod's axial ringing (18100 rad/s) and
+    faster modes, 0.1 % of the deflection, turn by hundreds of rad: they come to order 2 at much smaller steps than the
+    bending does. `slow_from_limit` and `slow_order` are therefore those of the deflection under a Hann window of two
+    axial periods. The reference neglects shear and rotary inertia; the row `shear` neglects the shear as well (a factor
+    of 1000)."""
+    data = models.STANDARD
+    turn = 2.0 * np.pi / data["speed"]
+    common = 250 if quick else 500
+    at = np.arange(1, common + 1) * turn / common
+    part = common // 4 if quick else common  # of the turn
+    bend, slide = models.floating_frame_slider_crank(np.concatenate([[0.0], at[:part]]), **data, modes=6)
+    bend, slide, peak = bend[1:], slide[1:], np.abs(bend).max()
+    window = np.hanning(2 + round(2 * (2.0 * np.pi / 18100.0) / (turn / common)))[1:-1]
+
+    def slow(d):
+        return np.convolve(d, window / window.sum(), mode="valid")
+
+    def run(series, elements, count, **options):
+        sim = slider_crank(device, speed=data["speed"], E=data["E"], dt=turn / count, stiff=STIFF, elements=elements,
+                           **options)  # fmt: skip
+        seconds = timed(sim, count * part // common)
+        pick = slice(count // common - 1, None, count // common)
+        d = deflection(sim)[pick]
+        print(f"    {series}: {elements} elements, {count} steps, {seconds:.0f} s", flush=True)
+        row = {"series": series, "elements": elements, "dt": sim.dt, "peak": float(np.abs(deflection(sim)).max()),
+               "reference_peak": float(peak), "from_model": float(np.abs(d - bend).max() / peak),
+               "slider_from_model": float(np.abs(place(sim, "slider")[pick, 0] - slide).max()),
+               **work(sim, seconds)}  # fmt: skip
+        return row, d
+
+    def judge(runs, order=None):
+        """Fill in orders and distances from the limit; the mesh and the step are halved from run to run."""
+        rows = [row for row, _ in runs]
+        for name, seen in (("", [d for _, d in runs]), ("slow_", [slow(d) for _, d in runs])):
+            gaps = [np.abs(b - a).max() for a, b in itertools.pairwise(seen)]
+            found = [None, None, *(float(np.log2(a / b)) for a, b in itertools.pairwise(gaps))]
+            limit = seen[-1] + (seen[-1] - seen[-2]) / (2.0 ** (order or found[-1]) - 1.0)
+            for row, d, p in zip(rows, seen, found):
+                row[f"{name}from_limit"] = float(np.abs(d - limit).max() / peak)
+                row[f"{name}order"] = p
+                if not name:
+                    row["limit_from_model"] = float(np.abs(limit - bend).max() / peak)
+        return rows
+
+    if quick:
+        return [run("time", 4, 1000)[0]]
+    rows = judge([run("time", 4, n) for n in (500, 1000, 2000, 4000, 8000, 16000, 32000)], 2.0)
+    rows += judge([run("mesh", n, 4000) for n in (2, 4, 8, 16)])
+    rows.append(run("shear", 8, 4000, shear=1000.0)[0])
+    return rows
+
+
+# double pendulum
+
+LINKS = (0.5, 0.5)
+WIDTH = 0.05
+
+
+def double_pendulum_links(device, *, kind, E, dt, angle):
+    """Two links 0.5 x 0.05 x 0.05 m with revolute joints in the middle of their end faces, at rest at `angle`."""
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=E, nu=0.3, density=STEEL)
+    along = np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    across = np.cross(along, Y)
+    at, above = np.zeros(3), wf.GROUND
+    for k, length in enumerate(LINKS):
+        if kind == "3243":
+            link = b.add_beam([at, at + length * along], elements=1, section=wf.Rectangle(WIDTH, WIDTH), normal=across,
+                              material=law, name=f"link_{k}")  # fmt: skip
+            top, low = link.start, link.end
+        else:
+            mesh = wf.mesh.box((length, WIDTH, WIDTH), cells=(1, 1, 1), origin=(0.0, -WIDTH / 2, -WIDTH / 2))
+            link = b.add_solid(
+                mesh, transform=(np.stack([along, Y, across], axis=1), at), material=law, name=f"link_{k}"
+            )
+            top, low = link.surface("x-"), link.surface("x+")
+        b.add_joint("revolute", parent=above, child=top, axis=-Y)
+        b.add_probe(("elbow", "tip")[k], low)
+        at, above = at + length * along, low
+    return wf.Simulation(b.finalize(device=device), dt=dt, integrator="bdf2")
+
+
+def double_pendulum(device, quick):
+    """Two stiff links that swing for 2 s from rest, bdf2, against rigid ones with the boxes' mass, centre and inertia.
+
+    Errors are the largest distances of elbow and tip over the length of both links. From the horizontal (1.571 rad) the
+    links swing to -2.19 and 2.07 rad, from 45 degrees (0.785 rad) within 0.83 rad; neither turns over."""
+    level, low = np.pi / 2, np.pi / 4
+    cases = [("time", "3243", 2e12, dt, level) for dt in (2e-3, 1e-3, 5e-4, 2.5e-4)]
+    cases += [("stiffness", "3243", E, 2.5e-4, level) for E in (2e9, 2e10, 2e11)]
+    cases += [("low", "3243", 2e11, 5e-4, low), ("solid", "T10", 2e11, 5e-4, low)]
+    rows, last = [], None
+    mass = [STEEL * WIDTH**2 * length for length in LINKS]
+    inertia = [m * (length**2 + WIDTH**2) / 12.0 for m, length in zip(mass, LINKS)]
+    for series, kind, E, dt, angle in [("quick", "3243", 2e11, 1e-3, low)] if quick else cases:
+        sim = double_pendulum_links(device, kind=kind, E=E, dt=dt, angle=angle)
+        seconds = timed(sim, round((0.5 if quick else 2.0) / dt))
+        times = np.concatenate([[0.0], sim.probe("tip").time])
+        angles, _ = models.double_pendulum(times, masses=mass, lengths=LINKS, centers=[length / 2 for length in LINKS],
+                                           inertias=inertia, angles=(angle, angle), rates=(0.0, 0.0))  # fmt: skip
+        error = {}
+        for name, exact in zip(("elbow", "tip"), models.double_pendulum_tip(angles[1:], LINKS)):
+            error[name] = float(np.linalg.norm(place(sim, name) - exact, axis=1).max() / sum(LINKS))
+        worst = max(error.values())
+        order = float(np.log2(last[1] / worst)) if last and last[0] == series == "time" else None
+        last = series, worst
+        rows.append({"series": series, "element": kind, "E": E, "dt": dt, "angle": angle, "elbow_error": error["elbow"],
+                     "tip_error": error["tip"], "order": order, "swing": [float(angles.min()), float(angles.max())],
+                     **work(sim, seconds)})  # fmt: skip
+        print(f"    {series} {kind} E {E:g} dt {dt:g}: {seconds:.0f} s", flush=True)
+    return rows
+
+
+# hanging chain
+
+
+def chain(device, kind, element, links, E):
+    """Links 10 cm long that hang straight down from the ground: model, joints from the top, weight of a link (N)."""
+    length, h = 0.1, 0.01
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=E, nu=0.3, density=STEEL)
+    above, joints = wf.GROUND, []
+    for k in range(links):
+        z = -k * length
+        if element == "3243":
+            link = b.add_beam([z * Z, (z - length) * Z], elements=1, section=wf.Rectangle(h, h), normal=Y, material=law)
+            top, low = link.start, link.end
+        else:
+            mesh = wf.mesh.box((h, h, length), cells=(1, 1, 2), origin=(-h / 2, -h / 2, z - length))
+            link = b.add_solid(mesh, material=law)
+            top, low = link.surface("z+"), link.surface("z-")
+        options = {"revolute": {"axis": (X, Y)[k % 2]}, "universal": {"axis": X}}.get(kind, {})
+        chosen = kind
+        if kind == "fixed and held slides":
+            chosen = ("fixed", "translational")[k % 2]
+            options = {"axis": Z, "drive": 0.0} if k % 2 else {}
+        joints.append(b.add_joint(chosen, parent=above, child=top, **options))
+        above = low
+    return b.finalize(device=device), joints, STEEL * h * h * length * 9.81
+
+
+def hanging_chain(device, quick):
+    """Reaction of every joint of a chain of 10 steel links that hangs at rest, against the weight below it.
+
+    By solve_static (one load step), where the joints leave no rigid motion, and by 20 steps of 10 ms of backward Euler
+    from the straight unstressed chain, which its damping settles. `force_error` is the largest of |F - W| / W,
+    `moment_error` of the moment over weight x link length."""
+    stiff = {"max_pcg": 20000}
+    cases = [
+        ("static", "fixed", "3243", {}),
+        ("static", "fixed and held slides", "3243", {}),
+        ("static", "fixed", "T10", {}),
+    ]
+    cases += [("dynamic", kind, "3243", {}) for kind in ("fixed", "spherical", "revolute", "universal")]
+    cases += [("dynamic", kind, "T10", stiff) for kind in ("fixed", "spherical", "revolute")]
+    if quick:
+        cases = [
+            ("static", "fixed", "3243", {}),
+            ("dynamic", "spherical", "3243", {}),
+            ("dynamic", "revolute", "3243", {}),
+        ]
+    rows, links, E = [], 10, 2e11
+    for way, kind, element, options in cases:
+        model, joints, weight = chain(device, kind, element, links, E)
+        began = clock.perf_counter()
+        if way == "static":
+            sim = wf.solve_static(model, load_steps=1).simulation
+        else:
+            sim = wf.Simulation(model, dt=1e-2, solver=wf.NewtonPCG(**options))
+            sim.step(20)
+        seconds = clock.perf_counter() - began
+        below = weight * np.arange(links, 0, -1)
+        got = np.array([sim.joint_force(joint)[0] for joint in joints])
+        error = np.linalg.norm(got[:, :3] - below[:, None] * Z, axis=1) / below
+        rows.append({"way": way, "joints": kind, "element": element, "links": links, "E": E, "solver": options,
+                     "force_error": float(error.max()), "errors": [float(e) for e in error],
+                     "moment_error": float((np.linalg.norm(got[:, 3:], axis=1) / (0.1 * below)).max()),
+                     "residual": float(sim.last.residual[0]), "seconds": seconds, **work(sim, seconds)})  # fmt: skip
+        print(f"    {way} {kind} {element}: {seconds:.1f} s", flush=True)
+    return rows
+
+
+# no drift
+
+DRIFT_STEPS = 100_000
+
+
+def swing(device):
+    """A soft beam on a ball joint with another on its end by a hinge, thrown from the horizontal, 48 unknowns."""
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=1e7, nu=0.3, density=1200.0)
+    first, second = (
+        b.add_beam(
+            [0.5 * k * X, 0.5 * (k + 1) * X], elements=1, section=wf.Rectangle(0.02, 0.02), normal=Z, material=law
+        )
+        for k in range(2)
+    )
+    joints = [b.add_joint("spherical", parent=wf.GROUND, child=first.start),
+              b.add_joint("revolute", parent=first.end, child=second.start, axis=Y)]  # fmt: skip
+    for beam in (first, second):
+        b.set_initial(beam, velocity=lambda P: np.cross((0.0, 0.0, 2.0), P))
+    for name, end in (("pivot", first.start), ("above", first.end), ("below", second.start), ("tip", second.end)):
+        b.add_probe(name, end)
+    return wf.Simulation(b.finalize(device=device), dt=1e-3, integrator="bdf2"), joints
+
+
+def no_drift(device, quick, checkpoint=None, steps=None):
+    """Violation over 1e5 steps of 1 ms of bdf2: a soft double pendulum of two 3243 elements swings in space.
+
+    `violation_*` are what the joints record at every step, over the model's size; `gap` is the same of the pinned ends
+    from their positions alone. First and last: of the first and the last tenth."""
+    sim, joints = swing(device)
+    target = steps or (DRIFT_STEPS // 100 if quick else DRIFT_STEPS)
+    if checkpoint is not None and checkpoint.exists():
+        sim.resume(checkpoint)
+        print(f"    goes on from step {sim.steps} of {checkpoint}", flush=True)
+    begun_at, halvings, began = sim.steps, 0, clock.perf_counter()
+
+    def watch(sim):
+        nonlocal halvings
+        halvings += int(sim.last.halvings[0])
+        if sim.steps % 10000 == 0:
+            print(f"    step {sim.steps}: {clock.perf_counter() - began:.0f} s", flush=True)
+
+    outputs = [wf.Checkpoint(checkpoint, every=5000)] if checkpoint is not None else []
+    sim.run(target * sim.dt, outputs=outputs, on_step=watch, progress=False)
+    seconds = clock.perf_counter() - began
+    assert sim.steps == target
+    size, tenth = sim.model.size, target // 10
+    records = [sim.joint_record(joint) for joint in joints]
+    violation = np.max([r.violation[0] for r in records], axis=0) / size
+    at = {name: sim.probe(name).position[0] for name in ("pivot", "above", "below", "tip")}
+    gap = np.maximum(np.linalg.norm(at["pivot"], axis=1), np.linalg.norm(at["above"] - at["below"], axis=1)) / size
+    energy = sim.energies()
+    row = {"element": "3243", "unknowns": int(sim.model.free_slots.sum()), "E": 1e7, "dt": sim.dt, "steps": target,
+           "recorded": len(violation), "resumed_at": begun_at, "violation_max": float(violation.max()),
+           "violation_first": float(violation[:tenth].max()), "violation_last": float(violation[-tenth:].max()),
+           "max_by_tenths": [float(part.max()) for part in np.array_split(violation, 10)],
+           "mean_by_tenths": [float(part.mean()) for part in np.array_split(violation, 10)],
+           "gap_max": float(gap.max()), "gap_first": float(gap[:tenth].max()), "gap_last": float(gap[-tenth:].max()),
+           "force_max": float(max(np.linalg.norm(r.force[0], axis=1).max() for r in records)),
+           "swing_last": float(np.ptp(at["tip"][-tenth:], axis=0).max()), "halvings_since_resumed": halvings,
+           "ledger_residual": float(energy["ledger_residual"][0]), "potential": float(energy["potential"][0]),
+           "ms_per_step": 1e3 * seconds / max(target - begun_at, 1),
+           "newton_per_step": float(sim.totals["newton"][0]) / target,
+           "pcg_per_step": float(sim.totals["pcg"][0]) / target}  # fmt: skip
+    if checkpoint is not None:
+        checkpoint.unlink(missing_ok=True)
+    return [row]
+
+
+# free fall
+
+GRAVITY = np.array([0.3, -0.5, -9.81])
+BOX = (0.5, 0.1, 0.1)
+TIES = ("spherical", "revolute", "fixed", "distance")
+OUTER = {"multipliers": "outer"}
+SOLVERS = [{}, {"penalty": 1.0}, {"penalty": 1e4}, {"max_newton": 1, "max_pcg": 1},
+           OUTER | {"penalty": 1.0}, OUTER, OUTER | {"penalty": 1e4}, OUTER | {"max_outer": 1}]  # fmt: skip
+
+
+def fall(integrator, steps, v0):
+    """Displacement and velocity of a free point after steps of the lengths given: the recursion of the scheme."""
+    u, v, before = [np.zeros(3)], [np.asarray(v0, dtype=float)], None
+    for h in steps:
+        if integrator == "backward_euler" or before is None:
+            u_tilde, v_tilde, beta = u[-1], v[-1], 1.0
+        else:
+            w = h / before
+            u_tilde, v_tilde = (((1 + w) ** 2 * q[-1] - w**2 * q[-2]) / (1 + 2 * w) for q in (u, v))
+            beta = (1 + w) / (1 + 2 * w)
+        v.append(v_tilde + beta * h * GRAVITY)
+        u.append(u_tilde + beta * h * v[-1])
+        before = h
+    return u[-1], v[-1]
+
+
+class Pair:
+    """Two boxes, or a box and a beam, end to end and tied by a joint; `None` for one box of both, "weld" for b.weld."""
+
+    def __init__(self, device, tie, *, E, second="T10", velocity=(0.0, 0.0, 0.0), spin=None, extra=None):
+        b = wf.ModelBuilder(gravity=GRAVITY)
+        law = wf.SVK(E=E, nu=0.3, density=1000.0)
+        origin = (0.0, -BOX[1] / 2, -BOX[2] / 2)
+        if tie is None:
+            mesh = wf.mesh.box((2 * BOX[0], *BOX[1:]), cells=(2, 1, 1), origin=origin)
+            self.bodies = [b.add_solid(mesh, material=law, name="A")]
+        else:
+            first = b.add_solid(wf.mesh.box(BOX, cells=(1, 1, 1), origin=origin), material=law, name="A")
+            if second == "T10":
+                mesh = wf.mesh.box(BOX, cells=(1, 1, 1), origin=(BOX[0], *origin[1:]))
+                other = b.add_solid(mesh, material=law, name="B")
+                face, far = other.surface("x-"), other.at((1.5 * BOX[0], 0.0, 0.0))
+            else:
+                curve = [BOX[0] * X, 2.2 * BOX[0] * X]
+                other = b.add_beam(
+                    curve, elements=1, section=wf.Rectangle(0.05, 0.08), normal=Z, material=law, name="B"
+                )
+                face, far = other.start, other.end
+            self.bodies = [first, other]
+            if tie == "weld":
+                b.weld(face, first.surface("x+"))
+            elif tie == "distance":
+                b.add_joint(tie, parent=first.at((0.5 * BOX[0], 0.0, 0.0)), child=far)
+            else:
+                axis = {"axis": Z} if tie == "revolute" else {}
+                b.add_joint(tie, parent=first.surface("x+"), child=face, **axis)
+        if extra is not None:
+            extra(b)
+        self.velocity = np.asarray(velocity, dtype=float)
+        if spin is not None:
+            center = self._center(b.finalize(device=device))  # of a first model, for the velocities about it
+            for body in self.bodies:
+                b.set_initial(body, velocity=lambda P: self.velocity + np.cross(spin, P - center))
+        self.model = b.finalize(device=device)
+        self.mask = np.concatenate([body.slots for body in self.bodies])
+
+    def _center(self, model):
+        x = self._places(model, np.zeros((model.slots, 3)))
+        own = np.concatenate([body.slots for body in self.bodies])
+        m = model.lumped_host[own]
+        return m @ x[own] / m[model.slot_kind[own] == 0].sum()
+
+    @staticmethod
+    def _places(model, u):
+        position = (model.slot_kind == 0)[:, None]
+        origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
+        return model.reference + position * origin + u
+
+    def motion(self, state):
+        """Displacement and velocity of the centre of mass; places and velocities (slots, 3) about it; L about it."""
+        m, own = self.model, self.mask
+        u, v = (array.numpy()[0].astype(float) for array in (state.displacement, state.velocity))
+        lumped, position = m.lumped_host[own], (m.slot_kind[own] == 0)[:, None]
+        mass = lumped[position[:, 0]].sum()
+        moved, pace = lumped @ u[own] / mass, lumped @ v[own] / mass
+        x = self._places(m, u)[own]
+        x = x - position * (lumped @ x / mass)
+        v = v[own] - position * pace
+        M = self.consistent
+        return moved, pace, x, v, np.cross(x, M @ v).sum(axis=0)
+
+    @property
+    def consistent(self):
+        return self.model.mass_matrix()[::3, ::3][self.mask][:, self.mask]
+
+    def points_error(self, sim, exact):
+        """Largest distance of all nodes from a common displacement, over it."""
+        away = [np.abs(sim.displacements(body)[0] - exact).max() for body in self.bodies]
+        return float(max(away) / np.abs(exact).max())
+
+
+def attempt(row, sim, steps):
+    """Do the steps one by one; halvings of each, or None with the reason in the row."""
+    halvings = []
+    try:
+        for _ in range(steps):
+            halvings.append(int(sim.step().halvings[0]))
+    except wf.ConvergenceError as error:
+        row |= {"converged": False, "why": str(error).partition(" in world")[2][3:80], "failed_step": len(halvings)}
+        return None
+    row |= {"converged": True, "steps": steps, "halvings": sum(halvings), "newton": int(sim.totals["newton"][0]),
+            "violation_over_size": sim.max_violation / sim.model.size}  # fmt: skip
+    return halvings
+
+
+def substeps(halvings, dt):
+    """Lengths of the substeps, of a step that was halved once both halves; None where more leave them unknown."""
+    if max(halvings) > 1:
+        return None
+    return [h for n in halvings for h in ([dt / 2] * 2 if n else [dt])]
+
+
+def _plain(device, E, tie, second, integrator, options, steps=30, dt=1e-2):
+    pair = Pair(device, tie, E=E, second=second)
+    sim = wf.Simulation(pair.model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(**options))
+    row = {"case": "fall", "joint": tie, "second": second, "integrator": integrator, "E": E, "dt": dt,
+           "solver": options, "error": None}  # fmt: skip
+    halvings = attempt(row, sim, steps)
+    if halvings is None:
+        return row
+    taken = substeps(halvings, dt)
+    if taken is None:
+        return row
+    u, _ = fall(integrator, taken, np.zeros(3))
+    if integrator == "backward_euler" and not any(halvings):  # the same, summed
+        assert np.allclose(u, GRAVITY * dt**2 * steps * (steps + 1) / 2, rtol=1e-13, atol=0.0)
+    row["error"] = pair.points_error(sim, u)
+    return row
+
+
+def _spinning(device, E, tie, second, integrator, options, steps=20, dt=1e-2):
+    """About its centre of mass: its fall, and with backward Euler the moment balance of each step,
+
+    L_n+1 - L_n = h sum M v_n+1 x v_n, which holds if the forces between the bodies are without a moment at q_n+1."""
+    pair = Pair(device, tie, E=E, second=second, velocity=(1.0, 0.0, 2.0), spin=np.array([1.0, 2.0, 8.0]))
+    sim = wf.Simulation(pair.model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(**options))
+    row = {"case": "spin", "joint": tie, "second": second, "integrator": integrator, "E": E, "dt": dt,
+           "solver": options, "error": None, "moment_balance": None, "kept": None}  # fmt: skip
+    M = pair.consistent
+    _, v0, _, v, start = pair.motion(sim.state)
+    halvings, L, balance = [], start, 0.0
+    for _ in range(steps):
+        part = {}
+        done = attempt(part, sim, 1)
+        if done is None:
+            return row | part
+        row |= part
+        halvings += done
+        moved, pace, _, v_new, L_new = pair.motion(sim.state)
+        if done[0] == 0:
+            away = L_new - L - dt * np.cross(v_new, M @ v).sum(axis=0)
+            balance = max(balance, float(np.linalg.norm(away) / np.linalg.norm(start)))
+        v, L = v_new, L_new
+    taken = substeps(halvings, dt)
+    if taken is not None:
+        u, _ = fall(integrator, taken, v0)
+        row["error"] = float(np.abs(moved - u).max() / np.abs(u).max())
+    row |= {"steps": steps, "halvings": sum(halvings), "newton": int(sim.totals["newton"][0]),
+            "kept": float(np.linalg.norm(L) / np.linalg.norm(start))}  # fmt: skip
+    if integrator == "backward_euler" and not any(halvings):
+        row["moment_balance"] = balance
+    return row
+
+
+def _beside_an_impact(device, tie, integrator):
+    """The pair beside a soft box that runs against its clamp, which halves the steps of all, and a lone box that falls
+    with the pair: same displacement everywhere; with backward Euler the velocity is n h g whatever the substeps."""
+    lone = []
+
+    def extra(b):
+        soft = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
+        hit = b.add_solid(wf.mesh.box((1.0, 0.4, 0.4), cells=(4, 2, 2), origin=(0, 2, 0)), material=soft, name="hit")
+        b.clamp(hit.nodes("x-"))
+        b.set_initial(hit, velocity=(-20.0, 0.0, 0.0))
+        steel = wf.SVK(E=2e9, nu=0.3, density=1000.0)
+        lone.append(b.add_solid(wf.mesh.box(BOX, cells=(1, 1, 1), origin=(0, 4, 0)), material=steel, name="lone"))
+
+    pair = Pair(device, tie, E=2e9, extra=extra)
+    dt, steps = 1e-2, 5
+    sim = wf.Simulation(pair.model, dt=dt, integrator=integrator)
+    row = {"case": "beside an impact", "joint": tie, "second": "T10", "integrator": integrator, "E": 2e9, "dt": dt,
+           "solver": {}, "error": None}  # fmt: skip
+    if attempt(row, sim, steps) is None:
+        return row
+    row["error"] = pair.points_error(sim, sim.displacements(lone[0])[0].mean(axis=0))
+    pace = pair.motion(sim.state)[1]
+    row["velocity_error"] = None
+    if integrator == "backward_euler":
+        row["velocity_error"] = float(np.abs(pace / (GRAVITY * dt * steps) - 1.0).max())
+    return row
+
+
+def free_fall(device, quick):
+    """Two bodies tied by a joint fall as one, against the scheme's recursion; backward Euler's q = g h^2 n (n + 1) / 2.
+
+    fall: all nodes of a pair let go at rest, over the fall. spin: the centre of mass of a pair thrown spinning at 8.3
+    rad/s, 20 steps of 1/8 turn per 10 ms at most; where max_newton is named it halves steps; `moment_balance` is what
+    the joint's forces do to the angular momentum in a step, over it; `kept` is L_end / L_start. beside an impact: steps
+    halved by another body. welded: `kept` of the pair against one body of both, `from_one_body` their difference over
+    what is lost."""
+    rows = []
+    schemes = ("backward_euler", "bdf2")
+    soft, stiff = 1e5, 2e9
+    pick = [TIES[:1], TIES[1:3]] if quick else [TIES, TIES]
+    for tie in TIES:
+        for integrator in schemes[: 1 if quick else 2]:
+            rows += [_plain(device, soft, tie, "T10", integrator, o) for o in SOLVERS]
+            rows += [_plain(device, stiff, tie, s, integrator, o) for s in ("T10", "3243") for o in (SOLVERS[:3])]
+            if not quick:
+                rows += [_plain(device, stiff, tie, "T10", integrator, o) for o in SOLVERS[4:]]
+    for tie in pick[1]:
+        for integrator, limit in zip(schemes, (5, 4)):
+            halved = {"max_newton": limit}
+            some = [{}, halved] if quick else [{}, {"tol": 1e-3}, {"penalty": 1e4}, OUTER | {"penalty": 1.0}, halved]
+            rows += [_spinning(device, stiff, tie, "T10", integrator, o, steps=4 if quick else 20) for o in some]
+            if not quick:
+                rows.append(_spinning(device, stiff, tie, "3243", integrator, {}))
+    for tie in ("revolute",) if quick else TIES:
+        rows += [_beside_an_impact(device, tie, integrator) for integrator in schemes]
+    for E in () if quick else (2e7, 2e8, 2e9, 2e10):
+        one = _spinning(device, E, None, "T10", "backward_euler", {})
+        for tie in (None, "weld", "fixed", "revolute", "spherical"):
+            row = _spinning(device, E, tie, "T10", "backward_euler", {}) if tie else dict(one)
+            row["joint"] = tie or "one body"
+            row["from_one_body"] = abs(row["kept"] - one["kept"]) / (1.0 - one["kept"])
+            rows.append(row | {"case": "welded"})
+    return rows
+
+
+PARTS = {
+    f.__name__: f
+    for f in (rigid_slider_crank, flexible_slider_crank, double_pendulum, hanging_chain, free_fall, no_drift)
+}
+
+
+def main():
+    to = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    to.add_argument("--out", required=True, help="JSON that is written")
+    to.add_argument("--device", default="cpu")
+    to.add_argument("--quick", action="store_true", help="fewer rows")
+    to.add_argument("--only", action="append", choices=PARTS, help="parts; the others stay as they are in the file")
+    options = to.parse_args()
+    wp.config.log_level = 30
+    path, commit = pathlib.Path(options.out), _commit()
+    content = json.loads(path.read_text()) if options.only and path.exists() else {"schema": 1, "parts": {}}
+    for name in options.only or PARTS:
+        print(f"{name} ...", flush=True)
+        began = clock.perf_counter()
+        more = {}
+        if name == "no_drift":
+            more["checkpoint"] = HERE.parent / "build" / f"{path.stem}_no_drift.npz"
+            more["checkpoint"].parent.mkdir(exist_ok=True)
+        rows = PARTS[name](options.device, options.quick, **more)
+        content["parts"][name] = {
+            "about": PARTS[name].__doc__, "rows": rows, "wall_s": clock.perf_counter() - began,
+            "command": shlex.join(["python", "tests/mechanism_report.py", *sys.argv[1:]]), "commit": commit,
+            "machine": machine(options.device), "versions": _versions(),
+        }  # fmt: skip
+        print(f"{name}: {clock.perf_counter() - began:.0f} s")
+        for row in rows:
+            print("  " + "  ".join(f"{k} {v:.5g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
+        partial = path.with_name(f".{path.name}.part")
+        partial.write_text(json.dumps(content, indent=1) + "\n")
+        os.replace(partial, path)
+
+
+if __name__ == "__main__":
+    main()
