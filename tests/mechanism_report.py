@@ -340,21 +340,30 @@ def swing(device):
     return wf.Simulation(b.finalize(device=device), dt=1e-3, integrator="bdf2"), joints
 
 
+def crossing(sim):
+    """Cosine between the hinge's axis on one beam of `swing` and the directions across it on the other, at its ends."""
+    above, below = (sim.node_gradients(beam)[0, k] for beam, k in zip(sim.model.bodies, (-1, 0)))
+    return max(abs(above @ Y @ (below @ d)) / np.linalg.norm(above @ Y) / np.linalg.norm(below @ d) for d in (X, Z))
+
+
 def no_drift(device, quick, checkpoint=None, steps=None):
     """Violation over 1e5 steps of 1 ms of bdf2: a soft double pendulum of two 3243 elements swings in space.
 
-    `violation_*` are what the joints record at every step, over the model's size; `gap` is the same of the pinned ends
-    from their positions alone. First and last: of the first and the last tenth."""
+    `violation_*` are what the joints record at every step, over the model's size; `gap_*` is the same of the pinned
+    ends from their positions alone, `crossing` of the hinge from deformation gradients, every 100 steps since resumed.
+    First and last: of the first and the last tenth."""
     sim, joints = swing(device)
     target = steps or (DRIFT_STEPS // 100 if quick else DRIFT_STEPS)
     if checkpoint is not None and checkpoint.exists():
         sim.resume(checkpoint)
         print(f"    goes on from step {sim.steps} of {checkpoint}", flush=True)
-    begun_at, halvings, began = sim.steps, 0, clock.perf_counter()
+    begun_at, halvings, crossed, began = sim.steps, 0, 0.0, clock.perf_counter()
 
     def watch(sim):
-        nonlocal halvings
+        nonlocal halvings, crossed
         halvings += int(sim.last.halvings[0])
+        if sim.steps % 100 == 0:
+            crossed = max(crossed, crossing(sim))
         if sim.steps % 10000 == 0:
             print(f"    step {sim.steps}: {clock.perf_counter() - began:.0f} s", flush=True)
 
@@ -374,8 +383,9 @@ def no_drift(device, quick, checkpoint=None, steps=None):
            "max_by_tenths": [float(part.max()) for part in np.array_split(violation, 10)],
            "mean_by_tenths": [float(part.mean()) for part in np.array_split(violation, 10)],
            "gap_max": float(gap.max()), "gap_first": float(gap[:tenth].max()), "gap_last": float(gap[-tenth:].max()),
+           "crossing": float(crossed), "halvings_since_resumed": halvings,
            "force_max": float(max(np.linalg.norm(r.force[0], axis=1).max() for r in records)),
-           "swing_last": float(np.ptp(at["tip"][-tenth:], axis=0).max()), "halvings_since_resumed": halvings,
+           "swing_last": float(np.ptp(at["tip"][-tenth:], axis=0).max()),
            "ledger_residual": float(energy["ledger_residual"][0]), "potential": float(energy["potential"][0]),
            "ms_per_step": 1e3 * seconds / max(target - begun_at, 1),
            "newton_per_step": float(sim.totals["newton"][0]) / target,

@@ -31,7 +31,9 @@ def bound(case, dtype):
 @pytest.mark.cuda
 @pytest.mark.parametrize("case", report.CASES)
 def test_cuda_equals_cpu(case):
-    row = report.compare(case, steps=30)
+    row = report.compare(
+        case, steps=100 if case == "mechanism" else 30
+    )  # its tip hangs on a rod and hardly moves at first
     for dtype in BOUND:
         assert row[f"cuda_{dtype}_difference"] < bound(case, dtype)
 
