@@ -22,6 +22,7 @@ __all__ = [
     "FacetTables",
     "HostBlock",
     "body_mass",
+    "facet_places",
     "facet_tables",
     "gather_table",
     "host_blocks",
@@ -330,12 +331,18 @@ def facet_tables(surface: SurfaceSet, parts: int = 1) -> FacetTables:
     return FacetTables(conn, table[0], table[1], table[2], rule.weights)
 
 
-def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
-    """Integral of each function over faces: body slots and weights (m^2; m^3 for gradients); curved faces too."""
-    body, t = surface.body, facet_tables(surface)
+def facet_places(body: Body, t: FacetTables) -> tuple[np.ndarray, np.ndarray]:
+    """Reference places X (F, Q, 3), m, of the points of faces, and the areas (F, Q), m^2, that they stand for."""
     x = body.reference[t.conn]
     normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
-    dA = np.linalg.norm(normal, axis=2) * t.weights
+    X = np.einsum("fqi,fik->fqk", t.shape, x) + body.origin
+    return X, np.linalg.norm(normal, axis=2) * t.weights
+
+
+def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
+    """Integral of each function over faces: body slots and weights (m^2; m^3 for gradients); curved faces too."""
+    t = facet_tables(surface)
+    _, dA = facet_places(surface.body, t)
     weights = np.einsum("fq,fqi->fi", dA, t.shape)
     slots, inverse = np.unique(t.conn, return_inverse=True)
     return slots, np.bincount(inverse.ravel(), weights=weights.ravel(), minlength=len(slots))

@@ -415,24 +415,6 @@ class Constraints:
 
     # on the host, for supports, tests and users
 
-    def jacobian(self, u: np.ndarray, target: np.ndarray | None = None) -> sp.csr_matrix:
-        """dc/dq (rows, 3 slots) at displacements u (slots, 3), computed on the host; targets f (rows,), by default
-        `fixed`."""
-        values = self.vectors(u)
-        f = np.array([r.fixed for r in self.rows]) if target is None else target
-        G = np.zeros((self.count, 3, 3))
-        for k, row in enumerate(self.rows):
-            a, b, a2 = values[3 * k : 3 * k + 3]
-            if row.kind == DISTANCE:
-                G[k, 0] = a / np.linalg.norm(a)
-            elif row.kind == TURN:
-                s, c = np.sin(f[k]), np.cos(f[k])
-                G[k] = -s * b, c * a2 - s * a, c * b
-            else:
-                G[k, 0], G[k, 1] = b, a
-            G[k] *= self.scale_host[k]
-        return self.expand(G)
-
     def expand(self, G: np.ndarray) -> sp.csr_matrix:
         """Rows of the Jacobian from the gradients of the vectors (rows, 3, 3)."""
         data = self.weight_host[:, None] * G.reshape(-1, 3)[self.term_host]
@@ -478,12 +460,6 @@ class Constraints:
     def _present(vector: Vector, u: np.ndarray) -> np.ndarray:
         slots, weights, _ = vector.entries()
         return vector.value + weights @ u[slots]
-
-    def vectors(self, u: np.ndarray) -> np.ndarray:
-        """(3 rows, 3) all vectors at displacements u (slots, 3)."""
-        out = self.reference_host.copy()
-        np.add.at(out, self.term_host, self.weight_host[:, None] * u[self.slot_host])
-        return out
 
     def hash(self, h: Any) -> None:
         """Feed what defines the rows into a hash."""

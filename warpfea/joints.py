@@ -197,13 +197,9 @@ def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
     body = surface.body
     label = f"surface {surface.name!r} of body {body.name!r}" if surface.name else f"a surface of body {body.name!r}"
     t = assembly.facet_tables(surface)
-    x = body.reference[t.conn] + (body.slot_kind[t.conn] == 0)[:, :, None] * body.origin
-    dA = (
-        np.linalg.norm(np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x)), axis=2)
-        * t.weights
-    )
+    X, dA = assembly.facet_places(body, t)
     share = (dA / dA.sum()).ravel()
-    X = np.einsum("fqi,fik->fqk", t.shape, x).reshape(-1, 3)
+    X = X.reshape(-1, 3)
     mean, at_points, span = _fit(share, X, FLAT_SURFACE)
     n = body.slot_count
     weights, gradients = np.zeros(n), np.zeros((n, 3))

@@ -329,8 +329,7 @@ class Model:
         """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
         ties = None
         if self.constraints:
-            start = self.state().displacement.numpy()[0].astype(float)
-            ties = self.constraints.jacobian(start)
+            ties = self.constraint_jacobian(self.state())
         for label in range(self.component_count):
             slots = np.flatnonzero(self.component == label)
             parts, part = np.unique(self.part[slots], return_inverse=True)

@@ -58,10 +58,7 @@ def _mortar(face: SurfaceSet, holder: Body, within: SurfaceSet | None, what: str
     """One vector per slot i of the face: int phi_i (x - x_holder) dA / int |phi_i| dA."""
     body = face.body
     t = assembly.facet_tables(face, _parts(face, holder))
-    x = body.reference[t.conn] + (body.slot_kind[t.conn] == 0)[:, :, None] * body.origin
-    normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
-    dA = np.linalg.norm(normal, axis=2) * t.weights
-    X = np.einsum("fqi,fik->fqk", t.shape, x)
+    X, dA = assembly.facet_places(body, t)
     _check_near(X.reshape(-1, 3), within, what)
     n, m = body.slot_count, holder.slot_count
     F, Q, _ = t.shape.shape
@@ -83,10 +80,8 @@ def _mortar(face: SurfaceSet, holder: Body, within: SurfaceSet | None, what: str
 
 def _parts(face: SurfaceSet, holder: Body) -> int:
     """Parts to split a face in, so that the kinks of the holder's functions between its elements are seen."""
-    t = assembly.facet_tables(face)
-    x = face.body.reference[t.conn]
-    normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
-    area = float((np.linalg.norm(normal, axis=2) @ t.weights).max())
+    _, dA = assembly.facet_places(face.body, assembly.facet_tables(face))
+    area = float(dA.sum(axis=1).max())
     size = np.cbrt(float(np.median(assembly.element_volumes(holder))))
     return int(np.clip(np.ceil(PER_ELEMENT * np.sqrt(area) / size), 1, MOST_PARTS))
 
@@ -113,9 +108,8 @@ def _check_near(X: np.ndarray, within: SurfaceSet | None, what: str) -> None:
     """Raise ModelError for points (n, 3) off the box of the surface that was named."""
     if within is None:
         return
-    body, t = within.body, assembly.facet_tables(within)
-    at = body.reference[t.conn] + (body.slot_kind[t.conn] == 0)[:, :, None] * body.origin
-    x = np.einsum("fqi,fik->fqk", t.shape, at).reshape(-1, 3)
+    body = within.body
+    x = assembly.facet_places(body, assembly.facet_tables(within))[0].reshape(-1, 3)
     low, high = x.min(axis=0), x.max(axis=0)
     slack = NEAR * float(np.linalg.norm(high - low))
     off = np.flatnonzero(((low - slack > X) | (high + slack < X)).any(axis=1))
