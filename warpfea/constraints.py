@@ -467,6 +467,3 @@ class Constraints:
             h.update(f"{row.kind} {row.scale!r} {row.constant!r} {row.fixed!r} {row.component}".encode())
         for values in (self.slot_host, self.weight_host, self.start_host, self.reference_host):
             h.update(np.ascontiguousarray(values).tobytes())
-
-
-assert (DOT, DISTANCE, TURN) == (0, 1, 2)
