@@ -19,12 +19,12 @@ class Launcher:
         self.kernels: set[str] = set()
         self.modules: set[str] = set()
 
-    def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any]) -> None:
+    def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
         """Launch one thread per item of `dim`; an empty launch is left out."""
         if min([dim] if isinstance(dim, int) else dim) == 0:
             return
         self._count(kernel)
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)
 
     def tiled(self, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int = 128) -> None:
         """Launch one block per item of `dim`."""
