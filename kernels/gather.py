@@ -9,6 +9,7 @@ import types as _types
 import warp as wp
 
 from .constraints import constraint_struct, multiplier_struct
+from .lanes import lane_functions
 from .types import kernel_module, precision
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels", "pattern_struct", "topology_struct"]
@@ -66,6 +67,7 @@ def gather_kernels(
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     f64 = wp.float64
     Pattern = pattern_struct()
+    lane_sum = lane_functions(dtype).lane_sum
     name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
     module = kernel_module(f"gather_{name}")
     matrix_module = kernel_module(f"matrix_product_{name}")
@@ -264,6 +266,7 @@ def gather_kernels(
         topo: Topology,
         pattern: Pattern,
         value: wp.array2d(dtype=mat33),
+        lanes: int,
         pushed_start: wp.array(dtype=wp.int32),
         pushed_entry: wp.array(dtype=wp.int32),
         pushed_contribution: wp.array2d(dtype=vec3),
@@ -276,13 +279,19 @@ def gather_kernels(
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """The same with the elements' part and the mass as one matrix."""
-        world, slot = wp.tid()
+        """The same with the elements' part and the mass as one matrix, so many lanes per row."""
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        slot = index / lanes
+        lane = index % lanes
         h = vec3()
-        for k in range(pattern.start[slot], pattern.start[slot + 1]):
-            h += value[world, k] * p_in[world, pattern.column[k]]
+        if slot < out.shape[1]:
+            for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
+                h += value[world, k] * p_in[world, pattern.column[k]]
+        h = lane_sum(h, lanes)
+        if lane != 0 or slot >= out.shape[1]:
+            return
         dq = T(dq_dv[world])
         h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
         out[world, slot] = h

@@ -10,6 +10,7 @@ import types as _types
 import warp as wp
 
 from .gather import pattern_struct
+from .lanes import lane_functions
 from .types import kernel_module, precision
 
 __all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
@@ -49,17 +50,11 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     f64 = wp.float64
     Level = level_struct(dtype)
     Pattern = pattern_struct()
+    sync, lane_sum = lane_functions(dtype).sync, lane_functions(dtype).lane_sum
     # a pivot below this share of its diagonal is rounding: the functions are dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[dtype]
     module = kernel_module(f"levels_{dtype}")
     build_module = kernel_module(f"levels_build_{dtype}")
-
-    @wp.func_native(snippet="""
-    #if defined(__CUDA_ARCH__)
-    __syncthreads();
-    #endif
-    """)
-    def sync(): ...
 
     @wp.kernel(module=build_module)
     def fill_tiles(
@@ -149,12 +144,14 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         level: Level,
         inverse: wp.array4d(dtype=T),
         by_row: int,
+        lanes: int,
+        first_group: int,
         r: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
         z: wp.array2d(dtype=vec3),
         coarse: wp.array2d(dtype=vec3),
     ):
-        """z = tile inverse times r, one thread per slot; then P^T r, one thread per function of a group.
+        """z = tile inverse times r, one thread per slot; from thread `first_group` on P^T r, so many lanes per group.
 
         The inverse is symmetric: read by columns neighbouring threads read neighbouring numbers, which CUDA wants;
         read by rows one thread does, which the CPU wants.
@@ -162,10 +159,11 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         world, index = wp.tid()
         if active[world] == 0:
             return
-        slots = TILE_SLOTS * level.tiles
-        if index < slots:
+        if index < first_group:
             tile = index / TILE_SLOTS
             place = index % TILE_SLOTS
+            if tile >= level.tiles:
+                return
             slot = level.tile_slot[tile, place]
             if slot < 0:
                 return
@@ -186,14 +184,30 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
                                 s[i] = s[i] + inverse[world, tile, column + j, row + i] * x[j]
             z[world, slot] = s
             return
-        index -= slots
-        group = index / 4
-        k = index % 4
-        s = vec3()
-        for e in range(level.group_start[group], level.group_start[group + 1]):
+        index -= first_group
+        group = index / lanes
+        lane = index % lanes
+        s0 = vec3()
+        s1 = vec3()
+        s2 = vec3()
+        s3 = vec3()
+        for e in range(level.group_start[group] + lane, level.group_start[group + 1], lanes):
             slot = level.group_slot[e]
-            s += level.weight[slot][k] * r[world, slot]
-        coarse[world, index] = s
+            w = level.weight[slot]
+            x = r[world, slot]
+            s0 += w[0] * x
+            s1 += w[1] * x
+            s2 += w[2] * x
+            s3 += w[3] * x
+        s0 = lane_sum(s0, lanes)
+        s1 = lane_sum(s1, lanes)
+        s2 = lane_sum(s2, lanes)
+        s3 = lane_sum(s3, lanes)
+        if lane == 0:
+            coarse[world, 4 * group] = s0
+            coarse[world, 4 * group + 1] = s1
+            coarse[world, 4 * group + 2] = s2
+            coarse[world, 4 * group + 3] = s3
 
     @wp.func
     def prolonged(level: Level, x: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
@@ -263,17 +277,23 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         pattern: Pattern,
         value: wp.array2d(dtype=mat33),
         d: wp.array2d(dtype=vec3),
+        lanes: int,
         active: wp.array(dtype=wp.int32),
         r: wp.array2d(dtype=vec3),
     ):
-        """r -= A d."""
-        world, slot = wp.tid()
+        """r -= A d, so many lanes per row."""
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        slot = index / lanes
+        lane = index % lanes
         s = vec3()
-        for k in range(pattern.start[slot], pattern.start[slot + 1]):
-            s += value[world, k] * d[world, pattern.column[k]]
-        r[world, slot] = r[world, slot] - s
+        if slot < r.shape[1]:
+            for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
+                s += value[world, k] * d[world, pattern.column[k]]
+        s = lane_sum(s, lanes)
+        if lane == 0 and slot < r.shape[1]:
+            r[world, slot] = r[world, slot] - s
 
     @wp.kernel(module=build_module)
     def fill_dense(

@@ -7,6 +7,8 @@ from typing import Any
 
 import warp as wp
 
+from .kernels.lanes import WARP
+
 __all__ = ["Launcher"]
 
 
@@ -25,6 +27,16 @@ class Launcher:
             return
         self._count(kernel)
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)
+
+    def lanes(self, per_row: int) -> int:
+        """Lanes that share a row with so many entries: a power of two; one on the CPU."""
+        if not self.device.is_cuda:
+            return 1
+        return min(WARP, 1 << max(0, (max(per_row, 1) - 1).bit_length() - 1))
+
+    def padded(self, threads: int) -> int:
+        """Threads in whole warps, as sums over lanes want."""
+        return -(-threads // WARP) * WARP if self.device.is_cuda else threads
 
     def tiled(self, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int = 128) -> None:
         """Launch one block per item of `dim`."""

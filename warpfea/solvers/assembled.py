@@ -45,6 +45,11 @@ class Pattern:
     upper: np.ndarray
 
     @property
+    def width(self) -> int:
+        """Mean entries of a row."""
+        return self.entries // max(self.graph.shape[0], 1)
+
+    @property
     def entries(self) -> int:
         """Number of blocks."""
         return len(self.graph.indices)

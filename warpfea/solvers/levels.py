@@ -16,12 +16,14 @@ from .assembled import Pattern, make_pattern
 if TYPE_CHECKING:
     from ..model import Model
 
-__all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
+__all__ = ["BOTTOM_SLOTS", "WHOLE_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
 """Slots of a group whose affine motions are the coarse space: 16 unknowns of a level to one of the next."""
-BOTTOM_SLOTS = 160
-"""A level of up to so many slots is inverted as one dense matrix."""
+WHOLE_SLOTS = 160
+"""A model of up to so many slots is inverted as one dense matrix: it needs no levels."""
+BOTTOM_SLOTS = {"cpu": 160, "cuda": 1024}
+"""So is a coarse level; on CUDA it costs less than the launches of more levels would."""
 MAX_LEVELS = 12
 
 
@@ -72,7 +74,7 @@ def make_levels(model: Model, pattern: Pattern) -> list[Level]:
     levels = []
     for depth in range(MAX_LEVELS):
         n = pattern.graph.shape[0]
-        if n <= BOTTOM_SLOTS:
+        if n <= (BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"] if depth else WHOLE_SLOTS):
             levels.append(Level(pattern, n, True, level_struct(model.dtype)()))
             return levels
         level, points, pattern = _make_level(model, pattern, points)

@@ -64,7 +64,7 @@ class Residual:
         self.con = model.constraints.data if model.constraints else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         # elements with many points per slot cost more than the matrix that they make
-        many = all(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
+        many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
@@ -161,8 +161,10 @@ class Residual:
         rest += [out, w.rows]
         if self.by_matrix:
             assert self.assembled is not None
-            args = [m.topology, self.assembled.pattern.data, self.matrix, *rest]
-            launch(self.gather.matrix_product, self.dim, args)
+            pattern = self.assembled.pattern
+            lanes = launch.lanes(pattern.width)
+            args = [m.topology, pattern.data, self.matrix, lanes, *rest]
+            launch(self.gather.matrix_product, (m.worlds, launch.padded(m.slots * lanes)), args)
         else:
             launch(self.gather.product, self.dim, [m.topology, w.contribution, *rest])
 

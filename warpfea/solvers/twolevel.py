@@ -23,7 +23,7 @@ from ..kernels.blocks import block_kernels
 from ..kernels.lag import lag_kernels, lag_struct
 from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels
 from ..kernels.pcg import pcg_kernels
-from .levels import Level, make_levels
+from .levels import GROUP_SLOTS, Level, make_levels
 
 if TYPE_CHECKING:
     from ..launch import Launcher
@@ -170,9 +170,10 @@ class TwoLevel:
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = tiles times r; returns what is to be prolonged."""
         level, arrays, below = self.levels[depth], self.arrays[depth], self.arrays[depth + 1].vectors
-        threads = TILE_SLOTS * level.tiles + 4 * level.groups
-        args = [level.data, arrays.matrix, self.by_row, r, active, z, below["r"]]
-        self.launch(self.kernels.smooth, (self.model.worlds, threads), args)
+        first_group = self.launch.padded(TILE_SLOTS * level.tiles)
+        lanes = self.launch.lanes(GROUP_SLOTS)
+        args = [level.data, arrays.matrix, self.by_row, lanes, first_group, r, active, z, below["r"]]
+        self.launch(self.kernels.smooth, (self.model.worlds, first_group + lanes * level.groups), args)
         if self.levels[depth + 1].dense:
             self._apply_dense(depth + 1, below["r"], below["x"], active)
         else:
@@ -194,8 +195,10 @@ class TwoLevel:
             args = [level.data, 1, coarse, v["z"], keep, step, active, v["d"], v["x"]]
             self.launch(self.kernels.chebyshev, dim, args)
             if k < CHEBYSHEV_STEPS - 1:
-                args = [level.pattern.data, arrays.value, v["d"], active, v["r"]]
-                self.launch(self.kernels.subtract_product, dim, args)
+                lanes = self.launch.lanes(level.pattern.width)
+                args = [level.pattern.data, arrays.value, v["d"], lanes, active, v["r"]]
+                threads = self.launch.padded(level.slots * lanes)
+                self.launch(self.kernels.subtract_product, (self.model.worlds, threads), args)
             new = 1.0 / (2.0 * ratio - rho)
             keep, step = new * rho, 2.0 * new / half
             rho = new
