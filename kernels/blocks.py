@@ -9,7 +9,7 @@ import types as _types
 import warp as wp
 
 from .constraints import multiplier_struct
-from .gather import pattern_struct, topology_struct
+from .gather import inverse_function, pattern_struct, topology_struct
 from .types import kernel_module, precision
 
 __all__ = ["assembly_kernels", "block_kernels", "coupling_struct"]
@@ -56,7 +56,10 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=mat33),
     ):
-        """value += (dq/dv) K of a block's elements, on the free components; `first`: = c_M M + (dq/dv) K."""
+        """value += (dq/dv) K of a block's elements; `first`: = c_M M + (dq/dv) K.
+
+        Prescribed components keep their diagonal and nothing else.
+        """
         world, index = wp.tid()
         if active[world] == 0:
             return
@@ -82,7 +85,8 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         column_free = topo.free[column]
         for i in range(3):
             for j in range(3):
-                A[i, j] = row_free[i] * column_free[j] * A[i, j]
+                if row != column or i != j:
+                    A[i, j] = row_free[i] * column_free[j] * A[i, j]
         if first == 0:
             A += value[world, at[0]]
         value[world, at[0]] = A
@@ -102,6 +106,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     Topology = topology_struct(dtype)
     Pattern, Couplings = pattern_struct(), coupling_struct()
     Multipliers = multiplier_struct()
+    free_inverse = inverse_function(dtype)
     module = kernel_module(f"blocks_{dtype}")
     coupling_module = kernel_module(f"couplings_{dtype}")
 
@@ -138,11 +143,34 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
             value[world, at[1]] = wp.transpose(B)
 
     @wp.kernel(module=module)
+    def take_diagonal(
+        topo: Topology,
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array2d(dtype=vec3),
+        inverse: wp.array2d(dtype=mat33),
+    ):
+        """The diagonal D and the inverses of the diagonal blocks on the free components."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            if pattern.column[k] == slot:
+                A = value[world, k]
+                D = vec3()
+                for i in range(3):
+                    D[i] = wp.max(wp.abs(A[i, i]), T(1.0e-30))
+                diagonal[world, slot] = D
+                inverse[world, slot] = free_inverse(A, T(0.0), topo.free[slot])
+
+    @wp.kernel(module=module)
     def galerkin(
         pair: wp.array(dtype=wp.vec3i),
         pair_start: wp.array(dtype=wp.int32),
         fine_entry: wp.array(dtype=wp.vec3i),
         weight: wp.array(dtype=vec4),
+        free: wp.array(dtype=vec3),
         fine: wp.array2d(dtype=mat33),
         active: wp.array(dtype=wp.int32),
         coarse: wp.array2d(dtype=mat33),
@@ -161,10 +189,18 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
         A = mat33()
         for e in range(pair_start[group], pair_start[group + 1]):
             f = fine_entry[e]
-            A += (weight[f[1]][k] * weight[f[2]][l]) * fine[world, f[0]]
+            w = weight[f[1]][k] * weight[f[2]][l]
+            if w != T(0.0):
+                B = fine[world, f[0]]
+                row_free = free[f[1]]
+                column_free = free[f[2]]
+                for i in range(3):
+                    for j in range(3):
+                        A[i, j] = A[i, j] + w * row_free[i] * column_free[j] * B[i, j]
         at = pair[group]
         coarse[world, at[0] + k * at[1] + at[2] + l] = A
 
     return _types.SimpleNamespace(
-        module=module, coupling_module=coupling_module, add_constraints=add_constraints, galerkin=galerkin
-    )
+        module=module, coupling_module=coupling_module, add_constraints=add_constraints, take_diagonal=take_diagonal,
+        galerkin=galerkin,
+    )  # fmt: skip

@@ -12,7 +12,7 @@ from .constraints import constraint_struct, multiplier_struct
 from .lanes import lane_functions
 from .types import kernel_module, precision
 
-__all__ = ["RESIDUAL_ROWS", "gather_kernels", "pattern_struct", "topology_struct"]
+__all__ = ["RESIDUAL_ROWS", "gather_kernels", "inverse_function", "pattern_struct", "topology_struct"]
 
 RESIDUAL_ROWS = 10
 """Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
@@ -56,6 +56,43 @@ def topology_struct(dtype: str):
 
 
 @functools.cache
+def inverse_function(dtype: str):
+    """Inverse of a diagonal block on its free components; where it is not safely positive, of its diagonal."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+
+    @wp.func
+    def positive_inverse(A: mat33, least: T) -> mat33:
+        d1 = A[0, 0]
+        d2 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+        d3 = wp.determinant(A)
+        tol = T(1.0e-6)
+        size = wp.trace(A)
+        if d1 > tol * size and d2 > tol * size * size and d3 > tol * size * size * size * T(0.01):
+            return wp.inverse(A)
+        B = mat33()
+        for k in range(3):
+            B[k, k] = T(1.0) / wp.max(wp.abs(A[k, k]), wp.max(least, tol * wp.abs(size)))
+        return B
+
+    @wp.func
+    def free_inverse(A: mat33, least: T, free: vec3) -> mat33:
+        M = A
+        for i in range(3):
+            for j in range(3):
+                M[i, j] = A[i, j] * free[i] * free[j]
+            if free[i] == T(0.0):
+                M[i, i] = wp.max(wp.abs(A[i, i]), T(1.0e-30))
+        B = positive_inverse(M, least)
+        for i in range(3):
+            for j in range(3):
+                B[i, j] = B[i, j] * free[i] * free[j]
+        return B
+
+    return free_inverse
+
+
+@functools.cache
 def gather_kernels(
     dtype: str, nonpotential: bool, pressure: bool = False, constrained: bool = False
 ) -> _types.SimpleNamespace:
@@ -68,6 +105,7 @@ def gather_kernels(
     f64 = wp.float64
     Pattern = pattern_struct()
     lane_sum = lane_functions(dtype).lane_sum
+    free_inverse = inverse_function(dtype)
     name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
     module = kernel_module(f"gather_{name}")
     matrix_module = kernel_module(f"matrix_product_{name}")
@@ -297,21 +335,6 @@ def gather_kernels(
         out[world, slot] = h
         rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
 
-    @wp.func
-    def positive_inverse(A: mat33, mass: T) -> mat33:
-        """Inverse of a symmetric block; where it is not safely positive, of its diagonal."""
-        d1 = A[0, 0]
-        d2 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
-        d3 = wp.determinant(A)
-        tol = T(1.0e-6)
-        size = wp.trace(A)
-        if d1 > tol * size and d2 > tol * size * size and d3 > tol * size * size * size * T(0.01):
-            return wp.inverse(A)
-        B = mat33()
-        for k in range(3):
-            B[k, k] = T(1.0) / wp.max(wp.abs(A[k, k]), wp.max(mass, tol * wp.abs(size)))
-        return B
-
     @wp.kernel(module=module)
     def gather_blocks(
         topo: Topology,
@@ -340,16 +363,8 @@ def gather_kernels(
         for i in range(3):
             A[i, i] = A[i, i] + mass
             D[i] = wp.max(wp.abs(A[i, i]), T(1.0e-30))
-            for j in range(3):
-                A[i, j] = A[i, j] * free[i] * free[j]
-            if free[i] == T(0.0):
-                A[i, i] = D[i]
         diagonal[world, slot] = D
-        B = positive_inverse(A, mass)
-        for i in range(3):
-            for j in range(3):
-                B[i, j] = B[i, j] * free[i] * free[j]
-        inverse[world, slot] = B
+        inverse[world, slot] = free_inverse(A, mass, free)
 
     @wp.kernel(module=module)
     def mass_product(

@@ -23,12 +23,14 @@ def lag_struct():
     class LagControl:
         build: wp.array(dtype=wp.int32)  # make it now
         moved: wp.array(dtype=wp.int32)  # at the present iterate; else again where it was made
+        changed: wp.array(dtype=wp.int32)  # it was moved since the state last heard
         stale: wp.array(dtype=wp.int32)  # the matrices at hand are not those of the state
-        due: wp.array(dtype=wp.int32)  # state: make it at the next solve
-        mass_factor: wp.array(dtype=wp.float64)  # state: c_M and dq/dv it was made for; negative: never made
+        due: wp.array(dtype=wp.int32)  # make it at the next solve
+        mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv it was made for; negative: never made
         dq_dv: wp.array(dtype=wp.float64)
-        rate: wp.array(dtype=wp.float64)  # state: iterations per decade of the first solve with it; 0: none yet
-        excess: wp.array(dtype=wp.float64)  # state: iterations beyond that rate since
+        rate: wp.array(dtype=wp.float64)  # iterations per decade of the first solve with it; 0: none yet
+        excess: wp.array(dtype=wp.float64)  # iterations beyond that rate since
+        kept: wp.array2d(dtype=wp.float64)  # of the state: due, mass_factor, dq_dv, rate, excess of accepted steps
         limit: wp.float64  # excess that pays for making it
         any_build: wp.array(dtype=wp.int32)
 
@@ -55,9 +57,16 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
         lag.moved[world] = 0
         if active[world] == 0:
             return
+        if lag.stale[world] != 0:
+            lag.due[world] = int(lag.kept[world, 0])
+            lag.mass_factor[world] = lag.kept[world, 1]
+            lag.dq_dv[world] = lag.kept[world, 2]
+            lag.rate[world] = lag.kept[world, 3]
+            lag.excess[world] = lag.kept[world, 4]
         same = lag.mass_factor[world] == mass_factor[world] and lag.dq_dv[world] == dq_dv[world]
         if lag.due[world] != 0 or not same:
             lag.moved[world] = 1
+            lag.changed[world] = 1
             lag.due[world] = 0
             lag.mass_factor[world] = mass_factor[world]
             lag.dq_dv[world] = dq_dv[world]
@@ -65,7 +74,6 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
             lag.excess[world] = f64(0.0)
         if lag.moved[world] != 0 or lag.stale[world] != 0:
             lag.build[world] = 1
-            lag.stale[world] = 0
             wp.atomic_max(lag.any_build, 0, 1)
 
     @wp.kernel(module=module)
@@ -85,36 +93,95 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
                 lag.due[world] = 1
 
     @wp.kernel(module=module)
+    def commit(lag: Lag, accepted: wp.array(dtype=wp.int32)):
+        """An accepted step: the state hears what was done."""
+        world = wp.tid()
+        if accepted[world] == 0:
+            return
+        lag.changed[world] = 0
+        lag.kept[world, 0] = f64(lag.due[world])
+        lag.kept[world, 1] = lag.mass_factor[world]
+        lag.kept[world, 2] = lag.dq_dv[world]
+        lag.kept[world, 3] = lag.rate[world]
+        lag.kept[world, 4] = lag.excess[world]
+
+    @wp.kernel(module=module)
     def mark(flags: wp.array(dtype=wp.int32), lag: Lag):
         """The state of flagged worlds was set from elsewhere."""
         world = wp.tid()
         if flags[world] != 0:
             lag.stale[world] = 1
 
-    @wp.kernel(module=module)
-    def keep_vectors(
-        source: wp.array2d(dtype=vec3), flags: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)
-    ):
-        """target = source in the flagged worlds."""
-        world, k = wp.tid()
-        if flags[world] != 0:
-            target[world, k] = source[world, k]
+    @wp.func
+    def which(lag: Lag, accepted: wp.array(dtype=wp.int32), world: int) -> int:
+        """1: the iterate is where it is made; 2: what was kept is; 3: the state hears. 0: nothing to do."""
+        if accepted.shape[0] > 0:
+            return wp.where(accepted[world] != 0 and lag.changed[world] != 0, 3, 0)
+        if lag.moved[world] != 0:
+            return 1
+        return wp.where(lag.stale[world] != 0, 2, 0)
 
     @wp.kernel(module=module)
-    def keep_rows(
+    def carry_places(
+        lag: Lag,
+        accepted: wp.array(dtype=wp.int32),
+        u: wp.array2d(dtype=vec3),
+        kept: wp.array2d(dtype=vec3),
+        place: wp.array2d(dtype=vec3),
+    ):
+        """Where it is made, and what the state keeps of it. `accepted`: of a step, else empty."""
+        world, slot = wp.tid()
+        to = which(lag, accepted, world)
+        if to == 1:
+            place[world, slot] = u[world, slot]
+        elif to == 2:
+            place[world, slot] = kept[world, slot]
+        elif to == 3:
+            kept[world, slot] = place[world, slot]
+
+    @wp.kernel(module=module)
+    def carry_rows(
+        lag: Lag,
+        accepted: wp.array(dtype=wp.int32),
         gradient: wp.array2d(dtype=wp.vec3d),
         stiffness: wp.array2d(dtype=f64),
-        flags: wp.array(dtype=wp.int32),
         kept_gradient: wp.array2d(dtype=wp.vec3d),
         kept_stiffness: wp.array2d(dtype=f64),
+        place_gradient: wp.array2d(dtype=wp.vec3d),
+        place_stiffness: wp.array2d(dtype=f64),
     ):
         """The same for the constraints' rows."""
         world, row = wp.tid()
-        if flags[world] != 0:
-            kept_stiffness[world, row] = stiffness[world, row]
-            for side in range(3):
-                kept_gradient[world, 3 * row + side] = gradient[world, 3 * row + side]
+        to = which(lag, accepted, world)
+        if to == 1:
+            place_stiffness[world, row] = stiffness[world, row]
+        elif to == 2:
+            place_stiffness[world, row] = kept_stiffness[world, row]
+        elif to == 3:
+            kept_stiffness[world, row] = place_stiffness[world, row]
+        for side in range(3):
+            k = 3 * row + side
+            if to == 1:
+                place_gradient[world, k] = gradient[world, k]
+            elif to == 2:
+                place_gradient[world, k] = kept_gradient[world, k]
+            elif to == 3:
+                kept_gradient[world, k] = place_gradient[world, k]
+
+    @wp.kernel(module=module)
+    def made(lag: Lag):
+        """The matrices at hand are those of the state again."""
+        world = wp.tid()
+        if lag.build[world] != 0:
+            lag.stale[world] = 0
 
     return _types.SimpleNamespace(
-        module=module, decide=decide, judge=judge, mark=mark, keep_vectors=keep_vectors, keep_rows=keep_rows
+        module=module,
+        decide=decide,
+        judge=judge,
+        commit=commit,
+        mark=mark,
+        made=made,
+        carry_places=carry_places,
+        carry_rows=carry_rows,
     )

@@ -256,6 +256,7 @@ class Stepper:
         launch(self.kernels.commit, self.dim, args)
         if constraints:
             constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
+        self.newton.preconditioner.commit(w.step.accepted)
 
     def _loads(self, active: wp.array) -> None:
         self._laws(active)

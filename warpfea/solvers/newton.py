@@ -146,7 +146,7 @@ class NewtonLoop:
         self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.constraints:
             self.constraints.evaluate(active)  # J, for rho
-        self.residual.blocks(active)
+        self.preconditioner.start(active)
         if self.constraints:
             self.constraints.build(active, penalty=True)
         self.residual.evaluate(active, hold=True)

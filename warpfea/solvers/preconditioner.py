@@ -32,8 +32,14 @@ class Preconditioner(Protocol):
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
 
+    def start(self, active: wp.array) -> None:
+        """An attempt begins: work.diagonal and work.inverse are wanted at its first iterate."""
+
     def follow(self, active: wp.array) -> None:
         """There is a new iterate."""
+
+    def commit(self, accepted: wp.array) -> None:
+        """The attempt was accepted."""
 
     def prepare(self, active: wp.array) -> None:
         """A solve begins."""
@@ -63,9 +69,14 @@ class BlockJacobi:
         """That of the conjugate gradients."""
         return {self.kernels.module}
 
-    def follow(self, active: wp.array) -> None:
+    def start(self, active: wp.array) -> None:
         """Assemble and invert the blocks."""
         self.residual.blocks(active)
+
+    follow = start
+
+    def commit(self, accepted: wp.array) -> None:
+        """Nothing to keep."""
 
     def prepare(self, active: wp.array) -> None:
         """The blocks are there."""

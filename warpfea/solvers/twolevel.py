@@ -92,29 +92,43 @@ class TwoLevel:
         constraints = residual.constraints
         self.tied = constraints is not None and not self.levels[0].dense
         self.lag: Any = None
+        coarse = max([level.slots for level in self.levels[1:]], default=1)
+        self.all_free = wp.full(coarse, 1.0, dtype=model.types.vec3, device=model.device)
 
     def register(self, state: State) -> None:
-        """Put the rule's memory into the state."""
+        """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
         m = self.model
-        state.register("preconditioner_displacement", m.types.vec3, (m.slots,))
-        if m.constraints:
-            state.register("preconditioner_gradient", wp.vec3d, (3 * m.constraints.count,))
-            state.register("preconditioner_stiffness", wp.float64, (m.constraints.count,))
         lag = lag_struct()()
-        for name, dtype, initial in (
-            ("due", wp.int32, 0),
-            ("mass_factor", wp.float64, -1.0),
-            ("dq_dv", wp.float64, -1.0),
-            ("rate", wp.float64, 0.0),
-            ("excess", wp.float64, 0.0),
-        ):
-            setattr(lag, name, state.register(f"preconditioner_{name}", dtype, (), initial))
-        for name in ("build", "moved", "stale"):
-            setattr(lag, name, self.work.array(f"LagControl.{name}", (m.worlds,), wp.int32))
-        lag.any_build = self.work.array("LagControl.any_build", (1,), wp.int32)
+        for name, var in lag_struct().vars.items():
+            if isinstance(var.type, wp.array) and name != "kept":
+                size = 1 if name == "any_build" else m.worlds
+                setattr(lag, name, self.work.array(f"LagControl.{name}", (size,), var.type.dtype))
+        lag.kept = state.register("preconditioner", wp.float64, (5,), (0.0, -1.0, -1.0, 0.0, 0.0))
         lag.limit = REBUILD_COST
         lag.stale.fill_(1)
-        self.lag, self.state = lag, state
+        lag.mass_factor.fill_(-1.0)
+        self.lag = lag
+        self.place = self.work.array("preconditioner place", self.dim, m.types.vec3)
+        self.kept = state.register("preconditioner_displacement", m.types.vec3, (m.slots,))
+        self.none = wp.zeros(0, dtype=wp.int32, device=m.device)
+        if m.constraints:
+            rows = m.constraints.count
+            self.place_rows = (
+                self.work.array("preconditioner gradient", (m.worlds, 3 * rows), wp.vec3d),
+                self.work.array("preconditioner stiffness", (m.worlds, rows), wp.float64),
+            )
+            self.kept_rows = (
+                state.register("preconditioner_gradient", wp.vec3d, (3 * rows,)),
+                state.register("preconditioner_stiffness", wp.float64, (rows,)),
+            )
+
+    def _carry(self, accepted: wp.array) -> None:
+        m, w, k = self.model, self.work, self.lag_kernels
+        self.launch(k.carry_places, self.dim, [self.lag, accepted, w.u, self.kept, self.place])
+        if m.constraints:
+            mul = w.multipliers
+            args = [self.lag, accepted, mul.gradient, mul.stiffness, *self.kept_rows, *self.place_rows]
+            self.launch(k.carry_rows, (m.worlds, m.constraints.count), args)
 
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
@@ -130,13 +144,26 @@ class TwoLevel:
         """The state of flagged worlds was set from elsewhere."""
         self.launch(self.lag_kernels.mark, self.model.worlds, [flags, self.lag])
 
+    def commit(self, accepted: wp.array) -> None:
+        """The step was accepted: tell the state."""
+        self._carry(accepted)
+        self.launch(self.lag_kernels.commit, self.model.worlds, [self.lag, accepted])
+
+    def start(self, active: wp.array) -> None:
+        """Make it anew where it is due, and D with it; penalties follow from D here."""
+        self._decide(active)
+        wp.capture_if(self.lag.any_build, self._build_first)
+
     def prepare(self, active: wp.array) -> None:
-        """Make it anew where it is due."""
+        """Make it anew where it is due. The penalties of constraints stay those of the step."""
+        self._decide(active)
+        wp.capture_if(self.lag.any_build, self._build)
+
+    def _decide(self, active: wp.array) -> None:
         w = self.work
         self.lag.any_build.zero_()
         args = [self.lag, w.step.mass_factor, w.step.dq_dv, active]
         self.launch(self.lag_kernels.decide, self.model.worlds, args)
-        wp.capture_if(self.lag.any_build, self._build)
 
     def judge(self, active: wp.array) -> None:
         """Count what the solve cost."""
@@ -205,17 +232,25 @@ class TwoLevel:
 
     # making it
 
-    def _build(self) -> None:
-        m, w, launch, lag, state = self.model, self.work, self.launch, self.lag, self.state
+    def _build_first(self) -> None:
+        self._build(penalty=True)
+
+    def _build(self, *, penalty: bool = False) -> None:
+        m, w, launch, lag = self.model, self.work, self.launch, self.lag
         flags, factors = lag.build, (lag.mass_factor, lag.dq_dv)
-        launch(self.lag_kernels.keep_vectors, self.dim, [w.u, lag.moved, state.preconditioner_displacement])
-        self.assembled.assemble(state.preconditioner_displacement, factors, flags, self.value, projected=True)
+        # the rows follow once the penalties are known
+        launch(self.lag_kernels.carry_places, self.dim, [lag, self.none, w.u, self.kept, self.place])
+        self.assembled.assemble(self.place, factors, flags, self.value, projected=True)
+        args = [m.topology, self.assembled.pattern.data, self.value, flags, w.diagonal, w.inverse]
+        launch(self.blocks.take_diagonal, self.dim, args)
         if m.constraints:
-            mul = w.multipliers
-            kept = [state.preconditioner_gradient, state.preconditioner_stiffness]
-            args = [mul.gradient, mul.stiffness, lag.moved, *kept]
-            launch(self.lag_kernels.keep_rows, (m.worlds, m.constraints.count), args)
-            self.assembled.add_constraints(*kept, lag.dq_dv, flags, self.value)
+            constraints = self.residual.constraints
+            assert constraints is not None
+            if penalty:
+                constraints.build(flags, penalty=True)
+            self._carry(self.none)
+            self.assembled.add_constraints(*self.place_rows, lag.dq_dv, flags, self.value)
+        launch(self.lag_kernels.made, m.worlds, [lag])
         for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
             value = arrays.value if depth else self.value
             if level.dense:
@@ -223,7 +258,8 @@ class TwoLevel:
                 return
             self._invert_tiles(level, arrays, value, flags, keep=depth == 0)
             assert level.galerkin is not None
-            args = [*level.galerkin, level.data.weight, value, flags, self.arrays[depth + 1].value]
+            free = self.all_free if depth else m.topology.free
+            args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
             launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array, *, keep: bool) -> None:
