@@ -14,7 +14,7 @@ import warp as wp
 from .errors import ModelError
 from .integrators import Integrator
 from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_kernels
-from .launch import Launcher
+from .launch import Launcher, part
 from .solvers.newton import NewtonLoop, NewtonPCG
 from .state import State
 from .workspace import Workspace
@@ -206,6 +206,12 @@ class Stepper:
         self.running.zero_()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
         wp.capture_while(self.running, self._attempt)
+        self._report()
+
+    @part("commit")
+    def _report(self) -> None:
+        """Undo a failed step, and tell of the step."""
+        m, w, launch = self.model, self.work, self.launch
         if self.backup is not None:
             launch(self.kernels.failed_now, m.worlds, [w.step, w.newton.active])
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
@@ -238,6 +244,12 @@ class Stepper:
             constraints.start(state.constraint_force, state.constraint_target, running)
         self.newton.run()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
+        self._commit()
+
+    @part("commit")
+    def _commit(self) -> None:
+        """Take over an accepted attempt."""
+        w, launch, state = self.work, self.launch, self.state
         if self.backup is not None:
             # before the first halving the state is still that of the step's start: keep it
             self.backup.copy_rows(launch, w.step.first_refusal, state)
@@ -245,9 +257,10 @@ class Stepper:
             self._book()
         args = [w.step, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
         launch(self.kernels.commit, self.dim, args)
-        if constraints:
-            constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
+        if self.newton.constraints:
+            self.newton.constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
 
+    @part("loads")
     def _loads(self, active: wp.array) -> None:
         self._laws(active)
         m, w, launch, loads = self.model, self.work, self.launch, self.model.loads
@@ -277,6 +290,7 @@ class Stepper:
             for kernel, law in loads.function_laws:
                 launch(kernel, m.worlds, [law, w.step.new_time, active, w.law_value])
 
+    @part("loads")
     def _damping(self, active: wp.array) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
         if self.integrator.static:
