@@ -9,7 +9,7 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import warp as wp
 
-__all__ = ["PARTS", "Launcher", "Recorder", "kernel_name", "part"]
+__all__ = ["PARTS", "Launcher", "Recorder", "kernel_name", "labelled"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -26,7 +26,7 @@ PARTS = {
     "control": "start of a step, line search, decisions of the loops",
     "commit": "acceptance of a step, energy ledger, report",
 }
-"""What the launches of a step are for. A launch outside any `part` is "control"."""
+"""What the launches of a step are for. A launch without a label is "control"."""
 
 
 class Recorder(Protocol):
@@ -42,7 +42,8 @@ class Launcher:
     """Launches on one device; remembers which kernels and modules were used and how often.
 
     Attributes:
-        recorder: does the launches, if set; they are not counted then. label: the part that launches belong to, see `PARTS`.
+        recorder: does the launches, if set; they are not counted then.
+        label: the part that launches belong to, see `PARTS`.
     """
 
     def __init__(self, device: Any) -> None:
@@ -93,7 +94,7 @@ def kernel_name(kernel: wp.Kernel) -> str:
     return f"{kernel.module.name.removeprefix('warpfea.kernels.')}.{kernel.key.rsplit('__locals__', 1)[-1]}"
 
 
-def part(name: str) -> Callable[[Callable[Concatenate[S, P], R]], Callable[Concatenate[S, P], R]]:
+def labelled(name: str) -> Callable[[Callable[Concatenate[S, P], R]], Callable[Concatenate[S, P], R]]:
     """Marks a method of an object with a `launch`: its launches belong to part `name`, see `PARTS`."""
     assert name in PARTS, name
 

@@ -109,6 +109,8 @@ class Profile:
 
 @dataclass
 class _Booked:
+    """Sums over launches."""
+
     launches: int = 0
     seconds: float = 0.0
     bytes: int = 0
@@ -147,12 +149,17 @@ class Recorder:
         booked.launches += 1
         booked.bytes += size
 
+    def clear(self) -> None:
+        """Forget what was booked; commands are kept."""
+        self._pending.clear()
+        for booked in self._booked.values():
+            booked.launches, booked.seconds, booked.bytes = 0, 0.0, 0
+
     def measure(self, work: Callable[[], object]) -> None:
         """Call `work`, whose launches come here; on the GPU collect their times."""
         if not self.device.is_cuda:
             work()
             return
-        self._pending.clear()
         wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
         try:
             work()
@@ -173,19 +180,18 @@ class Recorder:
 
     def kernels(self, steps: int, empty: float) -> tuple[KernelTime, ...]:
         """What was booked, per step, less `empty` seconds per launch; the longest first."""
-        rows = [
-            KernelTime(
-                part, kernel, b.launches / steps, 1e3 * max(b.seconds - b.launches * empty, 0.0) / steps, b.bytes / steps
-            )
-            for (part, kernel), b in self._booked.items()
-        ]
+        rows = []
+        for (part, kernel), b in self._booked.items():
+            if b.launches:
+                ms = 1e3 * max(b.seconds - b.launches * empty, 0.0)
+                rows.append(KernelTime(part, kernel, b.launches / steps, ms / steps, b.bytes / steps))
         return tuple(sorted(rows, key=lambda row: -row.ms))
 
 
 def _identity(value: Any) -> Any:
     """What tells arguments of a launch apart."""
     if isinstance(value, wp.array):
-        return value.ptr, value.shape
+        return value.ptr, value.shape, value.strides
     return value if isinstance(value, (int, float)) else id(value)
 
 
@@ -230,14 +236,12 @@ def _members(kernel: wp.Kernel) -> set[str] | None:
 
 
 def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] | None = None) -> Profile:
-    """Profile the `steps` steps that follow after a warm-up of two; the simulation is advanced.
+    """Profile the `steps` steps that follow a warm-up of two; the simulation is at their end then, as after `step`.
 
     Args:
         sim: a simulation that records its steps (capture=True).
         steps: that are timed, as graphs and then again launch by launch.
-        on_step: called after each of the 2 steps + 3 steps that are done.
-
-    Returns the simulation at the end of the last step, with the bits of a run without a profile.
+        on_step: called after each of the 2 steps + 3 that are done.
 
     Raises:
         ModelError: steps out of range, or a simulation with capture=False.
@@ -265,11 +269,12 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
     step_ms = do(steps, sim.step)
     per_step = {name: float(total.sum() - before[name]) / steps for name, total in sim.totals.items()}
     recorder = Recorder(sim.model.device)
-    sim.state.load(start)
-    do(1, stepper.sequence)
-    sim.state.load(start)
     stepper.launch.recorder = recorder
     try:
+        sim.state.load(start)
+        do(1, stepper.sequence)  # makes the commands
+        sim.state.load(start)
+        recorder.clear()
         do(steps, lambda: recorder.measure(stepper.sequence))
     finally:
         stepper.launch.recorder = None
@@ -284,19 +289,16 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
     )
 
 
-def _empty_command(device: Any) -> wp.Launch:
-    flags = wp.zeros(1, dtype=wp.int32, device=device)
-    return wp.launch(probe_kernels().empty, dim=1, inputs=[flags], device=device, record_cmd=True)
-
-
 def _empty_launch(device: Any) -> float:
     """Seconds that an empty launch takes by the recorder's means: the median of single ones."""
     device = wp.get_device(device)
-    command = _empty_command(device)
+    flags = wp.zeros(1, dtype=wp.int32, device=device)
+    command = wp.launch(probe_kernels().empty, dim=1, inputs=[flags], device=device, record_cmd=True)
     command.launch()
     if device.is_cuda:
         wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
         for _ in range(EMPTY_LAUNCHES):
+            wp.synchronize_device(device)  # small kernels that are launched one by one meet an idle device too
             command.launch()
         return 1e-3 * statistics.median(r.elapsed for r in wp.timing_end())
     times = []

@@ -14,7 +14,7 @@ import warp as wp
 from .errors import ModelError
 from .integrators import Integrator
 from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_kernels
-from .launch import Launcher, part
+from .launch import Launcher, labelled
 from .solvers.newton import NewtonLoop, NewtonPCG
 from .state import State
 from .workspace import Workspace
@@ -208,7 +208,7 @@ class Stepper:
         wp.capture_while(self.running, self._attempt)
         self._report()
 
-    @part("commit")
+    @labelled("commit")
     def _report(self) -> None:
         """Undo a failed step, and tell of the step."""
         m, w, launch = self.model, self.work, self.launch
@@ -246,7 +246,7 @@ class Stepper:
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
         self._commit()
 
-    @part("commit")
+    @labelled("commit")
     def _commit(self) -> None:
         """Take over an accepted attempt."""
         w, launch, state = self.work, self.launch, self.state
@@ -260,7 +260,7 @@ class Stepper:
         if self.newton.constraints:
             self.newton.constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
 
-    @part("loads")
+    @labelled("loads")
     def _loads(self, active: wp.array) -> None:
         self._laws(active)
         m, w, launch, loads = self.model, self.work, self.launch, self.model.loads
@@ -290,7 +290,7 @@ class Stepper:
             for kernel, law in loads.function_laws:
                 launch(kernel, m.worlds, [law, w.step.new_time, active, w.law_value])
 
-    @part("loads")
+    @labelled("loads")
     def _damping(self, active: wp.array) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
         if self.integrator.static:

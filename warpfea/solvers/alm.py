@@ -16,7 +16,7 @@ import warp as wp
 
 from ..kernels.constraints import SUM_ROWS, multiplier_struct
 from ..kernels.deflation import deflation_kernels
-from ..launch import part
+from ..launch import labelled
 
 if TYPE_CHECKING:
     from ..launch import Launcher
@@ -73,13 +73,13 @@ class ConstraintSolver:
         self.large = model.array("constraints", large, wp.int32) if self.largest else None
         self.large_count = len(large)
 
-    @part("constraints")
+    @labelled("constraints")
     def start(self, multipliers: wp.array, travel: wp.array, active: wp.array) -> None:
         """Warm start of an attempt from the state's multipliers and right sides; rho is not known yet."""
         args = [multipliers, travel, active, self.work.multipliers]
         self.launch(self.kernels.load_multipliers, self.dim, args)
 
-    @part("constraints")
+    @labelled("constraints")
     def evaluate(self, active: wp.array) -> None:
         """c, J and the augmented potential's rows at work.u."""
         m, w, k = self.model, self.work, self.kernels
@@ -88,7 +88,7 @@ class ConstraintSolver:
         args = [self.constraints.data, w.u, w.law_value, w.newton.alpha, active, mul]
         self.launch(k.evaluate, self.dim, args)
 
-    @part("build")
+    @labelled("build")
     def build(self, active: wp.array, *, penalty: bool = False) -> None:
         """Matrices of the clusters from the inverse diagonal blocks; `penalty`: set rho from them."""
         m, w, k, launch = self.model, self.work, self.deflation, self.launch
@@ -115,7 +115,7 @@ class ConstraintSolver:
         args = [self.constraints.data, w.multipliers, p, w.step.dq_dv, active]
         self.launch(self.kernels.product_terms, self.dim, args)
 
-    @part("preconditioner")
+    @labelled("preconditioner")
     def precondition(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z, and r.z per slot."""
         m, w, k, launch = self.model, self.work, self.deflation, self.launch
@@ -132,26 +132,26 @@ class ConstraintSolver:
                 launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
         launch(k.project, (m.worlds, m.slots), [data, mul, w.inverse, r, active, z, w.rows])
 
-    @part("constraints")
+    @labelled("constraints")
     def predict(self, active: wp.array) -> None:
         """The multipliers' part of the Newton step in work.direction."""
         w = self.work
         args = [self.constraints.data, w.multipliers, w.direction, w.newton.quiet, w.step.dq_dv, active]
         self.launch(self.kernels.predict_change, self.dim, args)
 
-    @part("constraints")
+    @labelled("constraints")
     def adopt(self, flags: wp.array) -> None:
         """Take over the multipliers of the trial."""
         self.launch(self.kernels.adopt, self.dim, [flags, self.work.multipliers])
 
-    @part("constraints")
+    @labelled("constraints")
     def work_terms(self, displacement: wp.array, travel: wp.array, accepted: wp.array) -> None:
         """Work of drives and loss of constraints along an accepted substep, as rows 0 and 1."""
         w = self.work
         args = [self.constraints.data, w.multipliers, w.u, displacement, travel, accepted]
         self.launch(self.kernels.work_terms, self.dim, args)
 
-    @part("constraints")
+    @labelled("constraints")
     def commit(self, multipliers: wp.array, travel: wp.array, accepted: wp.array) -> None:
         """Keep multipliers and right sides of an accepted substep."""
         args = [accepted, self.work.multipliers, multipliers, travel]

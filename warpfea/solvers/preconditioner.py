@@ -8,7 +8,7 @@ import warp as wp
 
 from ..errors import ModelError
 from ..kernels.pcg import pcg_kernels
-from ..launch import part
+from ..launch import labelled
 from .residual import Residual
 
 if TYPE_CHECKING:
@@ -37,12 +37,12 @@ class BlockJacobi:
         self.kernels = pcg_kernels(model.dtype, model.constraints is not None)
         self.dim = (model.worlds, model.slots)
 
-    @part("build")
+    @labelled("build")
     def build(self, active: wp.array) -> None:
         """Assemble and invert the blocks."""
         self.residual.blocks(active)
 
-    @part("preconditioner")
+    @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
         self.launch(self.kernels.block_jacobi, self.dim, [self.work.inverse, r, active, z, self.work.rows])
