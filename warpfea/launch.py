@@ -66,7 +66,8 @@ class Launcher:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Launches within belong to part `name`; the innermost counts."""
+        """Launches within belong to part `name` of `PARTS`; the innermost counts."""
+        assert name in PARTS, name
         outer, self.label = self.label, name
         try:
             yield
@@ -96,7 +97,6 @@ def kernel_name(kernel: wp.Kernel) -> str:
 
 def labelled(name: str) -> Callable[[Callable[Concatenate[S, P], R]], Callable[Concatenate[S, P], R]]:
     """Marks a method of an object with a `launch`: its launches belong to part `name`, see `PARTS`."""
-    assert name in PARTS, name
 
     def mark(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
         @functools.wraps(method)

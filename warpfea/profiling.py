@@ -171,8 +171,8 @@ class Recorder:
         """Book the times of the pending launches, in their order. ModelError where others were timed too."""
         if len(elapsed_ms) != len(self._pending):
             raise ModelError(
-                f"profile: {len(elapsed_ms)} kernels were timed and {len(self._pending)} launched; something else "
-                "uses the device in this process"
+                f"profile: {len(elapsed_ms)} kernels were timed and {len(self._pending)} launched; others run that "
+                "do not pass the Launcher"
             )
         for booked, ms in zip(self._pending, elapsed_ms):
             booked.seconds += 1e-3 * ms
