@@ -263,8 +263,9 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
                 on_step()
         return times
 
-    do(WARM_UP, sim.step)
+    do(WARM_UP - 1, sim.step)
     start = sim.state.numpy()
+    do(1, sim.step)
     before = {name: total.sum() for name, total in sim.totals.items()}
     step_ms = do(steps, sim.step)
     per_step = {name: float(total.sum() - before[name]) / steps for name, total in sim.totals.items()}
@@ -272,8 +273,7 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
     stepper.launch.recorder = recorder
     try:
         sim.state.load(start)
-        do(1, stepper.sequence)  # makes the commands
-        sim.state.load(start)
+        do(1, stepper.sequence)  # makes the commands, and what does not belong to the state
         recorder.clear()
         do(steps, lambda: recorder.measure(stepper.sequence))
     finally:
