@@ -239,11 +239,13 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         mul: Multipliers,
         inverse: wp.array2d(dtype=mat33),
         r: wp.array2d(dtype=vec3),
+        y: wp.array2d(dtype=vec3),
+        add: int,
         active: wp.array(dtype=wp.int32),
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z -= D^-1 J^T y, and r.z per slot."""
+        """z = y - D^-1 J^T s where constraints touch a slot, y = D^-1 r, with `add` z += the same; and r.z per slot."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -255,7 +257,10 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             for k in range(first, last):
                 term = con.slot_term[k]
                 s += (con.slot_weight[k] * mul.solved[world, term / 3]) * mul.gradient[world, term]
-            out = out - inverse[world, slot] * vec3(s)
+            change = y[world, slot] - inverse[world, slot] * vec3(s)
+            if add != 0:
+                change += out
+            out = change
             z[world, slot] = out
         rows[0, world, slot] = f64(wp.dot(r[world, slot], out))
 

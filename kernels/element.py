@@ -79,6 +79,7 @@ def element_kernels(
     history_module = kernel_module(f"{name}_history")
     viscous_module = kernel_module(f"{name}_viscous")
     stress_module = kernel_module(f"{name}_stress")
+    matrix_module = kernel_module(f"{name}_matrix")
 
     @wp.func
     def coefficients(block: Block, world: int, elem: int) -> coef:
@@ -325,6 +326,88 @@ def element_kernels(
                 entry = block.contribution_offset + i * block.count + elem
                 contribution[world, entry] = contribution[world, entry] + w * pack(K)
 
+    @wp.func
+    def compression(G: mat33, c: coef) -> T:
+        """A bound of the largest compressive principal value of S = F^-1 P (Gershgorin), 0 in tension."""
+        F = t.identity() + G
+        if wp.abs(wp.determinant(F)) < T(1.0e-3):
+            return T(0.0)
+        S = wp.inverse(F) * m.stress(G, c)
+        low = T(0.0)
+        for i in range(3):
+            low = wp.max(low, wp.abs(S[i, 0]) + wp.abs(S[i, 1]) + wp.abs(S[i, 2]) - wp.abs(S[i, i]) - S[i, i])
+        return low
+
+    @wp.kernel(module=matrix_module)
+    def element_matrix(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        projected: int,
+        active: wp.array(dtype=wp.int32),
+        matrix: wp.array3d(dtype=mat33),
+    ):
+        """K of each element as the 3x3 blocks of slots a <= b, row by row; one thread does one column of blocks.
+
+        `projected`: without what can make it indefinite at a point, compression and stress of the viscosity.
+        """
+        world, b, elem = wp.tid()
+        if active[world] == 0:
+            return
+        c = coefficients(block, world, elem)
+        U = load(block, u, world, elem)
+        V = Local()
+        if wp.static(damping == "rate"):
+            V = load(block, v, world, elem)
+        dq = T(dq_dv[world])
+        first = Local()
+        second = Local()
+        third = Local()
+        for q in range(NQ):
+            G = gradient_of(block, U, q, elem)
+            w = weight_of(block, q, elem)
+            local = into_axes(block, G, q, elem)
+            shift = T(0.0)
+            if projected != 0:
+                shift = compression(local, c)
+            h = vec3()
+            if wp.static(affine):
+                h = wp.transpose(block.J0_inv[elem]) * block.gradient[q, b, 0]
+            else:
+                h = block.gradient[q, b, elem]
+            for axis in range(3):
+                unit = vec3()
+                unit[axis] = T(1.0)
+                dG = wp.outer(unit, h)
+                dP = m.increment(local, into_axes(block, dG, q, elem), c)
+                dP = out_of_axes(block, dP, q, elem) + shift * dG
+                if wp.static(damping == "incremental" or damping == "rate"):
+                    F = t.identity() + G
+                    dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[LAMBDA_V] / dq, c[ETA] / dq)
+                    dP = dP + F * dS
+                    if projected == 0:
+                        rate = strain_rate(block, G, V, history, dq, world, q, elem)
+                        dP = dP + dG * t.isotropic(rate, c[LAMBDA_V], c[ETA])
+                dP = w * dP
+                if wp.static(affine):
+                    dP = dP * wp.transpose(block.J0_inv[elem])
+                for a in range(b + 1):
+                    column = vec3()
+                    if wp.static(affine):
+                        column = dP * block.gradient[q, a, 0]
+                    else:
+                        column = dP * block.gradient[q, a, elem]
+                    if axis == 0:
+                        first[a] = first[a] + column
+                    elif axis == 1:
+                        second[a] = second[a] + column
+                    else:
+                        third[a] = third[a] + column
+        for a in range(b + 1):
+            matrix[world, a * NS - (a * (a - 1)) / 2 + b - a, elem] = wp.matrix_from_cols(first[a], second[a], third[a])
+
     @wp.kernel(module=history_module)
     def strain_history(
         block: Block,
@@ -398,6 +481,7 @@ def element_kernels(
         internal_force=internal_force,
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,
+        element_matrix=element_matrix,
         strain_history=strain_history,
         viscous_force=viscous_force,
         point_stress=point_stress,

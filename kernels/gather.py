@@ -11,16 +11,29 @@ import warp as wp
 from .constraints import constraint_struct, multiplier_struct
 from .types import kernel_module, precision
 
-__all__ = ["RESIDUAL_ROWS", "gather_kernels", "topology_struct"]
+__all__ = ["RESIDUAL_ROWS", "gather_kernels", "pattern_struct", "topology_struct"]
 
-RESIDUAL_ROWS = 9
+RESIDUAL_ROWS = 10
 """Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
 part of Phi and its magnitude; g.p with non-potential forces held; what Phi changes by when they are refreshed; the
-squared norm of the rounding of the positions."""
+squared norm of the rounding of the positions; |g|^2."""
 
 
 REACTION = wp.constant(wp.float64(1.0e-6))
 """Share of the squared reactions in the squared scale of the residual."""
+
+
+@functools.cache
+def pattern_struct():
+    """Rows of a matrix of 3x3 blocks."""
+
+    @wp.struct
+    class Pattern:
+        start: wp.array(dtype=wp.int32)  # [slot + 1]
+        column: wp.array(dtype=wp.int32)  # [entry] slot
+        upper: wp.array(dtype=wp.vec4i)  # entry, its mirror, row, column; of the diagonal and above
+
+    return Pattern
 
 
 @functools.cache
@@ -52,7 +65,10 @@ def gather_kernels(
     Topology = topology_struct(dtype)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     f64 = wp.float64
-    module = kernel_module(f"gather_{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}")
+    Pattern = pattern_struct()
+    name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
+    module = kernel_module(f"gather_{name}")
+    matrix_module = kernel_module(f"matrix_product_{name}")
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -181,6 +197,35 @@ def gather_kernels(
         if wp.static(nonpotential):
             rows[7, world, slot] = f64(wp.dot(pushed_held[world, slot] - pushed[world, slot], vs))
         rows[8, world, slot] = spread(u[world, slot], free, D, dq_dv[world])
+        plain = wp.cw_mul(residual_force, free)
+        rows[9, world, slot] = f64(wp.dot(plain, plain))
+
+    @wp.func
+    def finish(
+        topo: Topology,
+        h: vec3,
+        pushed_start: wp.array(dtype=wp.int32),
+        pushed_entry: wp.array(dtype=wp.int32),
+        pushed_contribution: wp.array2d(dtype=vec3),
+        dq: T,
+        con: Constraints,
+        mul: Multipliers,
+        world: int,
+        slot: int,
+    ) -> vec3:
+        """Follower loads and constraints added to the elements' part, on the free components."""
+        out = h
+        if wp.static(pressure):
+            f = vec3()
+            for k in range(pushed_start[slot], pushed_start[slot + 1]):
+                f += pushed_contribution[world, pushed_entry[k]]
+            out -= dq * f
+        if wp.static(constrained):
+            tie = wp.vec3d()
+            for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
+                tie += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
+            out += vec3(tie)
+        return wp.cw_mul(out, topo.free[slot])
 
     @wp.kernel(module=module)
     def product(
@@ -208,16 +253,38 @@ def gather_kernels(
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
-        if wp.static(pressure):
-            for k in range(pushed_start[slot], pushed_start[slot + 1]):
-                f -= pushed_contribution[world, pushed_entry[k]]
-        h = T(mass_factor[world]) * a + T(dq_dv[world]) * f
-        if wp.static(constrained):
-            tie = wp.vec3d()
-            for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
-                tie += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
-            h += vec3(tie)
-        h = wp.cw_mul(h, topo.free[slot])
+        dq = T(dq_dv[world])
+        h = T(mass_factor[world]) * a + dq * f
+        h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
+        out[world, slot] = h
+        rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
+
+    @wp.kernel(module=matrix_module)
+    def matrix_product(
+        topo: Topology,
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        pushed_start: wp.array(dtype=wp.int32),
+        pushed_entry: wp.array(dtype=wp.int32),
+        pushed_contribution: wp.array2d(dtype=vec3),
+        p_in: wp.array2d(dtype=vec3),
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
+        out: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """The same with the elements' part and the mass as one matrix."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        h = vec3()
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            h += value[world, k] * p_in[world, pattern.column[k]]
+        dq = T(dq_dv[world])
+        h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
         out[world, slot] = h
         rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
 
@@ -290,6 +357,8 @@ def gather_kernels(
 
     return _types.SimpleNamespace(
         module=module,
+        matrix_module=matrix_module,
+        matrix_product=matrix_product,
         gather_force=gather_force,
         residual=residual,
         product=product,

@@ -78,6 +78,8 @@ def control_struct():
         open: wp.array(dtype=wp.float64)  # largest violation over its tolerance; with constraints
         slack: wp.float64  # norm of PCG over the norm that is judged, across constraints
         classical: wp.int32  # multipliers change in an outer loop
+        force: wp.array(dtype=wp.float64)  # |g| over the free components, N
+        force_tol: wp.float64  # N; accepted without regard to the size of the forces; 0: never
         tol: wp.float64
         eps: wp.float64
         max_iterations: wp.int32
@@ -125,6 +127,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
 
         Components that do not touch must not hide behind each other's forces, and a converged one is left alone.
         """
+        force = wp.sqrt(ctl.slot_sums[9, world])
+        ctl.force[world] = force
         largest = f64(0.0)
         excess = f64(0.0)
         floor_excess = f64(0.0)
@@ -144,6 +148,9 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             norm = wp.sqrt(g2)
             scale = wp.sqrt(f2)
             accept = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
+            if force > f64(0.0):
+                # the force's tolerance in this norm, as they compare at this iterate
+                accept = wp.max(accept, norm * (ctl.force_tol / force))
             loud = norm > accept
             if wp.static(constrained):
                 if ctl.violation[world, c] > ctl.constraint_tol:

@@ -29,8 +29,10 @@ def pcg_struct():
         rz: wp.array(dtype=wp.float64)
         alpha: wp.array(dtype=wp.float64)
         beta: wp.array(dtype=wp.float64)
-        target: wp.array(dtype=wp.float64)  # of sqrt(r.z)
-        sums: wp.array2d(dtype=wp.float64)
+        target: wp.array(dtype=wp.float64)  # of the norm
+        norm: wp.array(dtype=wp.float64)  # |r| in the D^-1 norm, which Newton's method judges by
+        first_norm: wp.array(dtype=wp.float64)  # at the start of the solve
+        sums: wp.array2d(dtype=wp.float64)  # r.z and r.D^-1 r; p.Hp
         any_active: wp.array(dtype=wp.int32)
         max_iterations: wp.int32
 
@@ -97,11 +99,12 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
     def block_jacobi(
         inverse: wp.array2d(dtype=mat33),
         r: wp.array2d(dtype=vec3),
+        diagonal: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z = D^-1 r with 3x3 blocks, and r.z per slot."""
+        """z = B r with 3x3 blocks B, and per slot r.z and r.D^-1 r."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -109,6 +112,8 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         b = inverse[world, slot] * a
         z[world, slot] = b
         rows[0, world, slot] = f64(wp.dot(a, b))
+        D = diagonal[world, slot]
+        rows[1, world, slot] = f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
 
     @wp.kernel(module=module)
     def begin(newton: Newton, ctl: Control):
@@ -118,24 +123,21 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         if newton.active[world] == 0:
             return
         rz = ctl.sums[0, world]
+        norm = wp.sqrt(ctl.sums[1, world])
         ctl.rz[world] = rz
+        ctl.norm[world] = norm
+        ctl.first_norm[world] = norm
         ctl.iterations[world] = 0
-        ctl.target[world] = wp.max(
-            newton.forcing[world] * newton.solve_norm[world], f64(0.1) * newton.solve_accept[world]
-        )
+        goal = newton.forcing[world] * newton.solve_norm[world]
+        least = f64(0.1) * newton.solve_accept[world]
         if wp.static(constrained):
-            # across constraints r.z counts less than the norm that is judged, by the root of the penalty's factor;
-            # and it may drive a step where the forces balance
-            goal = newton.forcing[world] * newton.solve_norm[world]
-            if newton.classical == 0:
-                goal = goal * newton.slack
-            goal = wp.min(goal, newton.forcing[world] * wp.sqrt(wp.max(rz, f64(0.0))))
-            least = f64(0.1) * newton.slack * newton.solve_accept[world]
+            # open constraints may drive a step where the forces balance
+            goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
             if newton.classical == 0:
                 # a loose tolerance of the forces must not leave constraints open
                 least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
-            ctl.target[world] = wp.max(goal, least)
-        if rz > ctl.target[world] * ctl.target[world] and ctl.max_iterations > 0:
+        ctl.target[world] = wp.max(goal, least)
+        if norm > ctl.target[world] and rz > f64(0.0) and ctl.max_iterations > 0:
             ctl.active[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)
 
@@ -181,10 +183,11 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         if ctl.active[world] == 0:
             return
         rz = ctl.sums[0, world]
+        norm = wp.sqrt(ctl.sums[1, world])
         ctl.beta[world] = rz / ctl.rz[world]
         ctl.rz[world] = rz
-        target = ctl.target[world]
-        if rz > target * target and ctl.iterations[world] < ctl.max_iterations and wp.isfinite(rz):
+        ctl.norm[world] = norm
+        if norm > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations and rz > f64(0.0) and wp.isfinite(rz):
             wp.atomic_max(ctl.any_active, 0, 1)
         else:
             ctl.active[world] = 0

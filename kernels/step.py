@@ -29,6 +29,7 @@ REPORT = (
     "attempt_time",
     "violation",
     "outer",
+    "residual_force",
 )
 """Columns of the report of a step, [world, column] in float64; probes follow."""
 
@@ -382,6 +383,7 @@ def step_kernels(
         report[world, 8] = step.new_time[world]
         report[world, 9] = f64(0.0)
         report[world, 10] = f64(0.0)
+        report[world, 11] = newton.force[world]
         if wp.static(constrained):
             largest = f64(0.0)
             for c in range(newton.components):

@@ -49,7 +49,9 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Block = tied_struct(dtype)
-    module = kernel_module(f"tied_{dtype}_{slots}_{ties}_{width}")
+    name = f"tied_{dtype}_{slots}_{ties}_{width}"
+    module = kernel_module(name)
+    matrix_module = kernel_module(f"{name}_matrix")
     Local = wp.types.matrix(shape=(slots, 3), dtype=T)
     Ties = wp.types.vector(length=ties, dtype=T)
     TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
@@ -190,8 +192,52 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             entry = block.contribution_offset + i * block.count + elem
             contribution[world, entry] = mu * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
 
+    @wp.kernel(module=matrix_module)
+    def element_matrix(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        projected: int,
+        active: wp.array(dtype=wp.int32),
+        matrix: wp.array3d(dtype=mat33),
+    ):
+        """K of each element as the 3x3 blocks of slots a <= b, row by row; `projected`: without the geometric part."""
+        world, b, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = load(block, u, world, elem)
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        A = TieVectors()
+        D = TieVectors()
+        y = TieVectors()
+        for t in range(NT):
+            A[t] = block.X_first[t, elem] + line(block.first, U, t, elem)
+            D[t] = block.X_second[t, elem] + line(block.second, U, t, elem)
+        for t in range(NT):
+            first = (t / W) * W
+            row = vec3()
+            for k in range(W):
+                s = first + k
+                row += block.coupling[t, k, elem] * (block.first[s, b, elem] * D[s] + block.second[s, b, elem] * A[s])
+            y[t] = mu * row
+        stress = Ties()
+        if projected == 0:
+            stress = stresses(block, shears(block, U, elem), world, elem)
+        for a in range(b + 1):
+            K = mat33()
+            for t in range(NT):
+                K += wp.outer(block.first[t, a, elem] * D[t] + block.second[t, a, elem] * A[t], y[t])
+                if projected == 0:
+                    both = block.first[t, a, elem] * block.second[t, b, elem]
+                    both += block.second[t, a, elem] * block.first[t, b, elem]
+                    K += (stress[t] * both) * wp.identity(n=3, dtype=T)
+            matrix[world, a * NS - (a * (a - 1)) / 2 + b - a, elem] = K
+
     return _types.SimpleNamespace(
         module=module,
+        element_matrix=element_matrix,
         internal_force=internal_force,
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,

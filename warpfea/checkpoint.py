@@ -124,6 +124,7 @@ def load_checkpoint(sim: Simulation, path: str | os.PathLike[str]) -> None:
         raise CheckpointError(f"{file}: iteration totals or probe records are damaged")
     try:
         sim.state.load(state)
+        sim.stepper.forget()
     except CheckpointError as error:
         raise CheckpointError(f"{file}: {error}") from None
     sim.totals = {name: np.array(a) for name, a in totals.items()}

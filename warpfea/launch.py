@@ -18,6 +18,7 @@ S = TypeVar("S")
 PARTS = {
     "residual": "forces of the elements and their sum at the nodes",
     "product": "the operator H v of the linear solve",
+    "assembly": "H as a matrix, where products are made with it",
     "preconditioner": "z = B r",
     "build": "the preconditioner at a new iterate",
     "vectors": "vector updates, dot products and sums",
@@ -33,9 +34,9 @@ class Recorder(Protocol):
     """Does the launches in place of the Launcher, to time them."""
 
     def __call__(
-        self, part: str, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], make: Callable[[], wp.Launch]
+        self, part: str, kernel: wp.Kernel, size: Sequence[int], inputs: list[Any], make: Callable[[], wp.Launch]
     ) -> None:
-        """Launch `kernel` on `dim` and `inputs`, for `part`; `make` gives the command that does it."""
+        """Launch `kernel` on items and blocks of `size` for `part`; `make` gives the command that does it."""
 
 
 class Launcher:
@@ -54,15 +55,15 @@ class Launcher:
         self.recorder: Recorder | None = None
         self.label = "control"
 
-    def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any]) -> None:
+    def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
         """Launch one thread per item of `dim`; an empty launch is left out."""
         if min([dim] if isinstance(dim, int) else dim) == 0:
             return
-        self._do(wp.launch, kernel, [dim] if isinstance(dim, int) else dim, inputs)
+        self._do(wp.launch, kernel, [dim] if isinstance(dim, int) else dim, inputs, block_dim)
 
     def tiled(self, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int = 128) -> None:
         """Launch one block per item of `dim`."""
-        self._do(wp.launch_tiled, kernel, dim, inputs, block_dim=block_dim)
+        self._do(wp.launch_tiled, kernel, dim, inputs, block_dim)
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
@@ -75,14 +76,14 @@ class Launcher:
             self.label = outer
 
     def _do(
-        self, launch: Callable[..., Any], kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], **how: Any
+        self, launch: Callable[..., Any], kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int
     ) -> None:
-        how |= {"dim": dim, "inputs": inputs, "device": self.device}
+        do = functools.partial(launch, kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)
         if self.recorder is not None:
-            self.recorder(self.label, kernel, dim, inputs, functools.partial(launch, kernel, record_cmd=True, **how))
+            self.recorder(self.label, kernel, (*dim, block_dim), inputs, functools.partial(do, record_cmd=True))
             return
         self._count(kernel)
-        launch(kernel, **how)
+        do()
 
     def _count(self, kernel: wp.Kernel) -> None:
         self.launches += 1

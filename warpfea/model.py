@@ -63,6 +63,8 @@ class Model:
         slots: number of slots of all bodies.
         size: diagonal of the box of all nodes, m; tolerances of constraints are measured with it.
         blocks: element blocks.
+        cache: tables that solvers made of the model and share.
+        mass_host: scalar mass matrix (slots, slots), CSR on the host, kg.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class Model:
         self.bodies: list[Body] = list(builder.bodies)
         self.types = precision(dtype)
         self._memory: dict[str, int] = {}
+        self.cache: dict[str, Any] = {}
         self._number()
         self._assemble_mass()
         self._build_blocks(tables)
@@ -139,9 +142,9 @@ class Model:
             raise ModelError("every component of every node is prescribed: nothing is left to solve for")
 
     def _assemble_mass(self) -> None:
-        self._mass = sp.block_diag([assembly.body_mass(b) for b in self.bodies], format="csr")
-        self._mass.sum_duplicates()
-        self.lumped_host = self._mass @ self.is_position_host
+        self.mass_host = sp.block_diag([assembly.body_mass(b) for b in self.bodies], format="csr")
+        self.mass_host.sum_duplicates()
+        self.lumped_host = self.mass_host @ self.is_position_host
         self.lumped = self.array("slots", self.lumped_host, self.types.T)
 
     def _build_blocks(self, tables: bool) -> None:
@@ -267,9 +270,9 @@ class Model:
         start, entry = assembly.gather_table(conn, self.slots)
         topo.start = self.array("topology", start, wp.int32)
         topo.entry = self.array("topology", entry, wp.int32)
-        topo.mass_start = self.array("mass", self._mass.indptr, wp.int32)
-        topo.mass_column = self.array("mass", self._mass.indices, wp.int32)
-        topo.mass_value = self.array("mass", self._mass.data, T)
+        topo.mass_start = self.array("mass", self.mass_host.indptr, wp.int32)
+        topo.mass_column = self.array("mass", self.mass_host.indices, wp.int32)
+        topo.mass_value = self.array("mass", self.mass_host.data, T)
         topo.free = self.array("slots", self.free_host, vec3)
         self.topology = topo
 
@@ -457,7 +460,7 @@ class Model:
 
     def mass_matrix(self) -> sp.csr_matrix:
         """Consistent mass, (3 slots, 3 slots) CSR, kg; unknown 3 slot + component."""
-        return sp.kron(self._mass, sp.identity(3), format="csr")
+        return sp.kron(self.mass_host, sp.identity(3), format="csr")
 
     def internal_force(self, state: State) -> np.ndarray:
         """Elastic internal force, Eq. (32), [world, slot, 3], N."""
@@ -516,7 +519,7 @@ class Model:
                 h.update(np.ascontiguousarray(body.frames).tobytes())
         h.update(self.reference.tobytes())
         h.update(self.free_host.tobytes())
-        h.update(self._mass.data.tobytes())
+        h.update(self.mass_host.data.tobytes())
         h.update(self.coefficients.numpy().tobytes())
         self.loads.hash(h)
         if self.constraints:

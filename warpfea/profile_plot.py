@@ -14,6 +14,7 @@ BETWEEN = "between kernels"
 COLORS = {  # a colour-blind-safe set (Okabe and Ito), greys for what is no arithmetic
     "residual": "#e69f00",
     "product": "#0072b2",
+    "assembly": "#004c7a",
     "preconditioner": "#009e73",
     "build": "#56b4e9",
     "vectors": "#cc79a7",

@@ -129,16 +129,16 @@ class Recorder:
         self._known: dict[Any, tuple[wp.Launch, _Booked, int, list[Any]]] = {}
 
     def __call__(
-        self, part: str, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], make: Callable[[], wp.Launch]
+        self, part: str, kernel: wp.Kernel, size: Sequence[int], inputs: list[Any], make: Callable[[], wp.Launch]
     ) -> None:
         """Do the launch; on the CPU time it."""
-        key = (part, kernel, *dim, *map(_identity, inputs))
+        key = (part, kernel, *size, *map(_identity, inputs))
         known = self._known.get(key)
         if known is None:
             booked = self._booked.setdefault((part, kernel_name(kernel)), _Booked())
             # the inputs are held, so that the identity of a struct stays its own
             known = self._known[key] = make(), booked, launch_bytes(inputs, _members(kernel)), inputs
-        command, booked, size, _ = known
+        command, booked, reached, _ = known
         if self.device.is_cuda:
             self._pending.append(booked)
             command.launch()
@@ -147,7 +147,7 @@ class Recorder:
             command.launch()
             booked.seconds += clock.perf_counter() - began
         booked.launches += 1
-        booked.bytes += size
+        booked.bytes += reached
 
     def clear(self) -> None:
         """Forget what was booked; commands are kept."""
@@ -273,6 +273,7 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
     stepper.launch.recorder = recorder
     try:
         sim.state.load(start)
+        stepper.forget()
         do(1, stepper.sequence)  # makes the commands, and what does not belong to the state
         recorder.clear()
         do(steps, lambda: recorder.measure(stepper.sequence))

@@ -41,6 +41,7 @@ class StepReport:
         status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
         min_J: smallest det F; a value <= 0 means that an element turned inside out (SVK only; others refuse it).
         time: s.
+        residual_force: |g| over the free components, N, of the last attempt.
         violation: largest of the constraints, m.
         outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
     """
@@ -56,6 +57,7 @@ class StepReport:
     failure: np.ndarray
     violation: np.ndarray
     outer: np.ndarray
+    residual_force: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +244,7 @@ class Simulation(Results):
             failure=column["failure"].astype(int),
             violation=column["violation"].copy(),
             outer=column["outer"].astype(int),
+            residual_force=column["residual_force"].copy(),
         )
         self.steps += 1
         self._stepped |= self.last.converged
@@ -366,6 +369,7 @@ class Simulation(Results):
             spec = self.state.specs[name]
             array[mask] = fresh[name][mask] if name in fresh else np.asarray(spec.initial)
         self.state.load(values)
+        self.stepper.forget(mask)
         self._stepped[mask] = False
         if self.model.constraints:
             self.stepper.begin_constraints()

@@ -74,6 +74,7 @@ class Stepper:
         self.newton = NewtonLoop(
             model, self.work, self.launch, solver, inertia=not integrator.static, constraint_tol=constraint_tol
         )
+        self.newton.preconditioner.register(state)
         self.dim = (model.worlds, model.slots)
         self.running = self.work.any_flag[2:3]
         self._bind()
@@ -134,6 +135,12 @@ class Stepper:
         self.state.ledger.assign(ledger)
         self.state.ledger_time.assign(self.state.time)
 
+    def forget(self, mask: np.ndarray | None = None) -> None:
+        """The state of the chosen worlds was set from elsewhere: what follows it on the device is made anew."""
+        m = self.model
+        flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
+        self.newton.preconditioner.forget(wp.array(flags, dtype=wp.int32, device=m.device))
+
     def _record(self) -> wp.Graph:
         with wp.ScopedCapture(device=self.model.device) as capture:
             self.sequence()
@@ -145,9 +152,10 @@ class Stepper:
         from .kernels.state import state_kernels
 
         m = self.model
-        out = {k.module for k in self.newton.residual.block_kernels} | {self.kernels.module, reduce_kernels().module}
-        out |= {m.loads.gather_kernels().module, self.newton.kernels.module}
+        out = {self.kernels.module, reduce_kernels().module}
+        out.add(self.newton.kernels.module)
         out.add(self.newton.pcg.kernels.module)
+        out |= self.newton.preconditioner.modules() | self.newton.residual.modules()
         out |= {kernel.module for kernel in m.loads.used_kernels()}
         if self.backup is not None:
             out.add(state_kernels().module)
@@ -215,6 +223,7 @@ class Stepper:
         if self.backup is not None:
             launch(self.kernels.failed_now, m.worlds, [w.step, w.newton.active])
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
+            self.newton.preconditioner.forget(w.newton.active)
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
             self._probe()

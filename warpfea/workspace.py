@@ -67,6 +67,8 @@ class Workspace:
             "explicit_power", (B, model.element_count) if "explicit" in forms else (1, 1), wp.float64
         )
         self.explicit_work = self.array("explicit_work", (1, B), wp.float64)
+        # scratch for kernels whose sums are not wanted
+        self.spare_rows = self.array("spare_rows", (2, B, n) if model.constraints else (1, 1, 1), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
         longest = max(n, model.element_count, model.constraints.count if model.constraints else 0)
@@ -95,7 +97,7 @@ class Workspace:
         self.newton.components = C
         if model.constraints:
             self.newton.violation = self.multipliers.violation
-        self.pcg = self._struct(pcg_struct(), B, sums=(1, B))
+        self.pcg = self._struct(pcg_struct(), B, sums=(2, B))
         self.step = self._struct(step_struct(), B)
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:

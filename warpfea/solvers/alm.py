@@ -116,8 +116,11 @@ class ConstraintSolver:
         self.launch(self.kernels.product_terms, self.dim, args)
 
     @labelled("preconditioner")
-    def precondition(self, r: wp.array, z: wp.array, active: wp.array) -> None:
-        """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z, and r.z per slot."""
+    def precondition(self, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None) -> None:
+        """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z on the slots of constraints, z = D^-1 r; and r.z per slot.
+
+        With `into` the result is added there instead.
+        """
         m, w, k, launch = self.model, self.work, self.deflation, self.launch
         data, mul = self.constraints.data, w.multipliers
         launch(k.restrict, self.dim, [data, mul, z, active])
@@ -130,7 +133,8 @@ class ConstraintSolver:
                 launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 1, active])
             for c in range(len(sizes) - 2, -1, -1):
                 launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
-        launch(k.project, (m.worlds, m.slots), [data, mul, w.inverse, r, active, z, w.rows])
+        args = [data, mul, w.inverse, r, z, int(into is not None), active, z if into is None else into, w.rows]
+        launch(k.project, (m.worlds, m.slots), args)
 
     @labelled("constraints")
     def predict(self, active: wp.array) -> None:

@@ -33,10 +33,15 @@ class NewtonPCG:
         tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
             for each connected part of the model apart. A thousandth of the reactions counts with f_int, so that a held,
             stressed body without loads has a scale. None: 1e-8 in float64, 1e-4 in float32.
+        force_tol: a step is accepted also when |g|, the plain norm over the free components, is at most so many newtons
+            (gradient slots count in N m); 0: never.
         max_newton: iterations before a step is refused.
         max_pcg: iterations per linear solve.
         max_halvings: how often a refused step may be halved.
-        preconditioner: "auto" or "block-jacobi"; with constraints "auto" deflates their directions.
+        preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
+            serves), "block-jacobi" (3x3 blocks, of every iterate), or "auto", the first. All deflate the directions of
+            constraints.
+        operator: H p from "elements", from the "matrix" assembled at every iterate, or "auto", by which is cheaper.
         multipliers: how constraint forces are found: "newton", with every Newton step, or "outer", the classical
             augmented Lagrangian, in a loop around the Newton solves.
         penalty: kappa, the penalty of a constraint over the stiffness of what it ties.
@@ -47,10 +52,12 @@ class NewtonPCG:
     """
 
     tol: float | None = None
+    force_tol: float = 0.0
     max_newton: int = 30
     max_pcg: int = 2000
     max_halvings: int = 8
     preconditioner: str = "auto"
+    operator: str = "auto"
     multipliers: str = "newton"
     penalty: float = 1000.0
     max_outer: int = 100
@@ -58,6 +65,10 @@ class NewtonPCG:
     def __post_init__(self) -> None:
         if self.tol is not None and not (math.isfinite(self.tol) and 0.0 < self.tol < 1.0):
             raise ModelError(f"NewtonPCG: tol = {self.tol!r} must lie between 0 and 1")
+        if not (math.isfinite(self.force_tol) and self.force_tol >= 0.0):
+            raise ModelError(f"NewtonPCG: force_tol = {self.force_tol!r} must be zero or positive, N")
+        if self.operator not in ("auto", "elements", "matrix"):
+            raise ModelError(f"NewtonPCG: operator = {self.operator!r} is none of 'auto', 'elements', 'matrix'")
         for name in ("max_newton", "max_pcg", "max_outer"):
             if not getattr(self, name) >= 1:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be at least 1")
@@ -94,11 +105,19 @@ class NewtonLoop:
         self.max_outer = options.max_outer
         self.constraints: ConstraintSolver | None = None
         if constrained:
-            deflate = options.preconditioner == "auto"
+            deflate = options.preconditioner != "block-jacobi"
             self.constraints = ConstraintSolver(
                 model, work, launch, classical=self.classical, kappa=options.penalty, deflate=deflate
             )
-        self.residual = Residual(model, work, launch, self.constraints, viscous=inertia)
+        self.residual = Residual(
+            model,
+            work,
+            launch,
+            self.constraints,
+            viscous=inertia,
+            operator=options.operator,
+            assembled=options.preconditioner != "block-jacobi",
+        )
         self.preconditioner = make(options.preconditioner, model, work, launch, self.residual)
         self.pcg = PCG(
             model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
@@ -106,6 +125,7 @@ class NewtonLoop:
         self.dim = (model.worlds, model.slots)
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv
+        ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
         ctl.max_iterations = options.max_newton
@@ -126,7 +146,7 @@ class NewtonLoop:
         self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.constraints:
             self.constraints.evaluate(active)  # J, for rho
-        self.preconditioner.build(active)
+        self.residual.blocks(active)
         if self.constraints:
             self.constraints.build(active, penalty=True)
         self.residual.evaluate(active, hold=True)
@@ -160,6 +180,7 @@ class NewtonLoop:
     def _iterate(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
         active = w.newton.active
+        self.residual.linearise(active)
         self.pcg.solve(active)
         self.residual.hold_pushed(active)
         self.residual.push_curvature(active)
@@ -171,7 +192,7 @@ class NewtonLoop:
         launch(k.begin_search, self.model.worlds, [w.newton])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
-        self.preconditioner.build(active)
+        self.preconditioner.follow(active)
         if self.constraints:
             self.constraints.build(active)
         self._any(active, self.iterating)

@@ -45,11 +45,13 @@ class PCG:
         if m.component_count > 1:
             launch(k.silence, self.dim, [w.newton, m.component_of_slot, active, w.r])
         self._translate(active)
+        self.preconditioner.prepare(active)
         self._precondition(active)
         w.pcg.any_active.zero_()
         launch(k.begin, m.worlds, [w.newton, w.pcg])
         launch(self.residual.newton.copy_active, self.dim, [w.z, w.pcg.active, w.p])
         wp.capture_while(w.pcg.any_active, self._iterate)
+        self.preconditioner.judge(active)
         self._translate(active)
 
     def _iterate(self) -> None:
@@ -66,7 +68,7 @@ class PCG:
     def _precondition(self, active: wp.array) -> None:
         w = self.work
         self.preconditioner.apply(w.r, w.z, active)
-        self.residual.reduce(w.rows, 1, active, w.pcg.sums)
+        self.residual.reduce(w.rows, 2, active, w.pcg.sums)
 
     def _translate(self, active: wp.array) -> None:
         """x += Z (Z^T H Z)^-1 Z^T r."""

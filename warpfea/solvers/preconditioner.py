@@ -1,4 +1,4 @@
-"""Preconditioners behind one seam: `build` at an iterate, `apply` z = B r with r.z per slot."""
+"""Preconditioners behind one seam."""
 
 from __future__ import annotations
 
@@ -10,23 +10,40 @@ from ..errors import ModelError
 from ..kernels.pcg import pcg_kernels
 from ..launch import labelled
 from .residual import Residual
+from .twolevel import TwoLevel
 
 if TYPE_CHECKING:
     from ..launch import Launcher
     from ..model import Model
+    from ..state import State
     from ..workspace import Workspace
 
 __all__ = ["BlockJacobi", "Preconditioner", "make"]
 
 
 class Preconditioner(Protocol):
-    """What PCG asks of a preconditioner."""
+    """What the solvers ask of a preconditioner."""
 
-    def build(self, active: wp.array) -> None:
-        """Follow the iterate."""
+    def register(self, state: State) -> None:
+        """Put what it remembers from step to step into the state."""
+
+    def forget(self, flags: wp.array) -> None:
+        """The state of flagged worlds was set from elsewhere."""
+
+    def modules(self) -> set[wp.Module]:
+        """Modules that it launches."""
+
+    def follow(self, active: wp.array) -> None:
+        """There is a new iterate."""
+
+    def prepare(self, active: wp.array) -> None:
+        """A solve begins."""
+
+    def judge(self, active: wp.array) -> None:
+        """A solve has ended."""
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
-        """z = B r, and r.z per slot in rows[0]."""
+        """z = B r; per slot r.z in rows[0] and r.D^-1 r in rows[1]."""
 
 
 class BlockJacobi:
@@ -37,15 +54,32 @@ class BlockJacobi:
         self.kernels = pcg_kernels(model.dtype, model.constraints is not None)
         self.dim = (model.worlds, model.slots)
 
+    def register(self, state: State) -> None:
+        """It remembers nothing."""
+
+    def forget(self, flags: wp.array) -> None:
+        """It remembers nothing."""
+
+    def modules(self) -> set[wp.Module]:
+        """That of the conjugate gradients."""
+        return {self.kernels.module}
+
     @labelled("build")
-    def build(self, active: wp.array) -> None:
+    def follow(self, active: wp.array) -> None:
         """Assemble and invert the blocks."""
         self.residual.blocks(active)
+
+    def prepare(self, active: wp.array) -> None:
+        """The blocks are there."""
+
+    def judge(self, active: wp.array) -> None:
+        """It does not learn."""
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
-        self.launch(self.kernels.block_jacobi, self.dim, [self.work.inverse, r, active, z, self.work.rows])
+        w = self.work
+        self.launch(self.kernels.block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, z, w.rows])
         constraints = self.residual.constraints
         if constraints is not None and constraints.deflate:
             constraints.precondition(r, z, active)
@@ -53,6 +87,8 @@ class BlockJacobi:
 
 def make(name: str, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> Preconditioner:
     """The preconditioner `name`; "auto" is the best there is. Raises ModelError listing the names."""
-    if name in ("auto", "block-jacobi"):
+    if name in ("auto", "two-level"):
+        return TwoLevel(model, work, launch, residual)
+    if name == "block-jacobi":
         return BlockJacobi(model, work, launch, residual)
-    raise ModelError(f"preconditioner {name!r} is unknown; there are auto, block-jacobi")
+    raise ModelError(f"preconditioner {name!r} is unknown; there are auto, two-level, block-jacobi")

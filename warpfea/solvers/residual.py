@@ -11,6 +11,7 @@ from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
 from ..launch import labelled
+from .assembled import Assembled
 
 if TYPE_CHECKING:
     from ..launch import Launcher
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from .alm import ConstraintSolver
 
 __all__ = ["Reducer", "Residual"]
+
+MATRIX_SLOTS = 10
+"""Slots per element up to which H p from the elements is cheaper than from their matrix."""
 
 
 class Reducer:
@@ -47,8 +51,9 @@ class Residual:
     """Launches that evaluate g(v), Phi(v), the norms, and H p."""
 
     def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, constraints: ConstraintSolver | None, *, viscous: bool
-    ) -> None:
+        self, model: Model, work: Workspace, launch: Launcher, constraints: ConstraintSolver | None, *, viscous: bool,
+        operator: str, assembled: bool,
+    ) -> None:  # fmt: skip
         self.model = model
         self.constraints = constraints
         self.work = work
@@ -60,6 +65,32 @@ class Residual:
         self.newton = newton_kernels(model.dtype, constraints is not None)
         self.con = model.constraints.data if model.constraints else constraint_struct()()
         self.dim = (model.worlds, model.slots)
+        # elements with many points per slot cost more than the matrix that they make
+        many = all(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
+        self.by_matrix = operator == "matrix" or (operator == "auto" and many)
+        self.assembled: Assembled | None = None
+        if assembled or self.by_matrix:
+            self.assembled = Assembled(model, work, launch, self.block_kernels)
+        if self.by_matrix:
+            assert self.assembled is not None
+            self.matrix = self.assembled.values("operator matrix")
+
+    def modules(self) -> set[wp.Module]:
+        """Modules of the elements, the gather, and the matrix where there is one."""
+        out = {k.module for k in self.block_kernels} | {self.gather.module}
+        if self.by_matrix:
+            assert self.assembled is not None
+            out |= {self.gather.matrix_module} | self.assembled.modules()
+        return out
+
+    @labelled("assembly")
+    def linearise(self, active: wp.array) -> None:
+        """Make the operator at the iterate."""
+        if self.by_matrix:
+            assert self.assembled is not None
+            w = self.work
+            factors = (w.step.mass_factor, w.step.dq_dv)
+            self.assembled.assemble(w.u, factors, active, self.matrix, projected=False)
 
     @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
@@ -123,18 +154,24 @@ class Residual:
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate, and p.Hp per slot in rows[0]."""
         m, w, launch = self.model, self.work, self.launch
-        for block, kernels in zip(m.blocks, self.block_kernels):
-            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
-            launch(kernels.tangent_product, (m.worlds, block.count), args)
+        if not self.by_matrix:
+            for block, kernels in zip(m.blocks, self.block_kernels):
+                args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
+                launch(kernels.tangent_product, (m.worlds, block.count), args)
         start, entry = m.topology.start, m.topology.entry
         if m.loads.followers:
             start, entry = m.loads.pushed_topology.start, m.loads.pushed_topology.entry
             self._push_product(p, active)
-        args = [m.topology, w.contribution, start, entry, w.pushed_tangent, p]
         if self.constraints:
             self.constraints.product(p, active)
-        args += [w.step.mass_factor, w.step.dq_dv, active, self.con, w.multipliers, out, w.rows]
-        launch(self.gather.product, self.dim, args)
+        rest = [start, entry, w.pushed_tangent, p, w.step.mass_factor, w.step.dq_dv, active, self.con, w.multipliers]
+        rest += [out, w.rows]
+        if self.by_matrix:
+            assert self.assembled is not None
+            args = [m.topology, self.assembled.pattern.data, self.matrix, *rest]
+            launch(self.gather.matrix_product, self.dim, args)
+        else:
+            launch(self.gather.product, self.dim, [m.topology, w.contribution, *rest])
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""

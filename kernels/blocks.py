@@ -1,0 +1,170 @@
+"""Matrices of 3x3 blocks: H assembled from element matrices, its product, and Galerkin products with affine functions.
+
+A pattern is symmetric and full; values are [world, entry]. An entry and its mirror are made by one thread.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .constraints import multiplier_struct
+from .gather import pattern_struct, topology_struct
+from .types import kernel_module, precision
+
+__all__ = ["assembly_kernels", "block_kernels", "coupling_struct"]
+
+
+@functools.cache
+def coupling_struct():
+    """What constraints add to entries: rho w grad_a grad_b^T."""
+
+    @wp.struct
+    class Couplings:
+        entry: wp.array(dtype=wp.int32)  # [item] index into Pattern.upper
+        start: wp.array(dtype=wp.int32)  # [item + 1]
+        term_a: wp.array(dtype=wp.int32)  # index into Multipliers.gradient
+        term_b: wp.array(dtype=wp.int32)
+        weight: wp.array(dtype=wp.float64)
+
+    return Couplings
+
+
+@functools.cache
+def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
+    """Assembly from the matrices of elements with so many slots."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64 = wp.float64
+    Topology = topology_struct(dtype)
+    Pattern = pattern_struct()
+    NS = slots
+    module = kernel_module(f"assembly_{dtype}_{slots}")
+
+    @wp.kernel(module=module)
+    def add_elements(
+        topo: Topology,
+        pattern: Pattern,
+        conn: wp.array2d(dtype=wp.int32),
+        offset: int,
+        count: int,
+        matrix: wp.array3d(dtype=mat33),
+        mass: wp.array(dtype=T),
+        first: int,
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):
+        """value += (dq/dv) K of a block's elements, on the free components; `first`: = c_M M + (dq/dv) K."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        at = pattern.upper[index]
+        row = at[2]
+        column = at[3]
+        A = mat33()
+        for k in range(topo.start[row], topo.start[row + 1]):
+            inside = topo.entry[k] - offset
+            if inside >= 0 and inside < NS * count:
+                a = inside / count
+                elem = inside % count
+                for b in range(NS):
+                    if conn[b, elem] == column:
+                        if a <= b:
+                            A += matrix[world, a * NS - (a * (a - 1)) / 2 + b - a, elem]
+                        else:
+                            A += wp.transpose(matrix[world, b * NS - (b * (b - 1)) / 2 + a - b, elem])
+        A = T(dq_dv[world]) * A
+        if first != 0:
+            A += T(mass_factor[world]) * mass[index] * wp.identity(n=3, dtype=T)
+        row_free = topo.free[row]
+        column_free = topo.free[column]
+        for i in range(3):
+            for j in range(3):
+                A[i, j] = row_free[i] * column_free[j] * A[i, j]
+        if first == 0:
+            A += value[world, at[0]]
+        value[world, at[0]] = A
+        if at[1] != at[0]:
+            value[world, at[1]] = wp.transpose(A)
+
+    return _types.SimpleNamespace(module=module, add_elements=add_elements)
+
+
+@functools.cache
+def block_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels on matrices of 3x3 blocks, whatever they came from."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64 = wp.float64
+    vec4 = wp.types.vector(length=4, dtype=T)
+    Topology = topology_struct(dtype)
+    Pattern, Couplings = pattern_struct(), coupling_struct()
+    Multipliers = multiplier_struct()
+    module = kernel_module(f"blocks_{dtype}")
+    coupling_module = kernel_module(f"couplings_{dtype}")
+
+    @wp.kernel(module=coupling_module)
+    def add_constraints(
+        topo: Topology,
+        pattern: Pattern,
+        con: Couplings,
+        gradient: wp.array2d(dtype=wp.vec3d),
+        stiffness: wp.array2d(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):
+        """value += (dq/dv) J^T rho J."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        at = pattern.upper[con.entry[item]]
+        A = wp.mat33d()
+        for k in range(con.start[item], con.start[item + 1]):
+            a = con.term_a[k]
+            factor = con.weight[k] * dq_dv[world] * stiffness[world, a / 3]
+            A += factor * wp.outer(gradient[world, a], gradient[world, con.term_b[k]])
+        B = mat33(A)
+        row_free = topo.free[at[2]]
+        column_free = topo.free[at[3]]
+        for i in range(3):
+            for j in range(3):
+                B[i, j] = row_free[i] * column_free[j] * B[i, j]
+        B += value[world, at[0]]
+        value[world, at[0]] = B
+        if at[1] != at[0]:
+            value[world, at[1]] = wp.transpose(B)
+
+    @wp.kernel(module=module)
+    def galerkin(
+        pair: wp.array(dtype=wp.vec3i),
+        pair_start: wp.array(dtype=wp.int32),
+        fine_entry: wp.array(dtype=wp.vec3i),
+        weight: wp.array(dtype=vec4),
+        fine: wp.array2d(dtype=mat33),
+        active: wp.array(dtype=wp.int32),
+        coarse: wp.array2d(dtype=mat33),
+    ):
+        """P^T A P: for two groups and two of their functions the sum of w w' A over the entries between them.
+
+        `pair`: first coarse entry of the group's rows, width of its rows, place of the other in them;
+        `fine_entry`: an entry, its row, its column.
+        """
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        group = index / 16
+        k = (index / 4) % 4
+        l = index % 4
+        A = mat33()
+        for e in range(pair_start[group], pair_start[group + 1]):
+            f = fine_entry[e]
+            A += (weight[f[1]][k] * weight[f[2]][l]) * fine[world, f[0]]
+        at = pair[group]
+        coarse[world, at[0] + k * at[1] + at[2] + l] = A
+
+    return _types.SimpleNamespace(
+        module=module, coupling_module=coupling_module, add_constraints=add_constraints, galerkin=galerkin
+    )

@@ -1,0 +1,406 @@
+"""Two-level preconditioner: dense inverses of tiles, affine motions of groups of tiles, a dense inverse at the bottom.
+
+A level has slots of 3-vectors, tiles of up to TILE_SLOTS slots, and groups whose four affine functions per axis are the
+slots of the next level. Work of a block is shared by the lanes of a block on CUDA and done by one lane on the CPU.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .gather import pattern_struct
+from .types import kernel_module, precision
+
+__all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
+
+TILE_SLOTS = 16
+TILE = 3 * TILE_SLOTS
+LANES = 64
+ROW_TILE = 128
+
+
+@functools.cache
+def level_struct(dtype: str):
+    """The constant data of a level."""
+    T = precision(dtype).T
+    vec4 = wp.types.vector(length=4, dtype=T)
+
+    @wp.struct
+    class Level:
+        tile_slot: wp.array2d(dtype=wp.int32)  # [tile, place] slot or -1
+        tile_of: wp.array(dtype=wp.int32)  # [slot]
+        place_of: wp.array(dtype=wp.int32)  # [slot] in its tile
+        group_start: wp.array(dtype=wp.int32)  # [group + 1]
+        group_slot: wp.array(dtype=wp.int32)
+        group_of: wp.array(dtype=wp.int32)  # [slot]
+        weight: wp.array(dtype=vec4)  # [slot] values of the group's affine functions 1, x, y, z
+        tiles: wp.int32
+        groups: wp.int32
+
+    return Level
+
+
+@functools.cache
+def level_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels of the levels in one precision."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64 = wp.float64
+    Level = level_struct(dtype)
+    Pattern = pattern_struct()
+    # a pivot below this share of its diagonal is rounding: the functions are dependent
+    NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[dtype]
+    module = kernel_module(f"levels_{dtype}")
+    build_module = kernel_module(f"levels_build_{dtype}")
+
+    @wp.func_native(snippet="""
+    #if defined(__CUDA_ARCH__)
+    __syncthreads();
+    #endif
+    """)
+    def sync(): ...
+
+    @wp.kernel(module=build_module)
+    def fill_tiles(
+        level: Level,
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array3d(dtype=T),
+        matrix: wp.array4d(dtype=T),
+    ):
+        """Diagonal blocks of A and their diagonal, one thread per slot; rows without an unknown are zero."""
+        world, tile, place = wp.tid()
+        if active[world] == 0:
+            return
+        for a in range(3):
+            diagonal[world, tile, 3 * place + a] = T(0.0)
+            for j in range(TILE):
+                matrix[world, tile, 3 * place + a, j] = T(0.0)
+        slot = level.tile_slot[tile, place]
+        if slot < 0:
+            return
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            other = pattern.column[k]
+            if level.tile_of[other] == tile:
+                b = 3 * level.place_of[other]
+                A = value[world, k]
+                for i in range(3):
+                    for j in range(3):
+                        matrix[world, tile, 3 * place + i, b + j] = A[i, j]
+        for a in range(3):
+            diagonal[world, tile, 3 * place + a] = matrix[world, tile, 3 * place + a, 3 * place + a]
+
+    @wp.kernel(module=build_module)
+    def invert_tiles(
+        lanes: int,
+        tiles: int,
+        keep: int,
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array3d(dtype=T),
+        column: wp.array3d(dtype=T),
+        matrix: wp.array4d(dtype=T),
+    ):
+        """Inverse in place by Gauss-Jordan. A row whose pivot is not safely positive, measured by its given diagonal,
+        is dropped: zeros, or with `keep` the inverse of the diagonal, so that the result is positive (semi-)definite
+        always."""
+        thread = wp.tid()
+        lane = thread % lanes
+        index = thread / lanes
+        tile = index % tiles
+        world = index / tiles
+        if active[world] == 0:
+            return
+        for k in range(TILE):
+            for i in range(lane, TILE, lanes):
+                column[world, tile, i] = matrix[world, tile, i, k]
+            sync()
+            pivot = column[world, tile, k]
+            size = diagonal[world, tile, k]
+            if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
+                scale = T(1.0) / pivot
+                for j in range(lane, TILE, lanes):
+                    if j == k:
+                        for i in range(TILE):
+                            matrix[world, tile, i, k] = -scale * column[world, tile, i]
+                        matrix[world, tile, k, k] = scale
+                    else:
+                        d = scale * matrix[world, tile, k, j]
+                        for i in range(TILE):
+                            matrix[world, tile, i, j] = matrix[world, tile, i, j] - d * column[world, tile, i]
+                        matrix[world, tile, k, j] = d
+            else:
+                for j in range(lane, TILE, lanes):
+                    matrix[world, tile, k, j] = T(0.0)
+                    matrix[world, tile, j, k] = T(0.0)
+                sync()
+                if lane == 0 and keep != 0 and wp.abs(size) > T(0.0):
+                    # negative now: the pivots to come must not see it, the end turns its sign
+                    diagonal[world, tile, k] = -wp.abs(size)
+            sync()
+        for j in range(lane, TILE, lanes):
+            size = diagonal[world, tile, j]
+            if size < T(0.0) and keep != 0:
+                matrix[world, tile, j, j] = -T(1.0) / size
+
+    @wp.kernel(module=module)
+    def smooth(
+        level: Level,
+        inverse: wp.array4d(dtype=T),
+        by_row: int,
+        r: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        z: wp.array2d(dtype=vec3),
+        coarse: wp.array2d(dtype=vec3),
+    ):
+        """z = tile inverse times r, one thread per slot; then P^T r, one thread per function of a group.
+
+        The inverse is symmetric: read by columns neighbouring threads read neighbouring numbers, which CUDA wants;
+        read by rows one thread does, which the CPU wants.
+        """
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        slots = TILE_SLOTS * level.tiles
+        if index < slots:
+            tile = index / TILE_SLOTS
+            place = index % TILE_SLOTS
+            slot = level.tile_slot[tile, place]
+            if slot < 0:
+                return
+            s = vec3()
+            for b in range(TILE_SLOTS):
+                other = level.tile_slot[tile, b]
+                if other >= 0:
+                    x = r[world, other]
+                    row = 3 * place
+                    column = 3 * b
+                    if by_row != 0:
+                        for i in range(3):
+                            for j in range(3):
+                                s[i] = s[i] + inverse[world, tile, row + i, column + j] * x[j]
+                    else:
+                        for j in range(3):
+                            for i in range(3):
+                                s[i] = s[i] + inverse[world, tile, column + j, row + i] * x[j]
+            z[world, slot] = s
+            return
+        index -= slots
+        group = index / 4
+        k = index % 4
+        s = vec3()
+        for e in range(level.group_start[group], level.group_start[group + 1]):
+            slot = level.group_slot[e]
+            s += level.weight[slot][k] * r[world, slot]
+        coarse[world, index] = s
+
+    @wp.func
+    def prolonged(level: Level, x: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
+        """(P x) of a slot."""
+        first = 4 * level.group_of[slot]
+        w = level.weight[slot]
+        s = vec3()
+        for k in range(4):
+            s += w[k] * x[world, first + k]
+        return s
+
+    @wp.kernel(module=module)
+    def add_coarse(
+        level: Level,
+        correct: int,
+        x: wp.array2d(dtype=vec3),
+        free: wp.array(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+        diagonal: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        z: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """z += P x; rows: r.z and r.D^-1 r."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        a = r[world, slot]
+        s = z[world, slot]
+        if correct != 0:
+            s += wp.cw_mul(prolonged(level, x, world, slot), free[slot])
+            z[world, slot] = s
+        D = diagonal[world, slot]
+        rows[0, world, slot] = f64(wp.dot(a, s))
+        rows[1, world, slot] = f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
+
+    @wp.kernel(module=module)
+    def chebyshev(
+        level: Level,
+        correct: int,
+        coarse: wp.array2d(dtype=vec3),
+        z: wp.array2d(dtype=vec3),
+        keep: T,
+        step: T,
+        active: wp.array(dtype=wp.int32),
+        d: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+    ):
+        """d = keep d + step (z + P coarse), x += d; with keep = 0 both start anew."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        s = z[world, slot]
+        if correct != 0:
+            s += prolonged(level, coarse, world, slot)
+        s = step * s
+        if keep == T(0.0):
+            d[world, slot] = s
+            x[world, slot] = s
+        else:
+            s += keep * d[world, slot]
+            d[world, slot] = s
+            x[world, slot] = x[world, slot] + s
+
+    @wp.kernel(module=module)
+    def subtract_product(
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        d: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """r -= A d."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        s = vec3()
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            s += value[world, k] * d[world, pattern.column[k]]
+        r[world, slot] = r[world, slot] - s
+
+    @wp.kernel(module=build_module)
+    def fill_dense(
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        slots: int,
+        active: wp.array(dtype=wp.int32),
+        scale: wp.array2d(dtype=T),
+        matrix: wp.array3d(dtype=T),
+    ):
+        """The whole matrix and its diagonal, one thread per row of slots; rows beyond the slots are zero."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        for a in range(3):
+            scale[world, 3 * slot + a] = T(0.0)
+            for j in range(matrix.shape[2]):
+                matrix[world, 3 * slot + a, j] = T(0.0)
+        if slot >= slots:
+            return
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            b = 3 * pattern.column[k]
+            A = value[world, k]
+            for i in range(3):
+                for j in range(3):
+                    matrix[world, 3 * slot + i, b + j] = A[i, j]
+                if pattern.column[k] == slot:
+                    scale[world, 3 * slot + i] = A[i, i]
+
+    @wp.kernel(module=build_module)
+    def take_pivot(
+        matrix: wp.array3d(dtype=T),
+        scale: wp.array2d(dtype=T),
+        first: int,
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array3d(dtype=T),
+        pivot: wp.array4d(dtype=T),
+    ):
+        """The pivot's block, and the diagonal that it had at first."""
+        world, i, j = wp.tid()
+        if active[world] != 0:
+            pivot[world, 0, i, j] = matrix[world, first + i, first + j]
+            if i == j:
+                diagonal[world, 0, i] = scale[world, first + i]
+
+    @wp.kernel(module=build_module)
+    def take_panels(
+        matrix: wp.array3d(dtype=T),
+        pivot: wp.array4d(dtype=T),
+        first: int,
+        active: wp.array(dtype=wp.int32),
+        left: wp.array3d(dtype=T),
+        top: wp.array3d(dtype=T),
+    ):
+        """left = A_ik P, top = A_kj: what the rest of the matrix is changed with."""
+        world, m, i = wp.tid()
+        if active[world] == 0:
+            return
+        s = T(0.0)
+        for n in range(TILE):
+            # the rows of A beside the pivot are symmetric but for the sign that columns done before have
+            s += matrix[world, i, first + n] * pivot[world, 0, n, m]
+        left[world, m, i] = s
+        top[world, m, i] = matrix[world, first + m, i]
+
+    @wp.kernel(module=build_module)
+    def eliminate(
+        pivot: wp.array4d(dtype=T),
+        left: wp.array3d(dtype=T),
+        top: wp.array3d(dtype=T),
+        first: int,
+        active: wp.array(dtype=wp.int32),
+        matrix: wp.array3d(dtype=T),
+    ):
+        """One pivot of block Gauss-Jordan."""
+        world, i, j = wp.tid()
+        if active[world] == 0:
+            return
+        row = i - first
+        column = j - first
+        in_row = row >= 0 and row < TILE
+        in_column = column >= 0 and column < TILE
+        if in_row and in_column:
+            matrix[world, i, j] = pivot[world, 0, row, column]
+        elif in_column:
+            matrix[world, i, j] = -left[world, column, i]
+        else:
+            s = T(0.0)
+            if in_row:
+                for m in range(TILE):
+                    s += pivot[world, 0, row, m] * top[world, m, j]
+                matrix[world, i, j] = s
+            else:
+                for m in range(TILE):
+                    s += left[world, m, i] * top[world, m, j]
+                matrix[world, i, j] = matrix[world, i, j] - s
+
+    @wp.kernel(module=module)
+    def apply_dense(
+        matrix: wp.array3d(dtype=T),
+        r: wp.array3d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        x: wp.array2d(dtype=T),
+    ):
+        """x = A^-1 r; one block does one row."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        acc = wp.tile_zeros(shape=(1, 1, ROW_TILE), dtype=T)
+        for k in range((r.shape[2] + ROW_TILE - 1) // ROW_TILE):
+            a = wp.tile_load(matrix, shape=(1, 1, ROW_TILE), offset=(world, row, k * ROW_TILE))
+            b = wp.tile_load(r, shape=(1, 1, ROW_TILE), offset=(world, 0, k * ROW_TILE))
+            acc += wp.tile_map(wp.mul, a, b)
+        x[world, row] = wp.tile_extract(wp.tile_sum(acc), 0)
+
+    return _types.SimpleNamespace(
+        module=module,
+        build_module=build_module,
+        fill_tiles=fill_tiles,
+        invert_tiles=invert_tiles,
+        smooth=smooth,
+        add_coarse=add_coarse,
+        chebyshev=chebyshev,
+        subtract_product=subtract_product,
+        fill_dense=fill_dense,
+        take_pivot=take_pivot,
+        take_panels=take_panels,
+        eliminate=eliminate,
+        apply_dense=apply_dense,
+    )

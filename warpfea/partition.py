@@ -1,0 +1,55 @@
+"""Groups of nearby nodes by recursive bisection, all groups of one depth at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+
+__all__ = ["bisect", "connected_groups"]
+
+
+def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity: int) -> np.ndarray:
+    """Group of each item: compact, of one label, and of total weight up to `capacity`.
+
+    A group is halved across its longest side until it fits, so that groups of twice the capacity hold whole ones.
+
+    Args:
+        places: (n, 3) m.
+        weights: (n,) whole numbers, each up to the capacity.
+        labels: (n,) items of different labels never meet.
+
+    Returns:
+        (n,) group numbers from 0, without gaps.
+    """
+    if np.any(weights > capacity):
+        raise ValueError(f"an item of weight {weights.max()} does not fit into a group of {capacity}")
+    # groups of equal parts of the largest weight always fit
+    room = capacity // int(weights.max()) * int(weights.max())
+    group = np.unique(labels, return_inverse=True)[1].ravel().astype(np.int64)
+    while True:
+        total = np.bincount(group, weights=weights)
+        parts = np.ceil(total / room - 1e-9).astype(np.int64)
+        if parts.max() <= 1:
+            return group
+        order = np.argsort(group, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(group))])[:-1]
+        sorted_places = places[order]
+        extent = np.maximum.reduceat(sorted_places, start) - np.minimum.reduceat(sorted_places, start)
+        axis = np.argmax(extent, axis=1)
+        along = places[np.arange(len(places)), axis[group]]
+        order = np.lexsort((along, group))
+        before = np.cumsum(weights[order]) - weights[order]
+        before = before - before[start][group[order]]  # weight of the items before it in its group
+        left = parts // 2
+        share = np.where(parts > 1, total * left / np.maximum(parts, 1), np.inf)
+        second = np.zeros(len(group), dtype=np.int64)
+        second[order] = before + 0.5 * weights[order] >= share[group[order]]
+        group = np.unique(2 * group + second, return_inverse=True)[1].ravel()
+
+
+def connected_groups(group: np.ndarray, graph: sp.csr_matrix) -> np.ndarray:
+    """The groups split into their connected parts; `graph` says which items touch."""
+    links = graph.tocoo()
+    inside = group[links.row] == group[links.col]
+    within = sp.coo_matrix((np.ones(int(inside.sum()), dtype=np.int8), (links.row[inside], links.col[inside])), graph.shape)
+    return np.asarray(sp.csgraph.connected_components(within.tocsr(), directed=False)[1])

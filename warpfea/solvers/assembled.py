@@ -1,0 +1,197 @@
+"""H as a matrix of 3x3 blocks: its pattern, and its assembly on the device in a fixed order.
+
+It is what preconditioners and direct solvers are made from, and the operator itself where a product with the matrix is
+cheaper than one with the elements (many quadrature points per slot).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..kernels.blocks import assembly_kernels, block_kernels, coupling_struct
+from ..kernels.gather import pattern_struct
+
+if TYPE_CHECKING:
+    from ..launch import Launcher
+    from ..model import Model
+    from ..workspace import Workspace
+
+__all__ = ["Assembled", "Pattern", "transposed_entries"]
+
+
+def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
+    """For each entry (i, j) of a symmetric pattern with sorted rows the entry (j, i)."""
+    rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
+    return np.lexsort((rows, graph.indices)).argsort()
+
+
+@dataclass(eq=False)
+class Pattern:
+    """A symmetric pattern of 3x3 blocks.
+
+    Attributes:
+        graph: the pattern on the host, rows sorted.
+        data: the device struct.
+        upper: (m, 4) entry, mirror, row, column of the diagonal and above.
+    """
+
+    graph: sp.csr_matrix
+    data: Any
+    upper: np.ndarray
+
+    @property
+    def entries(self) -> int:
+        """Number of blocks."""
+        return len(self.graph.indices)
+
+
+def make_pattern(model: Model, graph: sp.csr_matrix, *, mirrored: bool = True) -> Pattern:
+    """Upload a pattern; without `mirrored` it is only read."""
+    data = pattern_struct()()
+    data.start = model.array("matrix pattern", graph.indptr, wp.int32)
+    data.column = model.array("matrix pattern", graph.indices, wp.int32)
+    upper = np.zeros((0, 4), dtype=np.int32)
+    if mirrored:
+        rows = np.repeat(np.arange(graph.shape[0], dtype=np.int32), np.diff(graph.indptr))
+        chosen = np.flatnonzero(rows <= graph.indices)
+        mirror = transposed_entries(graph)[chosen]
+        upper = np.stack([chosen, mirror, rows[chosen], graph.indices[chosen]], axis=1).astype(np.int32)
+        data.upper = model.array("matrix pattern", upper, wp.vec4i)
+    return Pattern(graph, data, upper)
+
+
+class Assembled:
+    """Assembly of the elements' part of H, c_M M + (dq/dv) K, and on request of the penalties of the constraints.
+
+    Prescribed components have rows and columns of zeros.
+    """
+
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, block_kernels_of: list[Any]) -> None:
+        self.model, self.work, self.launch = model, work, launch
+        self.element_kernels = block_kernels_of
+        if "matrix" not in model.cache:
+            model.cache["matrix"] = self._make_tables()
+        self.pattern, self.mass, self.couplings, self.coupled = model.cache["matrix"]
+        self.kernels = [assembly_kernels(model.dtype, block.slots) for block in model.blocks]
+        self.common = block_kernels(model.dtype)
+        S = max(block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
+        self.scratch = work.array("element matrices", (model.worlds, S), model.types.mat33)
+
+    def _make_tables(self) -> tuple[Pattern, wp.array, Any, int]:
+        """Pattern, masses of its upper entries, and what constraints add."""
+        model = self.model
+        graph = model.graph()
+        ties = self._tied_slots()
+        if ties is not None:
+            graph = (graph + ties).tocsr()
+        graph.sort_indices()
+        pattern = make_pattern(model, graph)
+        mass = model.array("matrix pattern", self._mass_of(pattern), model.types.T)
+        return pattern, mass, *(self._couple(pattern) if model.constraints else (None, 0))
+
+    def modules(self) -> set[wp.Module]:
+        """Modules that assembly launches."""
+        out = {k.element_matrix.module for k in self.element_kernels} | {k.module for k in self.kernels}
+        if self.model.constraints:
+            out.add(self.common.coupling_module)
+        return out
+
+    def _mass_of(self, pattern: Pattern) -> np.ndarray:
+        """Scalar masses of the upper entries, kg."""
+        mass, upper = self.model.mass_host.sorted_indices(), pattern.upper
+        if len(mass.indices) == pattern.entries:
+            return mass.data[upper[:, 0]]
+        n = np.int64(mass.shape[0])
+        rows = np.repeat(np.arange(n), np.diff(mass.indptr))
+        key = rows * n + mass.indices
+        wanted = upper[:, 2].astype(np.int64) * n + upper[:, 3]
+        at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+        return np.where(key[at] == wanted, mass.data[at], 0.0)
+
+    def _tied_slots(self) -> sp.csr_matrix | None:
+        """Slots that a row of the constraints couples."""
+        con = self.model.constraints
+        if con is None:
+            return None
+        n = self.model.slots
+        row = con.term_host // 3
+        touched = sp.csr_matrix((np.ones(len(row), dtype=np.int8), (row, con.slot_host)), shape=(con.count, n))
+        touched.data[:] = 1
+        return sp.csr_matrix(touched.T.astype(np.int32) @ touched.astype(np.int32)).astype(np.int8)
+
+    def _couple(self, pattern: Pattern) -> tuple[Any, int]:
+        """Entries that constraints add to, with their pairs of vectors."""
+        model, con = self.model, self.model.constraints
+        assert con is not None
+        upper = pattern.upper
+        n = np.int64(model.slots)
+        key = upper[:, 2].astype(np.int64) * n + upper[:, 3]
+        items, term_a, term_b, weight = [], [], [], []
+        for row in range(con.count):
+            first, last = con.start_host[3 * row], con.start_host[3 * row + 3]
+            slot, term, w = con.slot_host[first:last], con.term_host[first:last], con.weight_host[first:last]
+            i, j = np.meshgrid(np.arange(len(slot)), np.arange(len(slot)), indexing="ij")
+            keep = slot[i] <= slot[j]
+            i, j = i[keep], j[keep]
+            items.append(np.searchsorted(key, slot[i].astype(np.int64) * n + slot[j]))
+            term_a.append(term[i])
+            term_b.append(term[j])
+            weight.append(w[i] * w[j])
+        item = np.concatenate(items)
+        order = np.argsort(item, kind="stable")
+        entry, count = np.unique(item, return_counts=True)
+        data = coupling_struct()()
+        data.entry = model.array("matrix pattern", entry, wp.int32)
+        data.start = model.array("matrix pattern", np.concatenate([[0], np.cumsum(count)]), wp.int32)
+        data.term_a = model.array("matrix pattern", np.concatenate(term_a)[order], wp.int32)
+        data.term_b = model.array("matrix pattern", np.concatenate(term_b)[order], wp.int32)
+        data.weight = model.array("matrix pattern", np.concatenate(weight)[order], wp.float64)
+        return data, len(entry)
+
+    def values(self, name: str) -> wp.array:
+        """Room for the blocks, [world, entry]."""
+        return self.work.array(name, (self.model.worlds, self.pattern.entries), self.model.types.mat33)
+
+    def assemble(
+        self, u: wp.array, factors: tuple[wp.array, wp.array], active: wp.array, out: wp.array, *, projected: bool
+    ) -> None:
+        """out = c_M M + (dq/dv) K at u; `factors` are c_M and dq/dv per world.
+
+        `projected`: K without what can make it indefinite at a point, and a function of u and the factors alone.
+        """
+        m, w, launch = self.model, self.work, self.launch
+        mass_factor, dq_dv = factors
+        for k, (block, elements, kernels) in enumerate(zip(m.blocks, self.element_kernels, self.kernels)):
+            pairs = block.slots * (block.slots + 1) // 2
+            matrix = _shaped(self.scratch, (m.worlds, pairs, block.count))
+            args = [block.data, u, w.v, w.history, dq_dv, int(projected), active, matrix]
+            launch(elements.element_matrix, (m.worlds, block.slots, block.count), args)
+            args = [m.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count, matrix]
+            args += [self.mass, int(k == 0), mass_factor, dq_dv, active, out]
+            launch(kernels.add_elements, (m.worlds, len(self.pattern.upper)), args)
+
+    def add_constraints(
+        self, gradient: wp.array, stiffness: wp.array, dq_dv: wp.array, active: wp.array, out: wp.array
+    ) -> None:
+        """out += (dq/dv) J^T rho J."""
+        args = [self.model.topology, self.pattern.data, self.couplings, gradient, stiffness, dq_dv, active, out]
+        self.launch(self.common.add_constraints, (self.model.worlds, self.coupled), args)
+
+    def matrix(self, values: wp.array, world: int = 0) -> sp.csr_matrix:
+        """The blocks of one world as (3 slots, 3 slots) CSR on the host."""
+        graph = self.pattern.graph
+        data = values.numpy()[world].astype(float)
+        n = 3 * self.model.slots
+        return sp.bsr_matrix((data, graph.indices, graph.indptr), shape=(n, n)).tocsr()
+
+
+def _shaped(array: wp.array, shape: tuple[int, ...]) -> wp.array:
+    """The beginning of an array under another shape."""
+    out: Any = wp.array(ptr=array.ptr, dtype=array.dtype, shape=shape, device=array.device)
+    out._owner = array
+    return out

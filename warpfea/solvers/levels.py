@@ -1,0 +1,168 @@
+"""The levels of the two-level preconditioner on the host: tiles, groups with affine functions, Galerkin tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..kernels.levels import TILE_SLOTS, level_struct
+from ..partition import bisect, connected_groups
+from .assembled import Pattern, make_pattern
+
+if TYPE_CHECKING:
+    from ..model import Model
+
+__all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
+
+GROUP_SLOTS = 64
+"""Slots of a group whose affine motions are the coarse space: 16 unknowns of a level to one of the next."""
+BOTTOM_SLOTS = 160
+"""A level of up to so many slots is inverted as one dense matrix."""
+MAX_LEVELS = 12
+
+
+@dataclass(eq=False)
+class Level:
+    """One level.
+
+    Attributes:
+        pattern: of its matrix.
+        dense: it is the bottom, inverted as a whole; it has no tiles and no groups then.
+        data: device struct of tiles and groups.
+        tiles, groups: their numbers; groups 0: nothing below.
+        galerkin: device tables of the product that makes the next level's matrix.
+    """
+
+    pattern: Pattern
+    slots: int
+    dense: bool
+    data: Any
+    tiles: int = 0
+    groups: int = 0
+    galerkin: tuple[wp.array, wp.array, wp.array] | None = None
+
+
+@dataclass(eq=False)
+class Points:
+    """What a level's slots stand for: values of affine functions.
+
+    Attributes:
+        value: (slots, 3) place of a position slot, derivative of a gradient slot.
+        position: (slots,) whether it is one of position.
+        node: (slots,) slots of one node stay together.
+        label: (slots,) what must not share a tile or group.
+    """
+
+    value: np.ndarray
+    position: np.ndarray
+    node: np.ndarray
+    label: np.ndarray
+
+
+def make_levels(model: Model, pattern: Pattern) -> list[Level]:
+    """The levels of a model, finest first; `pattern` is that of H."""
+    origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
+    position = model.slot_kind == 0
+    place = model.reference + origin * position[:, None]
+    points = Points(place, position, np.cumsum(position) - 1, model.part)
+    levels = []
+    for depth in range(MAX_LEVELS):
+        n = pattern.graph.shape[0]
+        if n <= BOTTOM_SLOTS:
+            levels.append(Level(pattern, n, True, level_struct(model.dtype)()))
+            return levels
+        level, points, pattern = _make_level(model, pattern, points)
+        levels.append(level)
+        # joints tie what elements don't; further down anything near may share a group
+        points.label = points.label if depth else model.component[_first_members(level)]
+        if level.groups * 4 > n // 2:
+            points.label = np.zeros_like(points.label)
+    raise AssertionError("groups do not shrink")
+
+
+def _first_members(level: Level) -> np.ndarray:
+    """A slot of the group that each slot of the next level belongs to."""
+    start, slot = level.data.group_start.numpy(), level.data.group_slot.numpy()
+    return np.repeat(slot[start[:-1]], 4)
+
+
+def _make_level(model: Model, pattern: Pattern, points: Points) -> tuple[Level, Points, Pattern]:
+    n = len(points.value)
+    first = np.flatnonzero(np.diff(points.node, prepend=-1))
+    sizes = np.diff(first, append=n)
+    args = points.value[first], sizes, points.label[first]
+    tile = bisect(*args, TILE_SLOTS)[points.node]
+    group = connected_groups(bisect(*args, GROUP_SLOTS)[points.node], pattern.graph)
+    tiles, groups = int(tile.max()) + 1, int(group.max()) + 1
+    data = level_struct(model.dtype)()
+    order = np.argsort(tile, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(tile))])
+    place = np.empty(n, dtype=np.int64)
+    place[order] = np.arange(n) - start[:-1][tile[order]]
+    table = np.full((tiles, TILE_SLOTS), -1)
+    table[tile, place] = np.arange(n)
+    by_group = np.argsort(group, kind="stable")
+    weight, centre, size = _affine(points, group, groups)
+    vec4 = wp.types.vector(length=4, dtype=model.types.T)
+    tables: dict[str, tuple[Any, Any]] = {
+        "tile_slot": (table, wp.int32),
+        "tile_of": (tile, wp.int32),
+        "place_of": (place, wp.int32),
+        "group_start": (np.concatenate([[0], np.cumsum(np.bincount(group))]), wp.int32),
+        "group_slot": (by_group, wp.int32),
+        "group_of": (group, wp.int32),
+        "weight": (weight, vec4),
+    }
+    for name, (values, dtype) in tables.items():
+        setattr(data, name, model.array("levels", values, dtype))
+    data.tiles, data.groups = tiles, groups
+    coarse, galerkin = _galerkin(model, pattern, group, groups)
+    level = Level(pattern, n, False, data, tiles, groups, galerkin)
+    value = np.zeros((groups, 4, 3))
+    value[:, 0] = centre
+    value[:, 1:] = size[:, None, None] * np.eye(3)
+    position = np.tile([True, False, False, False], groups)
+    node = np.repeat(np.arange(groups), 4)
+    label = np.repeat(points.label[by_group[np.flatnonzero(np.diff(group[by_group], prepend=-1))]], 4)
+    return level, Points(value.reshape(-1, 3), position, node, label), coarse
+
+
+def _affine(points: Points, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values (slots, 4) of 1, x, y, z of each slot's group, about its centre (groups, 3) over its size (groups,)."""
+    at = np.flatnonzero(points.position)
+    count = np.maximum(np.bincount(group[at], minlength=groups), 1)
+    centre = np.stack([np.bincount(group[at], points.value[at, k], groups) / count for k in range(3)], axis=1)
+    arm = points.value - points.position[:, None] * centre[group]
+    size = np.zeros(groups)
+    np.maximum.at(size, group, np.linalg.norm(arm, axis=1))
+    size = np.where(size > 0.0, size, 1.0)
+    return np.column_stack([points.position.astype(float), arm / size[group][:, None]]), centre, size
+
+
+def _galerkin(
+    model: Model, pattern: Pattern, group: np.ndarray, groups: int
+) -> tuple[Pattern, tuple[wp.array, wp.array, wp.array]]:
+    """Pattern of the next level's matrix and the tables of kernels.blocks.galerkin."""
+    graph = pattern.graph
+    rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
+    key = group[rows].astype(np.int64) * groups + group[graph.indices]
+    pairs, count = np.unique(key, return_counts=True)
+    order = np.argsort(key, kind="stable")
+    first, second = pairs // groups, pairs % groups
+    degree = np.bincount(first, minlength=groups)
+    start = np.concatenate([[0], np.cumsum(degree)])
+    table = np.stack([16 * start[first], 4 * degree[first], 4 * (np.arange(len(pairs)) - start[first])], axis=1)
+    entry = np.stack([order, rows[order], graph.indices[order]], axis=1)
+    galerkin = (
+        model.array("levels", table, wp.vec3i),
+        model.array("levels", np.concatenate([[0], np.cumsum(count)]), wp.int32),
+        model.array("levels", entry, wp.vec3i),
+    )
+    coarse = sp.csr_matrix((np.ones(len(pairs), dtype=np.int8), second, start), shape=(groups, groups))
+    blocks = sp.kron(coarse, np.ones((4, 4), dtype=np.int8), format="csr")
+    blocks.sort_indices()
+    return make_pattern(model, blocks, mirrored=False), galerkin

@@ -1,0 +1,264 @@
+"""The two-level preconditioner: tiles of 48 unknowns and the affine motions of groups of tiles, added.
+
+z = T r + P C P^T r: T holds dense inverses of the diagonal blocks of H, P the four affine functions per axis of each
+group of 64 slots (a position slot moves by a + B (X - Xc), a gradient slot along E by B E), and C stands for the inverse
+of P^T H P. C is dense when that is small; else it is CHEBYSHEV_STEPS steps of the Chebyshev iteration preconditioned by
+the same construction one level down. Adding all levels up instead (each treated once) is cheaper per iteration, but then
+iterations grow with the mesh: 51, 86, 126 at 6k, 55k, 265k unknowns of a T10 bar in statics, against 51, 48, 49.
+
+An odd number of Chebyshev steps keeps C positive whatever the largest eigenvalue is.
+
+Directions of constraints: tiles and coarse matrices hold the penalties, and (D + (dq/dv) J^T rho J)^-1 by Woodbury's
+identity is added on the slots that constraints touch, because a constraint may tie slots of several tiles.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.blocks import block_kernels
+from ..kernels.lag import lag_kernels, lag_struct
+from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels
+from ..kernels.pcg import pcg_kernels
+from ..launch import labelled
+from .levels import Level, make_levels
+
+if TYPE_CHECKING:
+    from ..launch import Launcher
+    from ..model import Model
+    from ..state import State
+    from ..workspace import Workspace
+    from .residual import Residual
+
+__all__ = ["TwoLevel"]
+
+CHEBYSHEV_STEPS = 5
+LARGEST = 3.5
+"""Assumed largest eigenvalue of a preconditioned coarse matrix (2.7 to 3.5 were measured)."""
+RATIO = 16.0
+"""The largest over the smallest eigenvalue that the Chebyshev steps are made for."""
+REBUILD_COST = 40.0
+"""Iterations that making the preconditioner costs."""
+
+
+class LevelArrays:
+    """Matrices and vectors of one level, [world, ...]."""
+
+    def __init__(self, model: Model, work: Workspace, level: Level, depth: int) -> None:
+        B, n, T = model.worlds, level.slots, model.types.T
+        name = f"level {depth}"
+        self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
+        if level.dense:
+            N = TILE * -(-n // TILE_SLOTS)
+            self.size = N
+            self.matrix = work.array(f"{name} inverse", (B, N, N), T)
+            self.left = work.array(f"{name} panels", (B, TILE, N), T)
+            self.top = work.array(f"{name} panels 2", (B, TILE, N), T)
+            self.scale = work.array(f"{name} diagonal", (B, N), T)
+            self.pivot = work.array(f"{name} pivot", (B, 1, TILE, TILE), T)
+        else:
+            self.matrix = work.array(f"{name} inverse", (B, level.tiles, TILE, TILE), T)
+        tiles = 1 if level.dense else level.tiles
+        self.diagonal = work.array(f"{name} pivots", (B, tiles, TILE), T)
+        self.column = work.array(f"{name} column", (B, tiles, TILE), T)
+        self.vectors: dict[str, wp.array] = {}
+        if depth:
+            names = ("r", "x") if level.dense else ("r", "x", "z", "d")
+            self.vectors = {k: work.array(f"{name} {k}", (B, n), model.types.vec3) for k in names}
+
+
+class TwoLevel:
+    """See the module. It is made where the rule of kernels/lag.py says, at the state's `preconditioner_displacement`."""
+
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
+        self.model, self.work, self.launch, self.residual = model, work, launch, residual
+        assert residual.assembled is not None
+        self.assembled = residual.assembled
+        self.kernels = level_kernels(model.dtype)
+        self.blocks = block_kernels(model.dtype)
+        self.lag_kernels = lag_kernels(model.dtype)
+        self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
+        self.newton = residual.newton
+        self.dim = (model.worlds, model.slots)
+        if "levels" not in model.cache:
+            model.cache["levels"] = make_levels(model, self.assembled.pattern)
+        self.levels: list[Level] = model.cache["levels"]
+        self.arrays = [LevelArrays(model, work, level, k) for k, level in enumerate(self.levels)]
+        self.value = self.assembled.values("preconditioner matrix")
+        self.lanes = LANES if model.device.is_cuda else 1
+        self.by_row = 0 if model.device.is_cuda else 1
+        constraints = residual.constraints
+        self.tied = constraints is not None and not self.levels[0].dense
+        self.lag: Any = None
+
+    def register(self, state: State) -> None:
+        """Put the rule's memory into the state."""
+        m = self.model
+        state.register("preconditioner_displacement", m.types.vec3, (m.slots,))
+        if m.constraints:
+            state.register("preconditioner_gradient", wp.vec3d, (3 * m.constraints.count,))
+            state.register("preconditioner_stiffness", wp.float64, (m.constraints.count,))
+        lag = lag_struct()()
+        for name, dtype, initial in (
+            ("due", wp.int32, 0),
+            ("mass_factor", wp.float64, -1.0),
+            ("dq_dv", wp.float64, -1.0),
+            ("rate", wp.float64, 0.0),
+            ("excess", wp.float64, 0.0),
+        ):
+            setattr(lag, name, state.register(f"preconditioner_{name}", dtype, (), initial))
+        for name in ("build", "moved", "stale"):
+            setattr(lag, name, self.work.array(f"LagControl.{name}", (m.worlds,), wp.int32))
+        lag.any_build = self.work.array("LagControl.any_build", (1,), wp.int32)
+        lag.limit = REBUILD_COST
+        lag.stale.fill_(1)
+        self.lag, self.state = lag, state
+
+    def modules(self) -> set[wp.Module]:
+        """Modules that it launches."""
+        k = self.kernels
+        return {k.module, k.build_module, self.lag_kernels.module, self.blocks.module} | self.assembled.modules()
+
+    # the seam
+
+    def follow(self, active: wp.array) -> None:
+        """Nothing: it lags behind the iterate."""
+
+    @labelled("build")
+    def forget(self, flags: wp.array) -> None:
+        """The state of flagged worlds was set from elsewhere."""
+        self.launch(self.lag_kernels.mark, self.model.worlds, [flags, self.lag])
+
+    @labelled("build")
+    def prepare(self, active: wp.array) -> None:
+        """Make it anew where it is due."""
+        w = self.work
+        self.lag.any_build.zero_()
+        args = [self.lag, w.step.mass_factor, w.step.dq_dv, active]
+        self.launch(self.lag_kernels.decide, self.model.worlds, args)
+        wp.capture_if(self.lag.any_build, self._build)
+
+    @labelled("build")
+    def judge(self, active: wp.array) -> None:
+        """Count what the solve cost."""
+        self.launch(self.lag_kernels.judge, self.model.worlds, [self.lag, self.work.newton, self.work.pcg])
+
+    @labelled("preconditioner")
+    def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
+        """z = B r; rows r.z and r.D^-1 r."""
+        m, w, launch, k = self.model, self.work, self.launch, self.kernels
+        level = self.levels[0]
+        if level.dense:
+            self._apply_dense(0, r, z, active)
+            coarse, correct = z, 0
+        else:
+            coarse, correct = self._smooth(0, r, z, active), 1
+        args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, z, w.rows]
+        launch(k.add_coarse, self.dim, args)
+        if self.tied:
+            assert self.residual.constraints is not None
+            args = [w.inverse, r, w.diagonal, active, w.Hp, w.spare_rows]
+            launch(self.jacobi, self.dim, args)
+            self.residual.constraints.precondition(r, w.Hp, active, into=z)
+
+    # application
+
+    def _apply_dense(self, depth: int, r: wp.array, x: wp.array, active: wp.array) -> None:
+        n, B = self.levels[depth].slots, self.model.worlds
+        flat_r = _flat(r, self.model.types.T, (B, 1, 3 * n))
+        flat_x = _flat(x, self.model.types.T, (B, 3 * n))
+        self.launch.tiled(self.kernels.apply_dense, (B, 3 * n), [self.arrays[depth].matrix, flat_r, active, flat_x])
+
+    def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
+        """z = tiles times r; returns what is to be prolonged."""
+        level, arrays, below = self.levels[depth], self.arrays[depth], self.arrays[depth + 1].vectors
+        threads = TILE_SLOTS * level.tiles + 4 * level.groups
+        args = [level.data, arrays.matrix, self.by_row, r, active, z, below["r"]]
+        self.launch(self.kernels.smooth, (self.model.worlds, threads), args)
+        if self.levels[depth + 1].dense:
+            self._apply_dense(depth + 1, below["r"], below["x"], active)
+        else:
+            self._chebyshev(depth + 1, active)
+        return below["x"]
+
+    def _chebyshev(self, depth: int, active: wp.array) -> None:
+        """x = C r of a level between, r is used up."""
+        level, arrays = self.levels[depth], self.arrays[depth]
+        v = arrays.vectors
+        dim = (self.model.worlds, level.slots)
+        low = LARGEST / RATIO
+        centre, half = 0.5 * (LARGEST + low), 0.5 * (LARGEST - low)
+        ratio = centre / half
+        rho = 1.0 / ratio
+        keep, step = 0.0, 1.0 / centre
+        for k in range(CHEBYSHEV_STEPS):
+            coarse = self._smooth(depth, v["r"], v["z"], active)
+            args = [level.data, 1, coarse, v["z"], keep, step, active, v["d"], v["x"]]
+            self.launch(self.kernels.chebyshev, dim, args)
+            if k < CHEBYSHEV_STEPS - 1:
+                args = [level.pattern.data, arrays.value, v["d"], active, v["r"]]
+                self.launch(self.kernels.subtract_product, dim, args)
+            new = 1.0 / (2.0 * ratio - rho)
+            keep, step = new * rho, 2.0 * new / half
+            rho = new
+
+    # making it
+
+    def _build(self) -> None:
+        m, w, launch, lag, state = self.model, self.work, self.launch, self.lag, self.state
+        flags, factors = lag.build, (lag.mass_factor, lag.dq_dv)
+        launch(self.lag_kernels.keep_vectors, self.dim, [w.u, lag.moved, state.preconditioner_displacement])
+        self.assembled.assemble(state.preconditioner_displacement, factors, flags, self.value, projected=True)
+        if m.constraints:
+            mul = w.multipliers
+            kept = [state.preconditioner_gradient, state.preconditioner_stiffness]
+            args = [mul.gradient, mul.stiffness, lag.moved, *kept]
+            launch(self.lag_kernels.keep_rows, (m.worlds, m.constraints.count), args)
+            self.assembled.add_constraints(*kept, lag.dq_dv, flags, self.value)
+        for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
+            value = arrays.value if depth else self.value
+            if level.dense:
+                self._invert_dense(level, arrays, value, flags)
+                return
+            self._invert_tiles(level, arrays, value, flags, keep=depth == 0)
+            assert level.galerkin is not None
+            args = [*level.galerkin, level.data.weight, value, flags, self.arrays[depth + 1].value]
+            launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+
+    def _invert_tiles(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array, *, keep: bool) -> None:
+        B, k = self.model.worlds, self.kernels
+        args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
+        self.launch(k.fill_tiles, (B, level.tiles, TILE_SLOTS), args)
+        self._gauss_jordan(level.tiles, arrays.matrix, arrays, flags, keep=keep)
+
+    def _gauss_jordan(self, tiles: int, matrix: wp.array, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
+        args = [self.lanes, tiles, int(keep), flags, arrays.diagonal, arrays.column, matrix]
+        self.launch(self.kernels.invert_tiles, self.model.worlds * tiles * self.lanes, args, block_dim=LANES)
+
+    def _invert_dense(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array) -> None:
+        """Gauss-Jordan by blocks of a tile's size."""
+        B, N, k, launch = self.model.worlds, arrays.size, self.kernels, self.launch
+        keep = level is self.levels[0]
+        args = [level.pattern.data, value, level.slots, flags, arrays.scale, arrays.matrix]
+        launch(k.fill_dense, (B, N // 3), args)
+        for first in range(0, N, TILE):
+            args = [arrays.matrix, arrays.scale, first, flags, arrays.diagonal, arrays.pivot]
+            launch(k.take_pivot, (B, TILE, TILE), args)
+            self._gauss_jordan(1, arrays.pivot, arrays, flags, keep=keep)
+            args = [arrays.matrix, arrays.pivot, first, flags, arrays.left, arrays.top]
+            launch(k.take_panels, (B, TILE, N), args)
+            args = [arrays.pivot, arrays.left, arrays.top, first, flags, arrays.matrix]
+            launch(k.eliminate, (B, N, N), args)
+
+
+def _flat(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+    """Vectors seen as scalars."""
+    out: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
+    out._owner = array
+    assert int(np.prod(shape)) * wp.types.type_size_in_bytes(dtype) == array.size * wp.types.type_size_in_bytes(
+        array.dtype
+    )
+    return out
