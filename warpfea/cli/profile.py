@@ -187,7 +187,7 @@ def _cells(k: KernelTime, found: Profile) -> list[str]:
     return [
         number(k.ms, 3),
         f"{100.0 * k.ms / found.total_ms:.1f} %",
-        f"{k.launches:.0f}",
+        f"{k.launches:.0f}" if k.launches >= 10.0 or k.launches % 1.0 == 0.0 else f"{k.launches:.1f}",
         number(1e-6 * k.bytes, 3),
         "-" if rate is None else number(rate, 3),
         "-" if rate is None else f"{100.0 * rate / found.copy_GBps:.0f} %",
