@@ -242,7 +242,9 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
             z[world, slot] = s
         D = diagonal[world, slot]
         rows[0, world, slot] = f64(wp.dot(a, s))
-        rows[1, world, slot] = f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
+        rows[1, world, slot] = (
+            f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
+        )
 
     @wp.kernel(module=module)
     def chebyshev(

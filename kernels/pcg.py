@@ -113,7 +113,9 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         z[world, slot] = b
         rows[0, world, slot] = f64(wp.dot(a, b))
         D = diagonal[world, slot]
-        rows[1, world, slot] = f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
+        rows[1, world, slot] = (
+            f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
+        )
 
     @wp.kernel(module=module)
     def begin(newton: Newton, ctl: Control):
@@ -187,7 +189,12 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         ctl.beta[world] = rz / ctl.rz[world]
         ctl.rz[world] = rz
         ctl.norm[world] = norm
-        if norm > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations and rz > f64(0.0) and wp.isfinite(rz):
+        if (
+            norm > ctl.target[world]
+            and ctl.iterations[world] < ctl.max_iterations
+            and rz > f64(0.0)
+            and wp.isfinite(rz)
+        ):
             wp.atomic_max(ctl.any_active, 0, 1)
         else:
             ctl.active[world] = 0

@@ -51,5 +51,7 @@ def connected_groups(group: np.ndarray, graph: sp.csr_matrix) -> np.ndarray:
     """The groups split into their connected parts; `graph` says which items touch."""
     links = graph.tocoo()
     inside = group[links.row] == group[links.col]
-    within = sp.coo_matrix((np.ones(int(inside.sum()), dtype=np.int8), (links.row[inside], links.col[inside])), graph.shape)
+    within = sp.coo_matrix(
+        (np.ones(int(inside.sum()), dtype=np.int8), (links.row[inside], links.col[inside])), graph.shape
+    )
     return np.asarray(sp.csgraph.connected_components(within.tocsr(), directed=False)[1])

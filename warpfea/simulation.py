@@ -348,7 +348,9 @@ class Simulation(Results):
     def _idle_report(self) -> StepReport:
         B = self.model.worlds
         zero, none = np.zeros(B, int), np.zeros(B)
-        return StepReport(self.status == 0, zero, zero, none, zero, self.status, none, self.time, zero, none, zero, none)
+        return StepReport(
+            self.status == 0, zero, zero, none, zero, self.status, none, self.time, zero, none, zero, none
+        )
 
     def freeze(self, worlds: Any) -> None:
         """Leave worlds (indices or mask) as they are from now on."""

@@ -14,7 +14,7 @@ import warp as wp
 from .errors import ModelError
 from .integrators import Integrator
 from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_kernels
-from .launch import Launcher
+from .launch import Launcher, labelled
 from .solvers.newton import NewtonLoop, NewtonPCG
 from .state import State
 from .workspace import Workspace
@@ -214,6 +214,12 @@ class Stepper:
         self.running.zero_()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
         wp.capture_while(self.running, self._attempt)
+        self._report()
+
+    @labelled("commit")
+    def _report(self) -> None:
+        """Undo a failed step, and tell of the step."""
+        m, w, launch = self.model, self.work, self.launch
         if self.backup is not None:
             launch(self.kernels.failed_now, m.worlds, [w.step, w.newton.active])
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
@@ -247,6 +253,12 @@ class Stepper:
             constraints.start(state.constraint_force, state.constraint_target, running)
         self.newton.run()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
+        self._commit()
+
+    @labelled("commit")
+    def _commit(self) -> None:
+        """Take over an accepted attempt."""
+        w, launch, state = self.work, self.launch, self.state
         if self.backup is not None:
             # before the first halving the state is still that of the step's start: keep it
             self.backup.copy_rows(launch, w.step.first_refusal, state)
@@ -254,10 +266,11 @@ class Stepper:
             self._book()
         args = [w.step, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
         launch(self.kernels.commit, self.dim, args)
-        if constraints:
-            constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
+        if self.newton.constraints:
+            self.newton.constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
         self.newton.preconditioner.commit(w.step.accepted)
 
+    @labelled("loads")
     def _loads(self, active: wp.array) -> None:
         self._laws(active)
         m, w, launch, loads = self.model, self.work, self.launch, self.model.loads
@@ -287,6 +300,7 @@ class Stepper:
             for kernel, law in loads.function_laws:
                 launch(kernel, m.worlds, [law, w.step.new_time, active, w.law_value])
 
+    @labelled("loads")
     def _damping(self, active: wp.array) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
         if self.integrator.static:

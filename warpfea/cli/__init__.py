@@ -1,4 +1,4 @@
-"""The command line: `warpfea run | scenes | info | render | bench | study`.
+"""The command line: `warpfea run | scenes | info | render | bench | study | profile`.
 
 Exit codes: 0 done, 2 bad input or usage, 3 not converged, 4 output failed, 130 interrupted (files valid), 1 a defect.
 """

@@ -48,10 +48,32 @@ A scene file is Python:
       ...
 """
 
+PROFILE_EXAMPLES = """\
+examples:
+  warpfea profile hook                                  where the time of a step goes
+  warpfea profile cantilever --set cells=200 --device cuda:0 --png p.png --json p.json
+  warpfea profile my_scenes.py:swing --steps 50 --dtype float32
+  warpfea profile part.msh --material svk:E=7e8,nu=0.33,density=2700 --clamp base
+
+parts:
+@PARTS@
+
+how to read it:
+  A step runs as one recorded graph: its time is that of the graph. The same steps are then done again from the same
+  state, launch by launch, each timed alone (on a GPU by events around the kernel, on the CPU by the clock), less the
+  time of an empty launch. "between" is what a step takes beyond its kernels; a large share means that the problem is
+  too small for the device. On the CPU kernels timed alone take somewhat longer, since caches cool down in between.
+
+  MB are the bytes of the arrays that a launch can reach through its arguments, each array counted once, and GB/s those
+  bytes over the time. That is an estimate of the traffic: it is too high for a kernel that touches an array in part
+  and too low for one that reads it several times; small problems stay in the caches, and come out above the rate of a
+  copy. Where "of copy" is near 100 % for arrays much larger than the caches, memory is the limit; where it is low,
+  arithmetic, scattered access or the launch itself is.
+"""
+
 LATER = {
     "stress": "the suite of stiff and extreme cases",
     "sweep": "sweeps over parameters on many devices",
-    "profile": "profiles of kernels",
 }
 MATERIAL_HINT = "e.g. svk:E=7e8,nu=0.33,density=2700"
 
@@ -141,6 +163,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     _add_render(commands)
     _add_bench(commands)
     _add_study(commands)
+    _add_profile(commands)
     for name, what in LATER.items():
         commands.add_parser(name, help=f"{what} (not part of this version)", add_help=False)
     if words and words[0] in LATER:
@@ -149,7 +172,8 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     arguments.words = list(words)
     if not hasattr(arguments, "command"):
         top.print_help()
-        raise UsageError(f"give a command: run, scenes, info, render, bench, study ({top.prog} --help tells more)")
+        names = "run, scenes, info, render, bench, study, profile"
+        raise UsageError(f"give a command: {names} ({top.prog} --help tells more)")
     return arguments
 
 
@@ -328,3 +352,23 @@ def _add_study(commands: Any) -> None:
     to.add_argument("--out", metavar="FOLDER", help="write ancf_tets.json, .csv and .png there")
     _add_general(to)
     to.set_defaults(command=_call("study", "study"))
+
+
+def _add_profile(commands: Any) -> None:
+    from ..launch import PARTS
+
+    parts = "\n".join(f"  {name:14}  {text}" for name, text in PARTS.items())
+    to = commands.add_parser(
+        "profile",
+        help="where the time of a step goes",
+        description="Time per part of a step and per kernel, iterations, launches, bytes, bandwidth beside that of a "
+        "copy, compile time.",
+        epilog=PROFILE_EXAMPLES.replace("@PARTS@", parts),
+    )
+    _add_model(to)
+    to.add_argument("--steps", type=count, default=10, metavar="N", help="steps that are timed, after 2 (default 10)")
+    out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
+    out.add_argument("--png", metavar="FILE", help="picture of the parts (pip install 'warpfea[plots]')")
+    out.add_argument("--json", metavar="FILE", help="all numbers, with fixed keys; - for stdout")
+    _add_general(to)
+    to.set_defaults(command=_call("profile", "profile"))

@@ -16,6 +16,7 @@ import warp as wp
 
 from ..kernels.constraints import SUM_ROWS, multiplier_struct
 from ..kernels.deflation import deflation_kernels
+from ..launch import labelled
 
 if TYPE_CHECKING:
     from ..launch import Launcher
@@ -72,11 +73,13 @@ class ConstraintSolver:
         self.large = model.array("constraints", large, wp.int32) if self.largest else None
         self.large_count = len(large)
 
+    @labelled("constraints")
     def start(self, multipliers: wp.array, travel: wp.array, active: wp.array) -> None:
         """Warm start of an attempt from the state's multipliers and right sides; rho is not known yet."""
         args = [multipliers, travel, active, self.work.multipliers]
         self.launch(self.kernels.load_multipliers, self.dim, args)
 
+    @labelled("constraints")
     def evaluate(self, active: wp.array) -> None:
         """c, J and the augmented potential's rows at work.u."""
         m, w, k = self.model, self.work, self.kernels
@@ -85,6 +88,7 @@ class ConstraintSolver:
         args = [self.constraints.data, w.u, w.law_value, w.newton.alpha, active, mul]
         self.launch(k.evaluate, self.dim, args)
 
+    @labelled("build")
     def build(self, active: wp.array, *, penalty: bool = False) -> None:
         """Matrices of the clusters from the inverse diagonal blocks; `penalty`: set rho from them."""
         m, w, k, launch = self.model, self.work, self.deflation, self.launch
@@ -111,6 +115,7 @@ class ConstraintSolver:
         args = [self.constraints.data, w.multipliers, p, w.step.dq_dv, active]
         self.launch(self.kernels.product_terms, self.dim, args)
 
+    @labelled("preconditioner")
     def precondition(self, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None) -> None:
         """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z on the slots of constraints, z = D^-1 r; and r.z per slot.
 
@@ -131,22 +136,26 @@ class ConstraintSolver:
         args = [data, mul, w.inverse, r, z, int(into is not None), active, z if into is None else into, w.rows]
         launch(k.project, (m.worlds, m.slots), args)
 
+    @labelled("constraints")
     def predict(self, active: wp.array) -> None:
         """The multipliers' part of the Newton step in work.direction."""
         w = self.work
         args = [self.constraints.data, w.multipliers, w.direction, w.newton.quiet, w.step.dq_dv, active]
         self.launch(self.kernels.predict_change, self.dim, args)
 
+    @labelled("constraints")
     def adopt(self, flags: wp.array) -> None:
         """Take over the multipliers of the trial."""
         self.launch(self.kernels.adopt, self.dim, [flags, self.work.multipliers])
 
+    @labelled("constraints")
     def work_terms(self, displacement: wp.array, travel: wp.array, accepted: wp.array) -> None:
         """Work of drives and loss of constraints along an accepted substep, as rows 0 and 1."""
         w = self.work
         args = [self.constraints.data, w.multipliers, w.u, displacement, travel, accepted]
         self.launch(self.kernels.work_terms, self.dim, args)
 
+    @labelled("constraints")
     def commit(self, multipliers: wp.array, travel: wp.array, accepted: wp.array) -> None:
         """Keep multipliers and right sides of an accepted substep."""
         args = [accepted, self.work.multipliers, multipliers, travel]

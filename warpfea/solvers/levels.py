@@ -16,7 +16,7 @@ from .assembled import Pattern, make_pattern
 if TYPE_CHECKING:
     from ..model import Model
 
-__all__ = ["BOTTOM_SLOTS", "WHOLE_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
+__all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "WHOLE_SLOTS", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
 """Slots of a group whose affine motions are the coarse space: 16 unknowns of a level to one of the next."""

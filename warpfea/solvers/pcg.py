@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..kernels.pcg import LANES, pcg_kernels
-from ..launch import Launcher
+from ..launch import Launcher, labelled
 from .preconditioner import Preconditioner
 from .residual import Residual
 
@@ -37,6 +37,7 @@ class PCG:
         self.deflate = deflate and model.group_count > 0
         work.pcg.max_iterations = max_iterations
 
+    @labelled("vectors")
     def solve(self, active: wp.array) -> None:
         """Put the direction into work.direction."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch

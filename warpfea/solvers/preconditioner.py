@@ -8,6 +8,7 @@ import warp as wp
 
 from ..errors import ModelError
 from ..kernels.pcg import pcg_kernels
+from ..launch import labelled
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -69,6 +70,7 @@ class BlockJacobi:
         """That of the conjugate gradients."""
         return {self.kernels.module}
 
+    @labelled("build")
     def start(self, active: wp.array) -> None:
         """Assemble and invert the blocks."""
         self.residual.blocks(active)
@@ -84,6 +86,7 @@ class BlockJacobi:
     def judge(self, active: wp.array) -> None:
         """It does not learn."""
 
+    @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
         w = self.work

@@ -10,6 +10,7 @@ from ..kernels.constraints import SUM_ROWS, constraint_struct
 from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
+from ..launch import labelled
 from .assembled import Assembled
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class Reducer:
         self.worlds = worlds
         self.kernels = reduce_kernels()
 
+    @labelled("vectors")
     def __call__(self, rows: wp.array, count: int, active: wp.array, out: wp.array) -> None:
         """out[k] = sum of rows[k], k < count, in the active worlds."""
         n = rows.shape[2]
@@ -81,6 +83,7 @@ class Residual:
             out |= {self.gather.matrix_module} | self.assembled.modules()
         return out
 
+    @labelled("assembly")
     def linearise(self, active: wp.array) -> None:
         """Make the operator at the iterate."""
         if self.by_matrix:
@@ -89,6 +92,7 @@ class Residual:
             factors = (w.step.mass_factor, w.step.dq_dv)
             self.assembled.assemble(w.u, factors, active, self.matrix, projected=False)
 
+    @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
         """q, forces, g and all sums at the iterate v; `hold`: Phi holds the non-potential forces of this iterate."""
         m, w, launch = self.model, self.work, self.launch
@@ -129,12 +133,14 @@ class Residual:
             launch(field.kernel, (m.worlds, field.count), args)
         launch(self.gather.gather_force, self.dim, [loads.pushed_topology, w.pushed_contribution, active, w.pushed])
 
+    @labelled("loads")
     def hold_pushed(self, active: wp.array) -> None:
         """From here on Phi holds the non-potential forces of this iterate."""
         if self.model.loads.nonpotential:
             args = [self.work.pushed, active, self.work.pushed_held]
             self.launch(self.newton.copy_active, self.dim, args)
 
+    @labelled("build")
     def blocks(self, active: wp.array) -> None:
         """Diagonal blocks of H at the iterate: D for the norms, inverses for the preconditioner."""
         m, w, launch = self.model, self.work, self.launch
@@ -144,6 +150,7 @@ class Residual:
         args = [m.topology, w.block_contribution, w.step.mass_factor, w.step.dq_dv, active, w.diagonal, w.inverse]
         launch(self.gather.gather_blocks, self.dim, args)
 
+    @labelled("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate, and p.Hp per slot in rows[0]."""
         m, w, launch = self.model, self.work, self.launch
@@ -175,6 +182,7 @@ class Residual:
             args = [part.data, w.u, w.law_value, active, p, w.pushed_tangent]
             launch(part.product, (m.worlds, part.count), args)
 
+    @labelled("loads")
     def push_curvature(self, active: wp.array) -> None:
         """p.K p of the follower loads along the direction p, into the Newton control."""
         m, w, launch = self.model, self.work, self.launch

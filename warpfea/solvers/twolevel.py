@@ -23,6 +23,7 @@ from ..kernels.blocks import block_kernels
 from ..kernels.lag import lag_kernels, lag_struct
 from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels
 from ..kernels.pcg import pcg_kernels
+from ..launch import labelled
 from .levels import GROUP_SLOTS, Level, make_levels
 
 if TYPE_CHECKING:
@@ -140,6 +141,7 @@ class TwoLevel:
     def follow(self, active: wp.array) -> None:
         """Nothing: it lags behind the iterate."""
 
+    @labelled("build")
     def forget(self, flags: wp.array) -> None:
         """The state of flagged worlds was set from elsewhere."""
         self.launch(self.lag_kernels.mark, self.model.worlds, [flags, self.lag])
@@ -149,11 +151,13 @@ class TwoLevel:
         self._carry(accepted)
         self.launch(self.lag_kernels.commit, self.model.worlds, [self.lag, accepted])
 
+    @labelled("build")
     def start(self, active: wp.array) -> None:
         """Make it anew where it is due, and D with it; penalties follow from D here."""
         self._decide(active)
         wp.capture_if(self.lag.any_build, self._build_first)
 
+    @labelled("build")
     def prepare(self, active: wp.array) -> None:
         """Make it anew where it is due. The penalties of constraints stay those of the step."""
         self._decide(active)
@@ -165,10 +169,12 @@ class TwoLevel:
         args = [self.lag, w.step.mass_factor, w.step.dq_dv, active]
         self.launch(self.lag_kernels.decide, self.model.worlds, args)
 
+    @labelled("build")
     def judge(self, active: wp.array) -> None:
         """Count what the solve cost."""
         self.launch(self.lag_kernels.judge, self.model.worlds, [self.lag, self.work.newton, self.work.pcg])
 
+    @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = B r; rows r.z and r.D^-1 r."""
         m, w, launch, k = self.model, self.work, self.launch, self.kernels

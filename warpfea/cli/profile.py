@@ -1,0 +1,194 @@
+"""`warpfea profile`: where the time of a step goes, as a table, JSON and a picture."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import statistics
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+from ..bench import machine
+from ..launch import PARTS
+from ..outputs import write_whole
+from ..profiling import WARM_UP, KernelTime, Profile
+from ..profiling import profile as measure
+from ..simulation import Simulation
+from . import DONE
+from .console import number, quiet_warp, table, write_json
+from .run import check_targets
+from .source import Source, progress, resolve
+from .summary import plain, versions
+
+__all__ = ["KEYS", "SCHEMA", "profile"]
+
+SCHEMA = 1
+KEYS = (
+    "schema",
+    "scene",
+    "parameters",
+    "device",
+    "dtype",
+    "dt",
+    "integrator",
+    "elements",
+    "unknowns",
+    "warm_up",
+    "steps",
+    "step_ms",
+    "kernels_ms",
+    "between_ms",
+    "newton_per_step",
+    "pcg_per_step",
+    "launches_per_step",
+    "bytes_per_step",
+    "copy_GBps",
+    "empty_launch_us",
+    "compile_s",
+    "parts",
+    "kernels",
+    "machine",
+    "versions",
+)
+SHOWN = 15
+"""Kernels that are listed one by one."""
+
+
+def profile(options: argparse.Namespace) -> int:
+    """Do `warpfea profile SCENE`."""
+    check_targets(options)
+    if options.png:  # before any work
+        from ..study.plots import require_matplotlib
+
+        require_matplotlib()
+    source = resolve(options)
+    with quiet_warp():
+        show = progress(options)
+        sim = source.simulation(source.model(), show)
+        total, hide = WARM_UP + 1 + 2 * options.steps, None if show is None else not show
+        with tqdm(desc="profile", unit="step", total=total, leave=False, disable=hide, file=sys.stderr) as bar:
+            found = measure(sim, steps=options.steps, on_step=bar.update)
+        content = _content(source, sim, found)
+    if options.json:
+        write_json(options.json, content)
+    if options.png:
+        from ..profile_plot import draw
+
+        title = f"{source.label}: {content['unknowns']} unknowns, {content['device']}, {content['dtype']}, "
+        title += f"{content['step_ms']['median']:.3g} ms per step"
+        write_whole(pathlib.Path(options.png), lambda path: draw(found, title, path))
+    if not options.quiet and options.json != "-":
+        print(_human(content, found, [name for name in (options.png, options.json) if name]), flush=True)
+    return DONE
+
+
+def _content(source: Source, sim: Simulation, found: Profile) -> dict[str, Any]:
+    """What the JSON holds."""
+    info = sim.model.info()
+    content = {
+        "schema": SCHEMA,
+        "scene": source.label,
+        "parameters": source.parameters,
+        "device": str(sim.model.device),
+        "dtype": sim.model.dtype,
+        "dt": sim.dt,
+        "integrator": sim.integrator.name,
+        "elements": info["elements"],
+        "unknowns": info["unknowns"],
+        "warm_up": WARM_UP,
+        "steps": len(found.step_ms),
+        "step_ms": {
+            "median": statistics.median(found.step_ms),
+            "mean": statistics.mean(found.step_ms),
+            "min": min(found.step_ms),
+            "max": max(found.step_ms),
+        },
+        "kernels_ms": found.kernels_ms,
+        "between_ms": found.between_ms,
+        "newton_per_step": found.newton,
+        "pcg_per_step": found.pcg,
+        "launches_per_step": found.launches,
+        "bytes_per_step": sum(k.bytes for k in found.kernels),
+        "copy_GBps": found.copy_GBps,
+        "empty_launch_us": found.empty_launch_us,
+        "compile_s": sim.compile_s,
+        "parts": {name: _row(k, found) for name, k in found.parts.items()},
+        "kernels": [{"part": k.part, "kernel": k.kernel} | _row(k, found) for k in found.kernels],
+        "machine": machine(str(sim.model.device)),
+        "versions": versions(),
+    }
+    assert tuple(content) == KEYS
+    return {name: plain(value) for name, value in content.items()}
+
+
+def _row(k: KernelTime, found: Profile) -> dict[str, float | None]:
+    """The numbers of a part or a kernel, per step."""
+    return {
+        "ms": k.ms,
+        "share": k.ms / found.total_ms,
+        "launches": k.launches,
+        "bytes": k.bytes,
+        "GBps": k.GBps,
+        "copy_share": None if k.GBps is None else k.GBps / found.copy_GBps,
+    }
+
+
+def _human(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
+    """The profile as tables."""
+    step, of_step = c["step_ms"], c["step_ms"]["mean"]
+    rows = [
+        ["scene", f"{c['scene']}: {c['elements']} elements, {c['unknowns']} unknowns"],
+        ["device", f"{c['device']}, {c['dtype']}, {c['integrator']}, dt = {number(c['dt'])} s"],
+        [
+            "a step",
+            f"{number(step['median'])} ms as one graph (median of {c['steps']}, {number(step['min'])} to "
+            f"{number(step['max'])} ms); kernels and set-up before took {c['compile_s']:.1f} s",
+        ],
+        ["iterations", f"{c['newton_per_step']:.1f} Newton and {c['pcg_per_step']:.0f} PCG per step"],
+        [
+            "launches",
+            f"{c['launches_per_step']:.0f} per step of {len({k.kernel for k in found.kernels})} kernels; an empty one "
+            f"takes {number(c['empty_launch_us'], 2)} us, which is taken off each",
+        ],
+        ["copy", f"{number(c['copy_GBps'], 3)} GB/s, read and written, for a large array"],
+    ]
+    parts = [["part", *HEADER, ""]]
+    parts += [[name, *_cells(k, found), PARTS[name]] for name, k in found.parts.items()]
+    gap, share = found.between_ms, 100.0 * found.between_ms / found.total_ms
+    cells = [number(gap, 3), f"{share:.1f} %"] if gap > 0.0 else ["-", "-"]
+    parts.append(["between", *cells, "", "", "", "", BETWEEN])
+    kernels = [[*HEADER, "part", "kernel"]]
+    kernels += [[*_cells(k, found), k.part, k.kernel] for k in found.kernels[:SHOWN]]
+    lines = [table(rows), "", table(parts, right=range(1, 7)), "", table(kernels, right=range(6))]
+    rest = found.kernels[SHOWN:]
+    if rest:
+        lines.append(f"and {len(rest)} more, {number(sum(k.ms for k in rest), 2)} ms together (--json lists them)")
+    notes = []
+    if found.kernels_ms > 1.02 * of_step:
+        longer = 100.0 * (found.kernels_ms / of_step - 1.0)
+        notes.append(
+            f"Timed one by one the kernels took {longer:.0f} % longer than the steps as graphs; shares are of them."
+        )
+    notes.append("MB are of the arrays that a launch can reach, each once: not its traffic (see --help).")
+    lines += ["", *notes]
+    lines += [f"wrote {name}" for name in wrote]
+    return "\n".join(lines)
+
+
+BETWEEN = "starting of kernels, conditions of loops, reading of the report"
+HEADER = ("ms/step", "share", "launches", "MB/step", "GB/s", "of copy")
+
+
+def _cells(k: KernelTime, found: Profile) -> list[str]:
+    """The texts under `HEADER`."""
+    rate = k.GBps
+    return [
+        number(k.ms, 3),
+        f"{100.0 * k.ms / found.total_ms:.1f} %",
+        f"{k.launches:.0f}" if k.launches >= 10.0 or k.launches % 1.0 == 0.0 else f"{k.launches:.1f}",
+        number(1e-6 * k.bytes, 3),
+        "-" if rate is None else number(rate, 3),
+        "-" if rate is None else f"{100.0 * rate / found.copy_GBps:.0f} %",
+    ]
