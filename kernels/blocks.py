@@ -8,7 +8,6 @@ import types as _types
 
 import warp as wp
 
-from .constraints import multiplier_struct
 from .gather import inverse_function, pattern_struct, topology_struct
 from .types import kernel_module, precision
 
@@ -34,7 +33,7 @@ def coupling_struct():
 def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
     """Assembly from the matrices of elements with so many slots."""
     p = precision(dtype)
-    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    T, mat33 = p.T, p.mat33
     f64 = wp.float64
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
@@ -105,7 +104,6 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     vec4 = wp.types.vector(length=4, dtype=T)
     Topology = topology_struct(dtype)
     Pattern, Couplings = pattern_struct(), coupling_struct()
-    Multipliers = multiplier_struct()
     free_inverse = inverse_function(dtype)
     module = kernel_module(f"blocks_{dtype}")
     coupling_module = kernel_module(f"couplings_{dtype}")

@@ -34,6 +34,7 @@ LANES = 32
 NOISE = 100.0  # Phi is blind below this many roundings of its parts
 FLOOR = 16.0
 MAX_SEARCH = 20
+CHORD = 0.02  # of the residual; a step's matrix that does at least so well is used again
 
 
 @functools.cache
@@ -80,6 +81,8 @@ def control_struct():
         classical: wp.int32  # multipliers change in an outer loop
         force: wp.array(dtype=wp.float64)  # |g| over the free components, N
         force_tol: wp.float64  # N; accepted without regard to the size of the forces; 0: never
+        first_forcing: wp.float64
+        relinearise: wp.array(dtype=wp.int32)  # the operator's matrix is to be made anew
         tol: wp.float64
         eps: wp.float64
         max_iterations: wp.int32
@@ -96,8 +99,6 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
-    # constraints are stiff: a loose first solve costs more iterations than it saves
-    FIRST_FORCING = wp.constant(0.01 if constrained else 0.1)
     module = kernel_module(f"newton_{dtype}{'_constrained' if constrained else ''}")
 
     @wp.func
@@ -234,13 +235,24 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         phi = objective(ctl, world) + ctl.slot_sums[7, world]
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = magnitude(ctl, world)
-        ctl.forcing[world] = f64(FIRST_FORCING)
+        ctl.forcing[world] = ctl.first_forcing
         if ctl.domain_J[world] <= f64(0.0):
             fail(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
             fail(ctl, world, FAIL_NAN)
         else:
             settle(ctl, world)
+
+    @wp.kernel(module=module)
+    def judge_matrix(ctl: Control, any_flag: wp.array(dtype=wp.int32)):
+        """The operator's matrix is kept within a step while the residual falls by CHORD per iteration at least."""
+        world = wp.tid()
+        ctl.relinearise[world] = 0
+        if ctl.active[world] == 0:
+            return
+        if ctl.iterations[world] == 0 or ctl.reduction[world] > f64(CHORD) or ctl.alpha[world] != f64(1.0):
+            ctl.relinearise[world] = 1
+            wp.atomic_max(any_flag, 0, 1)
 
     @wp.kernel(module=module)
     def begin_search(ctl: Control):
@@ -418,6 +430,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         reset_min_J=reset_min_J,
         begin=begin,
         begin_search=begin_search,
+        judge_matrix=judge_matrix,
         judge_trial=judge_trial,
         judge_outer=judge_outer,
         any_set=any_set,

@@ -82,7 +82,7 @@ class Workspace:
         self.report = self.array(
             "report", (B, len(REPORT) + 6 * len(model.probes) + JOINT_COLUMNS * joints), wp.float64
         )
-        self.any_flag = self.array("any_flag", (4,), wp.int32)
+        self.any_flag = self.array("any_flag", (5,), wp.int32)
         C = model.component_count
         sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
         self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)

@@ -117,7 +117,7 @@ class ConstraintSolver:
 
     @labelled("preconditioner")
     def precondition(self, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None) -> None:
-        """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z on the slots of constraints, z = D^-1 r; and r.z per slot.
+        """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z on the slots of constraints, z = D^-1 r; and r.z.
 
         With `into` the result is added there instead.
         """

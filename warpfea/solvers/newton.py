@@ -125,6 +125,10 @@ class NewtonLoop:
         self.dim = (model.worlds, model.slots)
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv
+        # a good preconditioner makes a decade of PCG cheaper than another Newton iteration
+        ctl.first_forcing = 0.1 if options.preconditioner == "block-jacobi" else 0.001
+        if constrained:  # constraints are stiff: a loose first solve costs more iterations than it saves
+            ctl.first_forcing = min(ctl.first_forcing, 0.01)
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]

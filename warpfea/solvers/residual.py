@@ -85,12 +85,21 @@ class Residual:
 
     @labelled("assembly")
     def linearise(self, active: wp.array) -> None:
-        """Make the operator at the iterate."""
-        if self.by_matrix:
-            assert self.assembled is not None
-            w = self.work
-            factors = (w.step.mass_factor, w.step.dq_dv)
-            self.assembled.assemble(w.u, factors, active, self.matrix, projected=False)
+        """Make the operator's matrix at the iterate, where it is to be made anew."""
+        if not self.by_matrix:
+            return
+        w = self.work
+        flag = w.any_flag[3:4]
+        flag.zero_()
+        self.launch(self.newton.judge_matrix, self.model.worlds, [w.newton, flag])
+        wp.capture_if(flag, self._assemble)
+
+    @labelled("assembly")
+    def _assemble(self) -> None:
+        assert self.assembled is not None
+        w = self.work
+        factors = (w.step.mass_factor, w.step.dq_dv)
+        self.assembled.assemble(w.u, factors, w.newton.relinearise, self.matrix, projected=False)
 
     @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:

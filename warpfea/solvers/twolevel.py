@@ -1,10 +1,11 @@
 """The two-level preconditioner: tiles of 48 unknowns and the affine motions of groups of tiles, added.
 
 z = T r + P C P^T r: T holds dense inverses of the diagonal blocks of H, P the four affine functions per axis of each
-group of 64 slots (a position slot moves by a + B (X - Xc), a gradient slot along E by B E), and C stands for the inverse
-of P^T H P. C is dense when that is small; else it is CHEBYSHEV_STEPS steps of the Chebyshev iteration preconditioned by
-the same construction one level down. Adding all levels up instead (each treated once) is cheaper per iteration, but then
-iterations grow with the mesh: 51, 86, 126 at 6k, 55k, 265k unknowns of a T10 bar in statics, against 51, 48, 49.
+group of 64 slots (a position slot moves by a + B (X - Xc), a gradient slot along E by B E), and C stands for the
+inverse of P^T H P. C is dense when that is small; else it is CHEBYSHEV_STEPS steps of the Chebyshev iteration
+preconditioned by the same construction one level down. Adding all levels up instead (each treated once) is cheaper per
+iteration, but then iterations grow with the mesh: 51, 86, 126 at 6k, 55k, 265k unknowns of a T10 bar in statics,
+against 51, 48, 49.
 
 An odd number of Chebyshev steps keeps C positive whatever the largest eigenvalue is.
 
@@ -71,7 +72,7 @@ class LevelArrays:
 
 
 class TwoLevel:
-    """See the module. It is made where the rule of kernels/lag.py says, at the state's `preconditioner_displacement`."""
+    """See the module; it is made anew when the rule of kernels/lag.py says so."""
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
