@@ -109,6 +109,7 @@ def gather_kernels(
     name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
     module = kernel_module(f"gather_{name}")
     matrix_module = kernel_module(f"matrix_product_{name}")
+    massive_module = kernel_module(f"massive_product_{name}")
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -299,6 +300,34 @@ def gather_kernels(
         out[world, slot] = h
         rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
 
+    @wp.kernel(module=massive_module)
+    def massive_product(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        pushed_start: wp.array(dtype=wp.int32),
+        pushed_entry: wp.array(dtype=wp.int32),
+        pushed_contribution: wp.array2d(dtype=vec3),
+        p_in: wp.array2d(dtype=vec3),
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
+        out: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """The same where the contributions hold mass and factors."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        h = vec3()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            h += contribution[world, topo.entry[k]]
+        dq = T(dq_dv[world])
+        h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
+        out[world, slot] = h
+        rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
+
     @wp.kernel(module=matrix_module)
     def matrix_product(
         topo: Topology,
@@ -382,6 +411,8 @@ def gather_kernels(
     return _types.SimpleNamespace(
         module=module,
         matrix_module=matrix_module,
+        massive_module=massive_module,
+        massive_product=massive_product,
         matrix_product=matrix_product,
         gather_force=gather_force,
         residual=residual,

@@ -161,6 +161,19 @@ def density_at(body: Body, elements: np.ndarray, s: np.ndarray, conn: np.ndarray
     return out
 
 
+def parent_mass(family: Any) -> np.ndarray:
+    """int s_i s_j over the parent element, of families whose functions there are those of every straight element."""
+    s, _ = family.shape(family.mass_rule.points, np.zeros((1, len(family.node_slots), 3)))
+    table = np.asarray(s[0])
+    return np.einsum("q,qi,qj->ij", family.mass_rule.weights, table, table)
+
+
+def element_density(host: HostBlock) -> np.ndarray:
+    """(E,) density of the elements of a block, constant in each, kg/m^3."""
+    density = np.asarray(host.body.materials[host.material][1].density, dtype=float)
+    return np.full(len(host.elements), float(density)) if density.ndim == 0 else density[host.elements]
+
+
 def body_mass(body: Body) -> sp.csr_matrix:
     """Consistent scalar mass matrix m_ij = int rho s_i s_j dV (Eq. 20), body slots, kg."""
     flat = straight(body)

@@ -46,6 +46,11 @@ class Block:
     field_rule: Any = None
     shear: Any = None
 
+    @property
+    def massive(self) -> bool:
+        """Whether the mass of an element is one table times a number."""
+        return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
+
     def kernels_for(self, dtype: str, damping: str | None) -> Any:
         """The kernels of this kind of element with another form of damping."""
         k = self.key
@@ -253,6 +258,10 @@ class Model:
             table = ds[0][:, :, None, :]
             data.J0_inv = self.array("elements", np.concatenate(J0), mat33)
             data.det_J0 = self.array("elements", np.concatenate(w), T)
+            if not any(callable(p.body.materials[p.material][1].density) for p in parts):
+                data.mass = self.array("elements", assembly.parent_mass(family), T)
+                density = [assembly.element_density(p) for p in parts]
+                data.density = self.array("elements", np.concatenate(density) * np.concatenate(w), T)
             data.weight = self.array("elements", rule.weights[:, None], T)
         else:
             table = np.moveaxis(np.concatenate(h), 0, 2)

@@ -65,6 +65,7 @@ class Residual:
         self.newton = newton_kernels(model.dtype, constraints is not None)
         self.con = model.constraints.data if model.constraints else constraint_struct()()
         self.dim = (model.worlds, model.slots)
+        self.massive = all(block.massive for block in model.blocks)
         # elements with many points per slot cost more than the matrix that they make
         many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
@@ -81,6 +82,8 @@ class Residual:
         if self.by_matrix:
             assert self.assembled is not None
             out |= {self.gather.matrix_module} | self.assembled.modules()
+        elif self.massive:
+            out |= {self.gather.massive_module} | {k.massive_product.module for k in self.block_kernels}
         return out
 
     @labelled("assembly")
@@ -163,7 +166,11 @@ class Residual:
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate, and p.Hp per slot in rows[0]."""
         m, w, launch = self.model, self.work, self.launch
-        if not self.by_matrix:
+        if self.massive and not self.by_matrix:
+            for block, kernels in zip(m.blocks, self.block_kernels):
+                args = [block.data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p, w.contribution]
+                launch(kernels.massive_product, (m.worlds, block.count), args)
+        elif not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
                 args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
                 launch(kernels.tangent_product, (m.worlds, block.count), args)
@@ -182,7 +189,8 @@ class Residual:
             args = [m.topology, pattern.data, self.matrix, lanes, *rest]
             launch(self.gather.matrix_product, (m.worlds, launch.padded(m.slots * lanes)), args)
         else:
-            launch(self.gather.product, self.dim, [m.topology, w.contribution, *rest])
+            kernel = self.gather.massive_product if self.massive else self.gather.product
+            launch(kernel, self.dim, [m.topology, w.contribution, *rest])
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""
