@@ -49,9 +49,13 @@ def step_error(sim: Simulation, world: int) -> ConvergenceError | ConstraintErro
         element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
+    reason = REASONS.get(code, "unknown reason")
+    direct = sim.stepper.newton.direct
+    if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
+        reason = "H is singular (a body or mechanism that nothing holds?)"
     return ConvergenceError(
         f"step from t = {time:.6g} s with dt = {sim.dt:g} s was not accepted in world {world}: "
-        f"{REASONS.get(code, 'unknown reason')} after {halvings} halvings; relative residuals "
+        f"{reason} after {halvings} halvings; relative residuals "
         f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}",
         time=time, world=world, residuals=history, element=element, state=sim.state,
     )  # fmt: skip

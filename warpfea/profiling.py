@@ -244,14 +244,14 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
         on_step: called after each of the 2 steps + 3 that are done.
 
     Raises:
-        ModelError: steps out of range, or a simulation with capture=False.
+        ModelError: steps out of range, or a simulation whose steps are not recorded.
         ConvergenceError, ConstraintError: a step failed.
     """
     if steps < 1:
         raise ModelError(f"profile: steps = {steps!r} must be at least 1")
     stepper = sim.stepper
     if stepper.graph is None:
-        raise ModelError("profile: the simulation was made with capture=False")
+        raise ModelError("profile: the simulation was made with capture=False, or with linear='direct'")
 
     def do(count: int, run: Callable[[], object]) -> list[float]:
         times = []

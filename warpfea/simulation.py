@@ -102,7 +102,7 @@ class Simulation(Results):
             float64, 1e-5 in float32.
         ledger: keep the energy ledger.
         record: keep what probes and joints tell of every step, else of the last alone.
-        capture: record a step as one graph, on the GPU and on the CPU.
+        capture: record a step as one graph, on the GPU and on the CPU; never done with linear="direct".
         on_compile: called with (modules ready, modules in all, name) while kernels compile.
         on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
             several only once all have failed.

@@ -87,7 +87,8 @@ class Stepper:
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
-        self.graph = self._record() if capture else None
+        # a direct solver takes part on the host
+        self.graph = self._record() if capture and self.newton.direct is None else None
 
     def _bind(self) -> None:
         w, state = self.work, self.state

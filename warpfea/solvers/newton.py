@@ -11,6 +11,7 @@ import warp as wp
 from ..errors import ModelError
 from ..kernels.newton import newton_kernels
 from .alm import ConstraintSolver
+from .direct import Direct
 from .pcg import PCG
 from .preconditioner import make
 from .residual import Residual
@@ -27,7 +28,7 @@ EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
 
 @dataclass(frozen=True)
 class NewtonPCG:
-    """Newton's method with a line search; linear systems by preconditioned conjugate gradients.
+    """Newton's method with a line search; linear systems by preconditioned conjugate gradients or a factorisation.
 
     Args:
         tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
@@ -41,6 +42,8 @@ class NewtonPCG:
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
             serves), "block-jacobi" (3x3 blocks, of every iterate), or "auto", the first. All deflate the directions of
             constraints.
+        linear: "pcg", or "direct": H is factorised (SuperLU on the host; on a GPU cuDSS where it is installed), for
+            reference and the hardest cases. PCG's iterations are then one or two, and steps are not recorded as graphs.
         operator: H p from "elements", from the "matrix" assembled at every iterate, or "auto", by which is cheaper.
         multipliers: how constraint forces are found: "newton", with every Newton step, or "outer", the classical
             augmented Lagrangian, in a loop around the Newton solves.
@@ -57,6 +60,7 @@ class NewtonPCG:
     max_pcg: int = 2000
     max_halvings: int = 8
     preconditioner: str = "auto"
+    linear: str = "pcg"
     operator: str = "auto"
     multipliers: str = "newton"
     penalty: float = 1000.0
@@ -67,6 +71,10 @@ class NewtonPCG:
             raise ModelError(f"NewtonPCG: tol = {self.tol!r} must lie between 0 and 1")
         if not (math.isfinite(self.force_tol) and self.force_tol >= 0.0):
             raise ModelError(f"NewtonPCG: force_tol = {self.force_tol!r} must be zero or positive, N")
+        if self.linear not in ("pcg", "direct"):
+            raise ModelError(f"NewtonPCG: linear = {self.linear!r} is neither 'pcg' nor 'direct'")
+        if self.linear == "direct" and self.preconditioner != "auto":
+            raise ModelError(f"NewtonPCG: preconditioner = {self.preconditioner!r} is not for linear = 'direct'")
         if self.operator not in ("auto", "elements", "matrix"):
             raise ModelError(f"NewtonPCG: operator = {self.operator!r} is none of 'auto', 'elements', 'matrix'")
         for name in ("max_newton", "max_pcg", "max_outer"):
@@ -104,8 +112,9 @@ class NewtonLoop:
         self.classical = constrained and options.multipliers == "outer"
         self.max_outer = options.max_outer
         self.constraints: ConstraintSolver | None = None
+        direct = options.linear == "direct"
         if constrained:
-            deflate = options.preconditioner != "block-jacobi"
+            deflate = options.preconditioner != "block-jacobi" and not direct
             self.constraints = ConstraintSolver(
                 model, work, launch, classical=self.classical, kappa=options.penalty, deflate=deflate
             )
@@ -115,10 +124,11 @@ class NewtonLoop:
             launch,
             self.constraints,
             viscous=inertia,
-            operator=options.operator,
+            operator="matrix" if direct and options.operator == "auto" else options.operator,
             assembled=options.preconditioner != "block-jacobi",
         )
-        self.preconditioner = make(options.preconditioner, model, work, launch, self.residual)
+        self.direct = Direct(model, work, launch, self.residual) if direct else None
+        self.preconditioner = self.direct or make(options.preconditioner, model, work, launch, self.residual)
         self.pcg = PCG(
             model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
         )

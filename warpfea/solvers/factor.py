@@ -1,0 +1,206 @@
+"""Sparse factorisations of H on the free components: SuperLU on the host, cuDSS on the GPU."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+import warp as wp
+
+from ..errors import ModelError
+
+if TYPE_CHECKING:
+    from ..model import Model
+
+__all__ = ["CuDSS", "Factors", "FreeMatrix", "Singular", "SuperLU", "make_factors"]
+
+PIVOT = 1e-3
+"""A diagonal pivot is taken where it is at least so large against its column, scaled to a unit diagonal."""
+
+
+class Singular(Exception):
+    """A matrix can't be factorised."""
+
+
+@dataclass(eq=False)
+class FreeMatrix:
+    """The free components of a symmetric matrix of 3x3 blocks, as CSR and CSC alike.
+
+    Attributes:
+        free: (n,) components, 3 slot + axis, in the order of rows.
+        start, index: of the rows.
+        take: (m,) where each entry is in the blocks, flattened.
+        row: (m,) row of each entry; diagonal: (n,) entries.
+    """
+
+    free: np.ndarray
+    start: np.ndarray
+    index: np.ndarray
+    take: np.ndarray
+    row: np.ndarray
+    diagonal: np.ndarray
+
+    @classmethod
+    def of(cls, graph: sp.csr_matrix, free: np.ndarray, *, ordered: bool) -> FreeMatrix:
+        """From the pattern of slots and the (slots, 3) mask of free components; `ordered`: by minimum degree."""
+        count = len(graph.indices)
+        place = np.arange(1.0, 9 * count + 1).reshape(count, 3, 3)
+        n = 3 * graph.shape[0]
+        whole = sp.bsr_matrix((place, graph.indices, graph.indptr), shape=(n, n)).tocsr()
+        chosen = np.flatnonzero(free.ravel())
+        matrix = whole[chosen][:, chosen].tocsr()
+        if ordered:
+            order = minimum_degree(matrix)
+            chosen, matrix = chosen[order], matrix[order][:, order].tocsr()
+        matrix.sort_indices()
+        row = np.repeat(np.arange(len(chosen)), np.diff(matrix.indptr))
+        return cls(
+            free=chosen,
+            start=matrix.indptr.astype(np.int32),
+            index=matrix.indices.astype(np.int32),
+            take=matrix.data.astype(np.int64) - 1,
+            row=row,
+            diagonal=np.flatnonzero(row == matrix.indices),
+        )
+
+
+def minimum_degree(pattern: sp.csr_matrix) -> np.ndarray:
+    """SuperLU's minimum degree order of a symmetric pattern, by way of an incomplete factorisation that drops all."""
+    n = pattern.shape[0]
+    dominant = sp.csc_matrix((np.full(len(pattern.data), -1e-6), pattern.indices, pattern.indptr), pattern.shape)
+    dominant = (dominant + sp.identity(n)).tocsc()
+    options = {"SymmetricMode": True}
+    lu = spla.spilu(
+        dominant, drop_tol=1.0, fill_factor=1.0, diag_pivot_thresh=0.0, permc_spec="MMD_AT_PLUS_A", options=options
+    )
+    return np.argsort(lu.perm_c)
+
+
+class Factors(Protocol):
+    """Factors of the matrices of several worlds."""
+
+    def factorise(self, values: wp.array, world: int) -> None:
+        """Factorise the blocks of a world, `values` being [world, entry]. Raises Singular."""
+
+    def solve(self, r: wp.array, z: wp.array, world: int) -> float:
+        """z = A^-1 r in a world, 0 on prescribed components; returns r.z, which may be nan."""
+
+
+class SuperLU:
+    """SuperLU by SciPy; matrix and vectors of a GPU are copied to the host and back.
+
+    The matrix is scaled to a unit diagonal. Its order is found once, from the pattern, so that a run that is resumed
+    does the same arithmetic.
+    """
+
+    def __init__(self, model: Model, graph: sp.csr_matrix) -> None:
+        if "direct order" not in model.cache:
+            model.cache["direct order"] = FreeMatrix.of(graph, model.free_host, ordered=True)
+        self.matrix: FreeMatrix = model.cache["direct order"]
+        self.factors: dict[int, tuple[Any, np.ndarray]] = {}
+        self.size, self.dtype = model.slots, np.dtype(model.dtype)
+
+    def factorise(self, values: wp.array, world: int) -> None:
+        """See Factors."""
+        m = self.matrix
+        data = values[world].numpy().reshape(-1)[m.take].astype(float)
+        diagonal = np.abs(data[m.diagonal])
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        data *= scale[m.row] * scale[m.index]
+        self.factors.pop(world, None)
+        if not np.isfinite(data).all():
+            raise Singular
+        matrix = sp.csc_matrix((data, m.index, m.start), shape=(len(m.free),) * 2)
+        try:
+            lu = spla.splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=PIVOT, options={"SymmetricMode": True})
+        except RuntimeError as error:
+            if "singular" not in str(error):
+                raise
+            raise Singular from error
+        self.factors[world] = lu, scale
+
+    def solve(self, r: wp.array, z: wp.array, world: int) -> float:
+        """See Factors."""
+        free = self.matrix.free
+        lu, scale = self.factors[world]
+        b = r[world].numpy().reshape(-1)[free].astype(float)
+        x = scale * lu.solve(scale * b)
+        out = np.zeros(3 * self.size)
+        out[free] = x
+        z[world].assign(out.reshape(-1, 3).astype(self.dtype))
+        return float(b @ x)
+
+
+class CuDSS:
+    """cuDSS by nvmath-python, matrix and vectors staying on the device as CuPy arrays. It has not been run yet."""
+
+    def __init__(self, model: Model, graph: sp.csr_matrix) -> None:
+        import cupy
+
+        self.device, self.cupy = model.device, cupy
+        self.matrix = FreeMatrix.of(graph, model.free_host, ordered=False)
+        with cupy.cuda.Device(self.device.ordinal):
+            self.take, self.free = cupy.asarray(self.matrix.take), cupy.asarray(self.matrix.free)
+        self.solvers: dict[int, Any] = {}
+
+    def _make(self, data: Any) -> Any:
+        """A solver that keeps `data` as the values of its matrix, and a right side."""
+        import cupyx.scipy.sparse as csp
+        from nvmath.sparse.advanced import DirectSolver, DirectSolverMatrixType, DirectSolverOptions
+
+        m, cp = self.matrix, self.cupy
+        n = len(m.free)
+        a = csp.csr_matrix((data, cp.asarray(m.index), cp.asarray(m.start)), shape=(n, n))
+        b = cp.zeros(n)
+        solver = DirectSolver(a, b, options=DirectSolverOptions(sparse_system_type=DirectSolverMatrixType.SYMMETRIC))
+        solver.plan()
+        return solver, a, b
+
+    def factorise(self, values: wp.array, world: int) -> None:
+        """See Factors."""
+        cp = self.cupy
+        wp.synchronize_device(self.device)
+        with cp.cuda.Device(self.device.ordinal):
+            data = cp.asarray(values)[world].reshape(-1)[self.take].astype(cp.float64)
+            if not bool(cp.isfinite(data).all()):
+                raise Singular
+            if world not in self.solvers:
+                self.solvers[world] = self._make(data)
+            solver, a, _ = self.solvers[world]
+            a.data[:] = data
+            solver.factorize()
+
+    def solve(self, r: wp.array, z: wp.array, world: int) -> float:
+        """See Factors."""
+        cp = self.cupy
+        wp.synchronize_device(self.device)
+        with cp.cuda.Device(self.device.ordinal):
+            solver, _, b = self.solvers[world]
+            b[:] = cp.asarray(r)[world].reshape(-1)[self.free]
+            x = solver.solve()
+            out = cp.asarray(z)[world].reshape(-1)
+            out[:] = 0.0
+            out[self.free] = x
+            return float(b @ x)
+
+
+def make_factors(model: Model, graph: sp.csr_matrix) -> Factors:
+    """cuDSS on a GPU where it is installed, else SuperLU, with a warning on a GPU."""
+    if not model.free_host.any():
+        raise ModelError("linear='direct': every component of the model is prescribed, there is nothing to solve for")
+    if not model.device.is_cuda:
+        return SuperLU(model, graph)
+    missing = [name for name in ("nvmath", "cupy") if importlib.util.find_spec(name) is None]
+    if not missing:
+        return CuDSS(model, graph)
+    warnings.warn(
+        f"linear='direct' on {model.device}: {' and '.join(missing)} not found, so SuperLU solves on the host; "
+        "pip install 'warpfea[cudss]' to stay on the GPU",
+        stacklevel=2,
+    )
+    return SuperLU(model, graph)
