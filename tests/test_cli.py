@@ -266,6 +266,7 @@ def test_bench_measures_time_and_error(folder, capfd):
     assert row["tip_error"] < 1e-6
     assert row["residual"] < 1e-7
     assert row["ms_per_step"] > 0
+    assert row["linear"] == "pcg"
 
 
 @pytest.mark.parametrize("command", [[], ["run"], ["scenes"], ["info"], ["render"], ["bench"]])

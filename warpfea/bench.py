@@ -7,6 +7,7 @@ mesh and steps with a tolerance 100 times tighter in float64, over the largest t
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import pathlib
 import platform
@@ -15,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import time as clock
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -39,6 +41,7 @@ class Row:
 
     problem: str
     dtype: str
+    linear: str
     unknowns: int
     elements: int
     ms_per_step: float
@@ -52,10 +55,12 @@ class Row:
     compile_s: float
 
 
-def run_once(model: Model, *, dt: float, steps: int, tol: float | None) -> tuple[Simulation, list[float], float]:
+def run_once(
+    model: Model, *, dt: float, steps: int, tol: float | None, linear: str = "pcg"
+) -> tuple[Simulation, list[float], float]:
     """Simulate from rest: the simulation, seconds of each step, seconds until it was ready."""
     began = clock.perf_counter()
-    sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol, max_pcg=20000), ledger=False)
+    sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol, max_pcg=20000, linear=linear), ledger=False)
     ready = clock.perf_counter() - began
     times = []
     for _ in range(steps):
@@ -81,23 +86,24 @@ def measure(
     dt: float,
     tol: float | None,
     with_reference: bool,
+    linear: Sequence[str] = ("pcg",),
 ) -> list[Row]:
-    """Rows of one mesh, one per precision."""
+    """Rows of one mesh, one per precision and linear solver."""
     builder = problem.build(size)
     reference = None
     if with_reference:
         tight = NewtonPCG(tol=tol).tolerance("float64") / TIGHTER
         reference = tip_of(run_once(builder.finalize(device=device), dt=dt, steps=steps, tol=tight)[0], problem.axis)
     rows = []
-    for dtype in dtypes:
+    for dtype, solver in itertools.product(dtypes, linear):
         began = clock.perf_counter()
         model = builder.finalize(device=device, dtype=dtype)
         setup = clock.perf_counter() - began
         times: list[float] = []
-        sim, first, ready = run_once(model, dt=dt, steps=steps, tol=tol)
+        sim, first, ready = run_once(model, dt=dt, steps=steps, tol=tol, linear=solver)
         for k in range(repeat):
             if k:
-                _, first, _ = run_once(model, dt=dt, steps=steps, tol=tol)
+                _, first, _ = run_once(model, dt=dt, steps=steps, tol=tol, linear=solver)
             times += first[min(WARM_UP, steps - 1) :]
         tip = tip_of(sim, problem.axis)
         error = None if reference is None else float(np.abs(tip - reference).max() / np.abs(reference).max())
@@ -106,6 +112,7 @@ def measure(
             Row(
                 problem=problem.name,
                 dtype=dtype,
+                linear=solver,
                 unknowns=info["unknowns"],
                 elements=info["elements"],
                 ms_per_step=1e3 * statistics.median(times),
@@ -139,6 +146,7 @@ def bench(options: argparse.Namespace) -> int:
     settings: dict[str, Any] = {
         "problems": {p.name: list(options.unknowns or p.defaults) for p in problems},
         "dtypes": options.dtype or ["float64", "float32"],
+        "linear": options.linear or ["pcg"],
         "steps": options.steps,
         "repeat": options.repeat,
         "dt": options.dt,
@@ -161,6 +169,7 @@ def bench(options: argparse.Namespace) -> int:
                 dt=options.dt,
                 tol=options.tol,
                 with_reference=wanted <= settings["reference_up_to"],
+                linear=settings["linear"],
             )
             rows += found
             for row in found:
@@ -180,7 +189,7 @@ def bench(options: argparse.Namespace) -> int:
 
 
 HEADER = (
-    f"{'problem':8} {'dtype':8} {'unknowns':>9} {'elements':>9} {'ms/step':>10} {'Newton':>7} {'PCG':>7} "
+    f"{'problem':8} {'dtype':8} {'linear':6} {'unknowns':>9} {'elements':>9} {'ms/step':>10} {'Newton':>7} {'PCG':>7} "
     f"{'B/unknown':>9} {'residual':>9} {'tip, m':>13} {'tip error':>9} {'set-up, s':>9} {'compile, s':>10}"
 )
 
@@ -188,8 +197,8 @@ HEADER = (
 def _line(r: Row) -> str:
     error = "-" if r.tip_error is None else f"{r.tip_error:.1e}"
     return (
-        f"{r.problem:8} {r.dtype:8} {r.unknowns:9d} {r.elements:9d} {r.ms_per_step:10.2f} {r.newton_per_step:7.1f} "
-        f"{r.pcg_per_step:7.0f} {r.bytes_per_unknown:9.0f} {r.residual:9.1e} {r.tip:13.6e} {error:>9} "
+        f"{r.problem:8} {r.dtype:8} {r.linear:6} {r.unknowns:9d} {r.elements:9d} {r.ms_per_step:10.2f} "
+        f"{r.newton_per_step:7.1f} {r.pcg_per_step:7.0f} {r.bytes_per_unknown:9.0f} {r.residual:9.1e} {r.tip:13.6e} {error:>9} "
         f"{r.setup_s:9.1f} {r.compile_s:10.1f}"
     )
 

@@ -320,6 +320,9 @@ def _add_bench(commands: Any) -> None:
     )
     to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     to.add_argument("--dtype", action="append", choices=("float64", "float32"), help="may be repeated; default both")
+    to.add_argument(
+        "--linear", action="append", choices=("pcg", "direct"), help="linear solver; may be repeated; default pcg"
+    )
     to.add_argument("--steps", type=count, default=10, metavar="N", help="steps that are simulated (default 10)")
     to.add_argument("--repeat", type=count, default=3, metavar="N", help="runs, of which the median counts (default 3)")
     to.add_argument("--dt", type=positive, default=1e-3, metavar="S", help="step, s (default 1e-3)")
