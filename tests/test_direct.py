@@ -113,13 +113,13 @@ def test_statics_of_a_slender_beam(data):
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     law = wf.SVK(E=2e11, nu=0.3, density=7800.0)
     beam = b.add_beam(
-        [(0, 0, 0), (10, 0, 0)], elements=10, section=wf.Rectangle(0.01, 0.01), normal=(0, 0, 1), material=law
+        [(0, 0, 0), (10, 0, 0)], elements=4, section=wf.Rectangle(0.01, 0.01), normal=(0, 0, 1), material=law
     )
     b.clamp(beam.start)
-    b.add_point_load(beam.end, (0, 0, -2.0))
+    b.add_point_load(beam.end, (0, 0, -0.1))
     model = b.finalize(device="cpu")
     expected, got = (
-        wf.solve_static(model, load_steps=4, solver=solver(linear, max_newton=50)) for linear in ("pcg", "direct")
+        wf.solve_static(model, load_steps=1, solver=solver(linear, max_newton=200)) for linear in ("pcg", "direct")
     )
     assert data.error(got.displacements(beam), expected.displacements(beam)) < 1e-9
 

@@ -198,8 +198,8 @@ def _line(r: Row) -> str:
     error = "-" if r.tip_error is None else f"{r.tip_error:.1e}"
     return (
         f"{r.problem:8} {r.dtype:8} {r.linear:6} {r.unknowns:9d} {r.elements:9d} {r.ms_per_step:10.2f} "
-        f"{r.newton_per_step:7.1f} {r.pcg_per_step:7.0f} {r.bytes_per_unknown:9.0f} {r.residual:9.1e} {r.tip:13.6e} {error:>9} "
-        f"{r.setup_s:9.1f} {r.compile_s:10.1f}"
+        f"{r.newton_per_step:7.1f} {r.pcg_per_step:7.0f} {r.bytes_per_unknown:9.0f} "
+        f"{r.residual:9.1e} {r.tip:13.6e} {error:>9} {r.setup_s:9.1f} {r.compile_s:10.1f}"
     )
 
 
