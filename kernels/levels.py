@@ -50,7 +50,8 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     f64 = wp.float64
     Level = level_struct(dtype)
     Pattern = pattern_struct()
-    sync, lane_sum = lane_functions(dtype).sync, lane_functions(dtype).lane_sum
+    lanes_of = lane_functions(dtype)
+    sync, lane_sum, row_sum = lanes_of.sync, lanes_of.lane_sum, lanes_of.row_sum
     # a pivot below this share of its diagonal is rounding: the functions are dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[dtype]
     module = kernel_module(f"levels_{dtype}")
@@ -228,23 +229,29 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         r: wp.array2d(dtype=vec3),
         diagonal: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
+        warp: int,
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z += P x; rows: r.z and r.D^-1 r."""
+        """z += P x; rows: r.z and r.D^-1 r per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        a = r[world, slot]
-        s = z[world, slot]
-        if correct != 0:
-            s += wp.cw_mul(prolonged(level, x, world, slot), free[slot])
-            z[world, slot] = s
-        D = diagonal[world, slot]
-        rows[0, world, slot] = f64(wp.dot(a, s))
-        rows[1, world, slot] = (
-            f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
-        )
+        rz = f64(0.0)
+        rr = f64(0.0)
+        if slot < z.shape[1]:
+            a = r[world, slot]
+            s = z[world, slot]
+            if correct != 0:
+                s += wp.cw_mul(prolonged(level, x, world, slot), free[slot])
+                z[world, slot] = s
+            rz = f64(wp.dot(a, s))
+            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
+        rz = row_sum(rz, warp)
+        rr = row_sum(rr, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = rz
+            rows[1, world, slot / warp] = rr
 
     @wp.kernel(module=module)
     def chebyshev(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..model import Model
     from ..workspace import Workspace
 
-__all__ = ["Assembled", "Pattern", "transposed_entries"]
+__all__ = ["Assembled", "Pattern", "make_pattern", "shaped"]
 
 
 def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
@@ -84,8 +84,8 @@ class Assembled:
         self.pattern, self.mass, self.couplings, self.coupled = model.cache["matrix"]
         self.kernels = [assembly_kernels(model.dtype, block.slots) for block in model.blocks]
         self.common = block_kernels(model.dtype)
-        S = max(block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
-        self.scratch = work.array("element matrices", (model.worlds, S), model.types.mat33)
+        S = max(3 * block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
+        self.scratch = work.array("element matrices", (model.worlds, S), model.types.vec3)
 
     def _make_tables(self) -> tuple[Pattern, wp.array, Any, int]:
         """Pattern, masses of its upper entries, and what constraints add."""
@@ -172,10 +172,10 @@ class Assembled:
         m, w, launch = self.model, self.work, self.launch
         mass_factor, dq_dv = factors
         for k, (block, elements, kernels) in enumerate(zip(m.blocks, self.element_kernels, self.kernels)):
-            pairs = block.slots * (block.slots + 1) // 2
-            matrix = _shaped(self.scratch, (m.worlds, pairs, block.count))
+            columns = 3 * block.slots * (block.slots + 1) // 2
+            matrix = shaped(self.scratch, (m.worlds, columns, block.count))
             args = [block.data, u, w.v, w.history, dq_dv, int(projected), active, matrix]
-            launch(elements.element_matrix, (m.worlds, block.slots, block.count), args)
+            launch(elements.element_matrix, (m.worlds, 3 * block.slots, block.count), args)
             args = [m.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count, matrix]
             args += [self.mass, int(k == 0), mass_factor, dq_dv, active, out]
             launch(kernels.add_elements, (m.worlds, len(self.pattern.upper)), args)
@@ -195,7 +195,7 @@ class Assembled:
         return sp.bsr_matrix((data, graph.indices, graph.indptr), shape=(n, n)).tocsr()
 
 
-def _shaped(array: wp.array, shape: tuple[int, ...]) -> wp.array:
+def shaped(array: wp.array, shape: tuple[int, ...]) -> wp.array:
     """The beginning of an array under another shape."""
     out: Any = wp.array(ptr=array.ptr, dtype=array.dtype, shape=shape, device=array.device)
     out._owner = array

@@ -22,7 +22,7 @@ GROUP_SLOTS = 64
 """Slots of a group whose affine motions are the coarse space: 16 unknowns of a level to one of the next."""
 WHOLE_SLOTS = 160
 """A model of up to so many slots is inverted as one dense matrix: it needs no levels."""
-BOTTOM_SLOTS = {"cpu": 160, "cuda": 1024}
+BOTTOM_SLOTS = {"cpu": 160, "cuda": 1280}
 """So is a coarse level; on CUDA it costs less than the launches of more levels would."""
 MAX_LEVELS = 12
 

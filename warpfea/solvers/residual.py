@@ -11,7 +11,7 @@ from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
 from ..launch import labelled
-from .assembled import Assembled
+from .assembled import Assembled, shaped
 
 if TYPE_CHECKING:
     from ..launch import Launcher
@@ -164,7 +164,7 @@ class Residual:
 
     @labelled("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
-        """out = H p at the iterate, and p.Hp per slot in rows[0]."""
+        """out = H p at the iterate, and p.Hp in parts in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
         if self.massive and not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
@@ -181,16 +181,20 @@ class Residual:
         if self.constraints:
             self.constraints.product(p, active)
         rest = [start, entry, w.pushed_tangent, p, w.step.mass_factor, w.step.dq_dv, active, self.con, w.multipliers]
-        rest += [out, w.rows]
+        rest.append(w.warp)
+        padded = (m.worlds, launch.padded(m.slots))
         if self.by_matrix:
             assert self.assembled is not None
             pattern = self.assembled.pattern
             lanes = launch.lanes(pattern.width)
-            args = [m.topology, pattern.data, self.matrix, lanes, *rest]
-            launch(self.gather.matrix_product, (m.worlds, launch.padded(m.slots * lanes)), args)
+            threads = launch.padded(m.slots * lanes)
+            self.curvature_rows = shaped(w.rows, (1, m.worlds, threads // w.warp))
+            args = [m.topology, pattern.data, self.matrix, lanes, *rest, out, self.curvature_rows]
+            launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:
             kernel = self.gather.massive_product if self.massive else self.gather.product
-            launch(kernel, self.dim, [m.topology, w.contribution, *rest])
+            self.curvature_rows = w.warp_rows
+            launch(kernel, padded, [m.topology, w.contribution, *rest, out, w.warp_rows])
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""

@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 __all__ = ["TwoLevel"]
 
-CHEBYSHEV_STEPS = 5
+CHEBYSHEV_STEPS = 3
 LARGEST = 3.5
 """Assumed largest eigenvalue of a preconditioned coarse matrix (2.7 to 3.5 were measured)."""
-RATIO = 16.0
+RATIO = 8.0
 """The largest over the smallest eigenvalue that the Chebyshev steps are made for."""
 REBUILD_COST = 40.0
 """Iterations that making the preconditioner costs."""
@@ -185,12 +185,13 @@ class TwoLevel:
             coarse, correct = z, 0
         else:
             coarse, correct = self._smooth(0, r, z, active), 1
-        args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, z, w.rows]
-        launch(k.add_coarse, self.dim, args)
+        args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
+        dim = (m.worlds, launch.padded(m.slots))
+        launch(k.add_coarse, dim, args)
         if self.tied:
             assert self.residual.constraints is not None
-            args = [w.inverse, r, w.diagonal, active, w.Hp, w.spare_rows]
-            launch(self.jacobi, self.dim, args)
+            args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
+            launch(self.jacobi, dim, args)
             self.residual.constraints.precondition(r, w.Hp, active, into=z)
 
     # application
