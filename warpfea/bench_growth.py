@@ -8,15 +8,17 @@ from the first size to the last. A step is not halved: one that does not converg
 from __future__ import annotations
 
 import argparse
+import gc
 import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
 
-from .bench import check_sizes, run_once, solver, write
+from .bench import check_sizes, solver, write
 from .bench_problems import DENSITY, PROBLEMS, Problem
 from .errors import ConvergenceError
 from .materials import SVK
+from .simulation import Simulation
 
 __all__ = ["GrowthRow", "growth"]
 
@@ -61,13 +63,18 @@ class _Cell:
 
 
 def measure(problem: Problem, sizes: list[int], *, device: Any) -> list[GrowthRow]:
-    """Rows of a problem, one per E, dt and nu; a model per size, E and nu."""
+    """Rows of a problem, one per E, dt and nu; a model and a simulation per size, E and nu."""
     cells: dict[tuple[float, float, float], list[_Cell]] = {}
     for wanted, E, nu in itertools.product(sizes, MODULI, RATIOS):
         law = SVK(E=E, nu=nu, density=DENSITY)
         model = problem.build(problem.size_for(wanted), law=law, traction=LOAD * E).finalize(device=device)
+        sim = Simulation(model, dt=STEPS[0], solver=solver(TOL, **LIMITS), ledger=False)
         for dt in STEPS:
-            cells.setdefault((E, dt, nu), []).append(_step(model, dt))
+            sim.reset()
+            sim.dt = dt
+            cells.setdefault((E, dt, nu), []).append(_step(sim))
+        del sim, model
+        gc.collect()  # a model refers to itself: its memory is wanted for the next
     rows = []
     for (E, dt, nu), row in sorted(cells.items()):
         first, last = row[0].pcg, row[-1].pcg
@@ -87,13 +94,13 @@ def measure(problem: Problem, sizes: list[int], *, device: Any) -> list[GrowthRo
     return rows
 
 
-def _step(model: Any, dt: float) -> _Cell:
-    unknowns = model.info()["unknowns"]
+def _step(sim: Simulation) -> _Cell:
+    unknowns = sim.model.info()["unknowns"]
     try:
-        sim = run_once(model, dt=dt, steps=1, solver=solver(TOL, **LIMITS)).sim
+        report = sim.step()
     except ConvergenceError as error:
         return _Cell(unknowns, f"ConvergenceError: {error}", None, None)
-    return _Cell(unknowns, "converged", int(sim.totals["newton"][0]), int(sim.totals["pcg"][0]))
+    return _Cell(unknowns, "converged", int(report.newton[0]), int(report.pcg[0]))
 
 
 def growth(options: argparse.Namespace) -> None:
