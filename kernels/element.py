@@ -11,6 +11,7 @@ import types as _types
 import warp as wp
 
 from . import materials
+from .lanes import lane_functions
 from .types import kernel_module, precision
 
 __all__ = ["block_struct", "element_kernels"]
@@ -67,6 +68,7 @@ def element_kernels(
     m = materials.law(law, dtype)
     viscous = materials.svk(dtype)
     Block = block_struct(dtype)
+    lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
     Local = wp.types.matrix(shape=(slots, 3), dtype=T)
@@ -209,15 +211,21 @@ def element_kernels(
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
+        lanes: int,
         contribution: wp.array2d(dtype=vec3),
         energy: wp.array3d(dtype=wp.float64),
         min_J: wp.array(dtype=wp.float64),
         domain_J: wp.array(dtype=wp.float64),
     ):
-        """Internal force contributions, Eqs. (32) and (70), strain energy and viscous potential of each element."""
-        world, elem = wp.tid()
+        """Internal force contributions, Eqs. (32) and (70), strain energy and viscous potential of each element.
+
+        So many lanes share the points of an element.
+        """
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        lane = index % lanes
+        elem = wp.min(index / lanes, block.count - 1)
         c = coefficients(block, world, elem)
         U = load(block, u, world, elem)
         f = Local()
@@ -230,7 +238,7 @@ def element_kernels(
         if wp.static(damping == "rate"):
             V = load(block, v, world, elem)
         dq = T(dq_dv[world])
-        for q in range(block.gradient.shape[0]):
+        for q in range(lane, block.gradient.shape[0], lanes):
             G = gradient_of(block, U, q, elem)
             w = weight_of(block, q, elem)
             J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
@@ -244,15 +252,20 @@ def element_kernels(
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
             f = scatter(block, f, P, q, elem)
         for i in range(NS):
-            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
-        energy[0, world, block.element_offset + elem] = wp.float64(psi)
-        energy[1, world, block.element_offset + elem] = wp.float64(psi_v)
+            f[i] = lane_sum(f[i], lanes)
+        stored = row_sum(wp.float64(psi), lanes)
+        lost = row_sum(wp.float64(psi_v), lanes)
         low = wp.float64(J_low)
         if low < min_J[world]:
             wp.atomic_min(min_J, world, low)
         if wp.static(needs_J):
             if low < domain_J[world]:
                 wp.atomic_min(domain_J, world, low)
+        if lane == 0 and index < block.count * lanes:
+            for i in range(NS):
+                contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+            energy[0, world, block.element_offset + elem] = stored
+            energy[1, world, block.element_offset + elem] = lost
 
     @wp.func
     def tangent_force(

@@ -104,14 +104,15 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
+        lanes: int,
         contribution: wp.array2d(dtype=vec3),
         energy: wp.array3d(dtype=wp.float64),
         min_J: wp.array(dtype=wp.float64),
         domain_J: wp.array(dtype=wp.float64),
     ):
-        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), and the energy e.s/2."""
+        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), and the energy e.s/2; one lane per element."""
         world, elem = wp.tid()
-        if active[world] == 0:
+        if active[world] == 0 or elem >= block.count:
             return
         U = load(block, u, world, elem)
         e = shears(block, U, elem)

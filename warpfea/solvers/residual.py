@@ -23,6 +23,8 @@ __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
 """Slots per element up to which H p from the elements is cheaper than from their matrix."""
+MANY_POINTS = 8
+"""Points of an element from which lanes share them."""
 
 
 class Reducer:
@@ -68,7 +70,8 @@ class Residual:
         self.massive = all(block.massive for block in model.blocks)
         # elements with many points per slot cost more than the matrix that they make
         many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
-        self.by_matrix = operator == "matrix" or (operator == "auto" and many)
+        # (on one core assembly costs more than it saves)
+        self.by_matrix = operator == "matrix" or (operator == "auto" and many and model.device.is_cuda)
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
             self.assembled = Assembled(model, work, launch, self.block_kernels)
@@ -111,8 +114,10 @@ class Residual:
         launch(self.newton.reset_min_J, m.worlds, [w.newton, active])
         launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         for block, kernels in zip(m.blocks, self.block_kernels):
-            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, w.contribution, w.energy_rows]
-            launch(kernels.internal_force, (m.worlds, block.count), [*args, w.newton.min_J, w.newton.domain_J])
+            lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1
+            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, lanes, w.contribution, w.energy_rows]
+            dim = (m.worlds, launch.padded(block.count * lanes))
+            launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
         self.push(active)
         if hold:
             self.hold_pushed(active)
