@@ -18,7 +18,6 @@ __all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
 TILE_SLOTS = 16
 TILE = 3 * TILE_SLOTS
 LANES = 64
-ROW_TILE = 128
 
 
 @functools.cache
@@ -52,6 +51,7 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     Pattern = pattern_struct()
     lanes_of = lane_functions(dtype)
     sync, lane_sum, row_sum = lanes_of.sync, lanes_of.lane_sum, lanes_of.row_sum
+    scalar_sum = lanes_of.scalar_sum
     # a pivot below this share of its diagonal is rounding: the functions are dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[dtype]
     module = kernel_module(f"levels_{dtype}")
@@ -403,20 +403,23 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def apply_dense(
         matrix: wp.array3d(dtype=T),
-        r: wp.array3d(dtype=T),
+        lanes: int,
+        r: wp.array2d(dtype=T),
         active: wp.array(dtype=wp.int32),
         x: wp.array2d(dtype=T),
     ):
-        """x = A^-1 r; one block does one row."""
-        world, row = wp.tid()
+        """x = A^-1 r, so many lanes per row."""
+        world, index = wp.tid()
         if active[world] == 0:
             return
-        acc = wp.tile_zeros(shape=(1, 1, ROW_TILE), dtype=T)
-        for k in range((r.shape[2] + ROW_TILE - 1) // ROW_TILE):
-            a = wp.tile_load(matrix, shape=(1, 1, ROW_TILE), offset=(world, row, k * ROW_TILE))
-            b = wp.tile_load(r, shape=(1, 1, ROW_TILE), offset=(world, 0, k * ROW_TILE))
-            acc += wp.tile_map(wp.mul, a, b)
-        x[world, row] = wp.tile_extract(wp.tile_sum(acc), 0)
+        lane = index % lanes
+        row = wp.min(index / lanes, x.shape[1] - 1)
+        s = T(0.0)
+        for k in range(lane, r.shape[1], lanes):
+            s += matrix[world, row, k] * r[world, k]
+        s = scalar_sum(s, lanes)
+        if lane == 0:
+            x[world, row] = s
 
     return _types.SimpleNamespace(
         module=module,

@@ -198,9 +198,10 @@ class TwoLevel:
 
     def _apply_dense(self, depth: int, r: wp.array, x: wp.array, active: wp.array) -> None:
         n, B = self.levels[depth].slots, self.model.worlds
-        flat_r = _flat(r, self.model.types.T, (B, 1, 3 * n))
-        flat_x = _flat(x, self.model.types.T, (B, 3 * n))
-        self.launch.tiled(self.kernels.apply_dense, (B, 3 * n), [self.arrays[depth].matrix, flat_r, active, flat_x])
+        flat_r, flat_x = (_flat(a, self.model.types.T, (B, 3 * n)) for a in (r, x))
+        lanes = self.launch.lanes(3 * n)
+        args = [self.arrays[depth].matrix, lanes, flat_r, active, flat_x]
+        self.launch(self.kernels.apply_dense, (B, self.launch.padded(3 * n * lanes)), args)
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = tiles times r; returns what is to be prolonged."""
