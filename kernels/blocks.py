@@ -9,7 +9,7 @@ import types as _types
 import warp as wp
 
 from .gather import inverse_function, pattern_struct, topology_struct
-from .types import kernel_module, precision
+from .types import SMALL, kernel_module, precision
 
 __all__ = ["assembly_kernels", "block_kernels", "coupling_struct"]
 
@@ -38,7 +38,7 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     NS = slots
-    module = kernel_module(f"assembly_{dtype}_{slots}")
+    module = kernel_module(f"assembly_{dtype}_{slots}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
     def add_elements(
@@ -110,8 +110,8 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     Topology = topology_struct(dtype)
     Pattern, Couplings = pattern_struct(), coupling_struct()
     free_inverse = inverse_function(dtype)
-    module = kernel_module(f"blocks_{dtype}")
-    coupling_module = kernel_module(f"couplings_{dtype}")
+    module = kernel_module(f"blocks_{dtype}", max_unroll=SMALL)
+    coupling_module = kernel_module(f"couplings_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=coupling_module)
     def add_constraints(

@@ -410,12 +410,14 @@ def element_kernels(
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         projected: int,
+        add: int,
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=vec3),
     ):
         """K of each element as the columns of the 3x3 blocks of slots a <= b, row by row; one thread does one column.
 
-        `projected`: without what can make it indefinite at a point, compression and stress of the viscosity.
+        `projected`: without what can make it indefinite at a point, compression and stress of the viscosity; `add`: to
+        what is there, of another part of the energy.
         """
         world, column, elem = wp.tid()
         if active[world] == 0:
@@ -460,6 +462,8 @@ def element_kernels(
         for a in range(NS):
             if a <= b:
                 pair = a * NS - (a * (a - 1)) / 2 + b - a
+                if add != 0:
+                    out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
                 matrix[world, 3 * pair + axis, elem] = out[a]
 
     @wp.kernel(module=history_module)

@@ -10,7 +10,7 @@ import warp as wp
 
 from .constraints import constraint_struct, multiplier_struct
 from .lanes import lane_functions
-from .types import kernel_module, precision
+from .types import SMALL, kernel_module, precision
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels", "inverse_function", "pattern_struct", "topology_struct"]
 
@@ -107,9 +107,9 @@ def gather_kernels(
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     free_inverse = inverse_function(dtype)
     name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
-    module = kernel_module(f"gather_{name}")
-    matrix_module = kernel_module(f"matrix_product_{name}")
-    massive_module = kernel_module(f"massive_product_{name}")
+    module = kernel_module(f"gather_{name}", max_unroll=SMALL)
+    matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
+    massive_module = kernel_module(f"massive_product_{name}", max_unroll=SMALL)
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:

@@ -11,7 +11,7 @@ import warp as wp
 
 from .gather import pattern_struct
 from .lanes import lane_functions
-from .types import kernel_module, precision
+from .types import SMALL, kernel_module, precision
 
 __all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
 
@@ -54,8 +54,8 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     scalar_sum = lanes_of.scalar_sum
     # a pivot below this share of its diagonal is rounding: the functions are dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[dtype]
-    module = kernel_module(f"levels_{dtype}")
-    build_module = kernel_module(f"levels_build_{dtype}")
+    module = kernel_module(f"levels_{dtype}", max_unroll=SMALL)
+    build_module = kernel_module(f"levels_build_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=build_module)
     def fill_tiles(

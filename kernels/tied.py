@@ -201,12 +201,13 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         projected: int,
+        add: int,
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=vec3),
     ):
         """K of each element as the columns of the 3x3 blocks of slots a <= b, row by row; one thread does one column.
 
-        `projected`: without the geometric part.
+        `projected`: without the geometric part; `add`: to what is there, of another part of the energy.
         """
         world, column, elem = wp.tid()
         if active[world] == 0:
@@ -224,7 +225,12 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             change[t] = block.first[t, b, elem] * D[t][axis] + block.second[t, b, elem] * A[t][axis]
         stress = Ties()
         if projected == 0:
-            stress = stresses(block, shears(block, U, elem), world, elem)
+            e = Ties()
+            for t in range(NT):
+                X = block.X_first[t, elem]
+                Y = block.X_second[t, elem]
+                e[t] = wp.dot(X, D[t] - Y) + wp.dot(A[t] - X, D[t])
+            stress = stresses(block, e, world, elem)
         out = Local()
         for t in range(NT):
             first = (t / W) * W
@@ -240,6 +246,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         for a in range(NS):
             if a <= b:
                 pair = a * NS - (a * (a - 1)) / 2 + b - a
+                if add != 0:
+                    out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
                 matrix[world, 3 * pair + axis, elem] = out[a]
 
     return _types.SimpleNamespace(
