@@ -9,7 +9,7 @@ import types as _types
 import warp as wp
 
 from .gather import inverse_function, pattern_struct, topology_struct
-from .types import kernel_module, precision
+from .types import SMALL, kernel_module, precision
 
 __all__ = ["assembly_kernels", "block_kernels", "coupling_struct"]
 
@@ -33,12 +33,12 @@ def coupling_struct():
 def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
     """Assembly from the matrices of elements with so many slots."""
     p = precision(dtype)
-    T, mat33 = p.T, p.mat33
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     NS = slots
-    module = kernel_module(f"assembly_{dtype}_{slots}")
+    module = kernel_module(f"assembly_{dtype}_{slots}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
     def add_elements(
@@ -47,7 +47,7 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         conn: wp.array2d(dtype=wp.int32),
         offset: int,
         count: int,
-        matrix: wp.array3d(dtype=mat33),
+        matrix: wp.array3d(dtype=vec3),
         mass: wp.array(dtype=T),
         first: int,
         mass_factor: wp.array(dtype=f64),
@@ -55,7 +55,7 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=mat33),
     ):
-        """value += (dq/dv) K of a block's elements; `first`: = c_M M + (dq/dv) K.
+        """value += (dq/dv) K of a block's elements, whose matrices come in columns; `first`: = c_M M + (dq/dv) K.
 
         Prescribed components keep their diagonal and nothing else.
         """
@@ -73,10 +73,15 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
                 elem = inside % count
                 for b in range(NS):
                     if conn[b, elem] == column:
+                        low = wp.min(a, b)
+                        k = 3 * (low * NS - (low * (low - 1)) / 2 + wp.abs(a - b))
+                        x = matrix[world, k, elem]
+                        y = matrix[world, k + 1, elem]
+                        z = matrix[world, k + 2, elem]
                         if a <= b:
-                            A += matrix[world, a * NS - (a * (a - 1)) / 2 + b - a, elem]
+                            A += wp.matrix_from_cols(x, y, z)
                         else:
-                            A += wp.transpose(matrix[world, b * NS - (b * (b - 1)) / 2 + a - b, elem])
+                            A += wp.matrix_from_rows(x, y, z)
         A = T(dq_dv[world]) * A
         if first != 0:
             A += T(mass_factor[world]) * mass[index] * wp.identity(n=3, dtype=T)
@@ -105,8 +110,8 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     Topology = topology_struct(dtype)
     Pattern, Couplings = pattern_struct(), coupling_struct()
     free_inverse = inverse_function(dtype)
-    module = kernel_module(f"blocks_{dtype}")
-    coupling_module = kernel_module(f"couplings_{dtype}")
+    module = kernel_module(f"blocks_{dtype}", max_unroll=SMALL)
+    coupling_module = kernel_module(f"couplings_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=coupling_module)
     def add_constraints(

@@ -11,6 +11,7 @@ import types as _types
 import warp as wp
 
 from .constraints import constraint_functions, constraint_struct, multiplier_struct
+from .lanes import lane_functions
 from .types import kernel_module, precision
 
 __all__ = ["deflation_kernels"]
@@ -24,6 +25,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     directional = constraint_functions(dtype).directional
+    row_sum = lane_functions(dtype).row_sum
     module = kernel_module(f"deflation_{dtype}")
 
     @wp.kernel(module=module)
@@ -242,27 +244,33 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         y: wp.array2d(dtype=vec3),
         add: int,
         active: wp.array(dtype=wp.int32),
+        warp: int,
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z = y - D^-1 J^T s where constraints touch a slot, y = D^-1 r, with `add` z += the same; and r.z per slot."""
+        """z = y - D^-1 J^T s where constraints touch a slot, y = D^-1 r, with `add` z += the same; r.z per warp."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        out = z[world, slot]
-        first = con.slot_start[slot]
-        last = con.slot_start[slot + 1]
-        if last > first:
-            s = vec3d()
-            for k in range(first, last):
-                term = con.slot_term[k]
-                s += (con.slot_weight[k] * mul.solved[world, term / 3]) * mul.gradient[world, term]
-            change = y[world, slot] - inverse[world, slot] * vec3(s)
-            if add != 0:
-                change += out
-            out = change
-            z[world, slot] = out
-        rows[0, world, slot] = f64(wp.dot(r[world, slot], out))
+        rz = f64(0.0)
+        if slot < z.shape[1]:
+            out = z[world, slot]
+            first = con.slot_start[slot]
+            last = con.slot_start[slot + 1]
+            if last > first:
+                s = vec3d()
+                for k in range(first, last):
+                    term = con.slot_term[k]
+                    s += (con.slot_weight[k] * mul.solved[world, term / 3]) * mul.gradient[world, term]
+                change = y[world, slot] - inverse[world, slot] * vec3(s)
+                if add != 0:
+                    change += out
+                out = change
+                z[world, slot] = out
+            rz = f64(wp.dot(r[world, slot], out))
+        rz = row_sum(rz, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = rz
 
     return _types.SimpleNamespace(
         module=module,

@@ -8,6 +8,7 @@ import warp as wp
 from .blocks import coupling_struct
 from .constraints import DISTANCE, TURN, constraint_struct, multiplier_struct
 from .gather import pattern_struct, topology_struct
+from .lanes import lane_functions
 from .types import kernel_module, precision
 
 __all__ = ["direct_kernels", "followed_struct"]
@@ -40,6 +41,7 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
         followed_struct(),
     )
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
+    row_sum = lane_functions(dtype).row_sum
     module = kernel_module(f"direct_{dtype}")
 
     @wp.func
@@ -151,18 +153,24 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
         z: wp.array2d(dtype=vec3),
         diagonal: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
+        warp: int,
         rows: wp.array3d(dtype=f64),
     ):
-        """Per slot r.z and r.D^-1 r."""
+        """r.z and r.D^-1 r per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        a = r[world, slot]
-        D = diagonal[world, slot]
-        rows[0, world, slot] = f64(wp.dot(a, z[world, slot]))
-        rows[1, world, slot] = (
-            f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
-        )
+        rz = f64(0.0)
+        rr = f64(0.0)
+        if slot < z.shape[1]:
+            a = r[world, slot]
+            rz = f64(wp.dot(a, z[world, slot]))
+            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
+        rz = row_sum(rz, warp)
+        rr = row_sum(rr, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = rz
+            rows[1, world, slot / warp] = rr
 
     return _types.SimpleNamespace(
         module=module,

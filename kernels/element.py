@@ -11,6 +11,7 @@ import types as _types
 import warp as wp
 
 from . import materials
+from .lanes import lane_functions
 from .types import kernel_module, precision
 
 __all__ = ["block_struct", "element_kernels"]
@@ -67,13 +68,13 @@ def element_kernels(
     m = materials.law(law, dtype)
     viscous = materials.svk(dtype)
     Block = block_struct(dtype)
+    lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
     Local = wp.types.matrix(shape=(slots, 3), dtype=T)
     NS, NQ = slots, points
     needs_J = law not in materials.ANY_J
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
-    vertices = 4
     form = "affine" if affine else "framed" if framed else "table"
     name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
     module = kernel_module(name)
@@ -81,8 +82,8 @@ def element_kernels(
     history_module = kernel_module(f"{name}_history")
     viscous_module = kernel_module(f"{name}_viscous")
     stress_module = kernel_module(f"{name}_stress")
-    matrix_module = kernel_module(f"{name}_matrix")
-    # slots in registers: 2.2 times faster than arrays that loops index; the loop over points stays a loop
+    # slots in registers, not in arrays that loops index; the loops over points stay loops
+    matrix_module = kernel_module(f"{name}_matrix", max_unroll=16)
     massive_module = kernel_module(f"{name}_massive", max_unroll=16)
 
     @wp.func
@@ -190,7 +191,7 @@ def element_kernels(
     def vertex_jacobian(block: Block, U: Local, elem: int) -> T:
         """Smallest J at the element's vertices, where a quadratic field is outside the hull of the points."""
         J = T(1.0e30)
-        for q in range(vertices):
+        for q in range(block.vertex_gradient.shape[0]):
             D = mat33()
             for i in range(NS):
                 if wp.static(affine):
@@ -210,15 +211,21 @@ def element_kernels(
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
+        lanes: int,
         contribution: wp.array2d(dtype=vec3),
         energy: wp.array3d(dtype=wp.float64),
         min_J: wp.array(dtype=wp.float64),
         domain_J: wp.array(dtype=wp.float64),
     ):
-        """Internal force contributions, Eqs. (32) and (70), strain energy and viscous potential of each element."""
-        world, elem = wp.tid()
+        """Internal force contributions, Eqs. (32) and (70), strain energy and viscous potential of each element.
+
+        So many lanes share the points of an element.
+        """
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        lane = index % lanes
+        elem = wp.min(index / lanes, block.count - 1)
         c = coefficients(block, world, elem)
         U = load(block, u, world, elem)
         f = Local()
@@ -231,7 +238,7 @@ def element_kernels(
         if wp.static(damping == "rate"):
             V = load(block, v, world, elem)
         dq = T(dq_dv[world])
-        for q in range(NQ):
+        for q in range(lane, block.gradient.shape[0], lanes):
             G = gradient_of(block, U, q, elem)
             w = weight_of(block, q, elem)
             J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
@@ -245,15 +252,20 @@ def element_kernels(
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
             f = scatter(block, f, P, q, elem)
         for i in range(NS):
-            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
-        energy[0, world, block.element_offset + elem] = wp.float64(psi)
-        energy[1, world, block.element_offset + elem] = wp.float64(psi_v)
+            f[i] = lane_sum(f[i], lanes)
+        stored = row_sum(wp.float64(psi), lanes)
+        lost = row_sum(wp.float64(psi_v), lanes)
         low = wp.float64(J_low)
         if low < min_J[world]:
             wp.atomic_min(min_J, world, low)
         if wp.static(needs_J):
             if low < domain_J[world]:
                 wp.atomic_min(domain_J, world, low)
+        if lane == 0 and index < block.count * lanes:
+            for i in range(NS):
+                contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+            energy[0, world, block.element_offset + elem] = stored
+            energy[1, world, block.element_offset + elem] = lost
 
     @wp.func
     def tangent_force(
@@ -358,7 +370,7 @@ def element_kernels(
         for i in range(NS):
             B = sym6()
             contribution[world, block.contribution_offset + i * block.count + elem] = B
-        for q in range(NQ):
+        for q in range(block.gradient.shape[0]):
             G = gradient_of(block, U, q, elem)
             w = weight_of(block, q, elem)
             for i in range(NS):
@@ -398,67 +410,61 @@ def element_kernels(
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         projected: int,
+        add: int,
         active: wp.array(dtype=wp.int32),
-        matrix: wp.array3d(dtype=mat33),
+        matrix: wp.array3d(dtype=vec3),
     ):
-        """K of each element as the 3x3 blocks of slots a <= b, row by row; one thread does one column of blocks.
+        """K of each element as the columns of the 3x3 blocks of slots a <= b, row by row; one thread does one column.
 
-        `projected`: without what can make it indefinite at a point, compression and stress of the viscosity.
+        `projected`: without what can make it indefinite at a point, compression and stress of the viscosity; `add`: to
+        what is there, of another part of the energy.
         """
-        world, b, elem = wp.tid()
+        world, column, elem = wp.tid()
         if active[world] == 0:
             return
+        b = column / 3
+        axis = column % 3
         c = coefficients(block, world, elem)
         U = load(block, u, world, elem)
         V = Local()
         if wp.static(damping == "rate"):
             V = load(block, v, world, elem)
         dq = T(dq_dv[world])
-        first = Local()
-        second = Local()
-        third = Local()
-        for q in range(NQ):
+        unit = vec3()
+        unit[axis] = T(1.0)
+        out = Local()
+        for q in range(block.gradient.shape[0]):
             G = gradient_of(block, U, q, elem)
-            w = weight_of(block, q, elem)
             local = into_axes(block, G, q, elem)
-            shift = T(0.0)
-            if projected != 0:
-                shift = compression(local, c)
             h = vec3()
             if wp.static(affine):
                 h = wp.transpose(block.J0_inv[elem]) * block.gradient[q, b, 0]
             else:
                 h = block.gradient[q, b, elem]
-            for axis in range(3):
-                unit = vec3()
-                unit[axis] = T(1.0)
-                dG = wp.outer(unit, h)
-                dP = m.increment(local, into_axes(block, dG, q, elem), c)
-                dP = out_of_axes(block, dP, q, elem) + shift * dG
-                if wp.static(damping == "incremental" or damping == "rate"):
-                    F = t.identity() + G
-                    dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[LAMBDA_V] / dq, c[ETA] / dq)
-                    dP = dP + F * dS
-                    if projected == 0:
-                        rate = strain_rate(block, G, V, history, dq, world, q, elem)
-                        dP = dP + dG * t.isotropic(rate, c[LAMBDA_V], c[ETA])
-                dP = w * dP
-                if wp.static(affine):
-                    dP = dP * wp.transpose(block.J0_inv[elem])
-                for a in range(b + 1):
-                    column = vec3()
-                    if wp.static(affine):
-                        column = dP * block.gradient[q, a, 0]
-                    else:
-                        column = dP * block.gradient[q, a, elem]
-                    if axis == 0:
-                        first[a] = first[a] + column
-                    elif axis == 1:
-                        second[a] = second[a] + column
-                    else:
-                        third[a] = third[a] + column
-        for a in range(b + 1):
-            matrix[world, a * NS - (a * (a - 1)) / 2 + b - a, elem] = wp.matrix_from_cols(first[a], second[a], third[a])
+            dG = wp.outer(unit, h)
+            dP = mat33()
+            if wp.static(framed):
+                R = wp.transpose(block.frame[q, elem])
+                dP = m.increment(local, wp.outer(R * unit, R * h), c)
+            else:
+                dP = m.increment(local, dG, c)
+            dP = out_of_axes(block, dP, q, elem)
+            if projected != 0:
+                dP = dP + compression(local, c) * dG
+            if wp.static(damping == "incremental" or damping == "rate"):
+                F = t.identity() + G
+                dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[LAMBDA_V] / dq, c[ETA] / dq)
+                dP = dP + F * dS
+                if projected == 0:
+                    rate = strain_rate(block, G, V, history, dq, world, q, elem)
+                    dP = dP + dG * t.isotropic(rate, c[LAMBDA_V], c[ETA])
+            out = scatter(block, out, dP, q, elem)
+        for a in range(NS):
+            if a <= b:
+                pair = a * NS - (a * (a - 1)) / 2 + b - a
+                if add != 0:
+                    out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
+                matrix[world, 3 * pair + axis, elem] = out[a]
 
     @wp.kernel(module=history_module)
     def strain_history(

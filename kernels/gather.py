@@ -10,7 +10,7 @@ import warp as wp
 
 from .constraints import constraint_struct, multiplier_struct
 from .lanes import lane_functions
-from .types import kernel_module, precision
+from .types import SMALL, kernel_module, precision
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels", "inverse_function", "pattern_struct", "topology_struct"]
 
@@ -104,12 +104,12 @@ def gather_kernels(
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     f64 = wp.float64
     Pattern = pattern_struct()
-    lane_sum = lane_functions(dtype).lane_sum
+    lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     free_inverse = inverse_function(dtype)
     name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
-    module = kernel_module(f"gather_{name}")
-    matrix_module = kernel_module(f"matrix_product_{name}")
-    massive_module = kernel_module(f"massive_product_{name}")
+    module = kernel_module(f"gather_{name}", max_unroll=SMALL)
+    matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
+    massive_module = kernel_module(f"massive_product_{name}", max_unroll=SMALL)
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -281,24 +281,30 @@ def gather_kernels(
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
+        warp: int,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per slot."""
+        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        f = vec3()
-        for k in range(topo.start[slot], topo.start[slot + 1]):
-            f += contribution[world, topo.entry[k]]
-        a = vec3()
-        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
-        dq = T(dq_dv[world])
-        h = T(mass_factor[world]) * a + dq * f
-        h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
-        out[world, slot] = h
-        rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
+        share = f64(0.0)
+        if slot < out.shape[1]:
+            f = vec3()
+            for k in range(topo.start[slot], topo.start[slot + 1]):
+                f += contribution[world, topo.entry[k]]
+            a = vec3()
+            for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+                a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
+            dq = T(dq_dv[world])
+            h = T(mass_factor[world]) * a + dq * f
+            h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
+            out[world, slot] = h
+            share = f64(wp.dot(h, p_in[world, slot]))
+        share = row_sum(share, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = share
 
     @wp.kernel(module=massive_module)
     def massive_product(
@@ -313,6 +319,7 @@ def gather_kernels(
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
+        warp: int,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
@@ -320,13 +327,18 @@ def gather_kernels(
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        h = vec3()
-        for k in range(topo.start[slot], topo.start[slot + 1]):
-            h += contribution[world, topo.entry[k]]
-        dq = T(dq_dv[world])
-        h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
-        out[world, slot] = h
-        rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
+        share = f64(0.0)
+        if slot < out.shape[1]:
+            h = vec3()
+            for k in range(topo.start[slot], topo.start[slot + 1]):
+                h += contribution[world, topo.entry[k]]
+            dq = T(dq_dv[world])
+            h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
+            out[world, slot] = h
+            share = f64(wp.dot(h, p_in[world, slot]))
+        share = row_sum(share, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = share
 
     @wp.kernel(module=matrix_module)
     def matrix_product(
@@ -343,6 +355,7 @@ def gather_kernels(
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
+        warp: int,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
@@ -357,12 +370,15 @@ def gather_kernels(
             for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
                 h += value[world, k] * p_in[world, pattern.column[k]]
         h = lane_sum(h, lanes)
-        if lane != 0 or slot >= out.shape[1]:
-            return
-        dq = T(dq_dv[world])
-        h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
-        out[world, slot] = h
-        rows[0, world, slot] = f64(wp.dot(h, p_in[world, slot]))
+        share = f64(0.0)
+        if lane == 0 and slot < out.shape[1]:
+            dq = T(dq_dv[world])
+            h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
+            out[world, slot] = h
+            share = f64(wp.dot(h, p_in[world, slot]))
+        share = row_sum(share, warp)
+        if index % warp == 0:
+            rows[0, world, index / warp] = share
 
     @wp.kernel(module=module)
     def gather_blocks(

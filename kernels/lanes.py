@@ -46,7 +46,8 @@ def lane_sum_float32(x: wp.float32, lanes: int) -> wp.float32: ...
 
 @functools.cache
 def lane_functions(dtype: str) -> _types.SimpleNamespace:
-    """`sync` of a block's threads, and `lane_sum(v, lanes)` of vectors over runs of lanes, a power of two up to WARP.
+    """`sync` of a block's threads, and sums over runs of lanes, a power of two up to WARP: `lane_sum(v, lanes)` of
+    vectors, `row_sum(x, lanes)` of float64, `scalar_sum` of the precision itself.
 
     Every thread of a warp must come to a sum: launches pad their rows to whole warps. The first lane has the sum.
     """
@@ -57,4 +58,4 @@ def lane_functions(dtype: str) -> _types.SimpleNamespace:
     def lane_sum(v: vec3, lanes: int) -> vec3:
         return vec3(scalar_sum(v[0], lanes), scalar_sum(v[1], lanes), scalar_sum(v[2], lanes))
 
-    return _types.SimpleNamespace(sync=sync, lane_sum=lane_sum)
+    return _types.SimpleNamespace(sync=sync, lane_sum=lane_sum, row_sum=lane_sum_float64, scalar_sum=scalar_sum)

@@ -11,14 +11,13 @@ import warp as wp
 
 from .gather import pattern_struct
 from .lanes import lane_functions
-from .types import kernel_module, precision
+from .types import SMALL, kernel_module, precision
 
 __all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
 
 TILE_SLOTS = 16
 TILE = 3 * TILE_SLOTS
 LANES = 64
-ROW_TILE = 128
 
 
 @functools.cache
@@ -50,11 +49,13 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     f64 = wp.float64
     Level = level_struct(dtype)
     Pattern = pattern_struct()
-    sync, lane_sum = lane_functions(dtype).sync, lane_functions(dtype).lane_sum
+    lanes_of = lane_functions(dtype)
+    sync, lane_sum, row_sum = lanes_of.sync, lanes_of.lane_sum, lanes_of.row_sum
+    scalar_sum = lanes_of.scalar_sum
     # a pivot below this share of its diagonal is rounding: the functions are dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[dtype]
-    module = kernel_module(f"levels_{dtype}")
-    build_module = kernel_module(f"levels_build_{dtype}")
+    module = kernel_module(f"levels_{dtype}", max_unroll=SMALL)
+    build_module = kernel_module(f"levels_build_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=build_module)
     def fill_tiles(
@@ -228,23 +229,29 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         r: wp.array2d(dtype=vec3),
         diagonal: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
+        warp: int,
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z += P x; rows: r.z and r.D^-1 r."""
+        """z += P x; rows: r.z and r.D^-1 r per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        a = r[world, slot]
-        s = z[world, slot]
-        if correct != 0:
-            s += wp.cw_mul(prolonged(level, x, world, slot), free[slot])
-            z[world, slot] = s
-        D = diagonal[world, slot]
-        rows[0, world, slot] = f64(wp.dot(a, s))
-        rows[1, world, slot] = (
-            f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
-        )
+        rz = f64(0.0)
+        rr = f64(0.0)
+        if slot < z.shape[1]:
+            a = r[world, slot]
+            s = z[world, slot]
+            if correct != 0:
+                s += wp.cw_mul(prolonged(level, x, world, slot), free[slot])
+                z[world, slot] = s
+            rz = f64(wp.dot(a, s))
+            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
+        rz = row_sum(rz, warp)
+        rr = row_sum(rr, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = rz
+            rows[1, world, slot / warp] = rr
 
     @wp.kernel(module=module)
     def chebyshev(
@@ -396,20 +403,23 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def apply_dense(
         matrix: wp.array3d(dtype=T),
-        r: wp.array3d(dtype=T),
+        lanes: int,
+        r: wp.array2d(dtype=T),
         active: wp.array(dtype=wp.int32),
         x: wp.array2d(dtype=T),
     ):
-        """x = A^-1 r; one block does one row."""
-        world, row = wp.tid()
+        """x = A^-1 r, so many lanes per row."""
+        world, index = wp.tid()
         if active[world] == 0:
             return
-        acc = wp.tile_zeros(shape=(1, 1, ROW_TILE), dtype=T)
-        for k in range((r.shape[2] + ROW_TILE - 1) // ROW_TILE):
-            a = wp.tile_load(matrix, shape=(1, 1, ROW_TILE), offset=(world, row, k * ROW_TILE))
-            b = wp.tile_load(r, shape=(1, 1, ROW_TILE), offset=(world, 0, k * ROW_TILE))
-            acc += wp.tile_map(wp.mul, a, b)
-        x[world, row] = wp.tile_extract(wp.tile_sum(acc), 0)
+        lane = index % lanes
+        row = wp.min(index / lanes, x.shape[1] - 1)
+        s = T(0.0)
+        for k in range(lane, r.shape[1], lanes):
+            s += matrix[world, row, k] * r[world, k]
+        s = scalar_sum(s, lanes)
+        if lane == 0:
+            x[world, row] = s
 
     return _types.SimpleNamespace(
         module=module,

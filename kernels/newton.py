@@ -34,7 +34,6 @@ LANES = 32
 NOISE = 100.0  # Phi is blind below this many roundings of its parts
 FLOOR = 16.0
 MAX_SEARCH = 20
-CHORD = 0.02  # of the residual; a step's matrix that does at least so well is used again
 
 
 @functools.cache
@@ -82,6 +81,7 @@ def control_struct():
         force: wp.array(dtype=wp.float64)  # |g| over the free components, N
         force_tol: wp.float64  # N; accepted without regard to the size of the forces; 0: never
         first_forcing: wp.float64
+        chord: wp.float64  # reduction of the residual by which a step's matrix is used again
         relinearise: wp.array(dtype=wp.int32)  # the operator's matrix is to be made anew
         tol: wp.float64
         eps: wp.float64
@@ -245,12 +245,12 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def judge_matrix(ctl: Control, any_flag: wp.array(dtype=wp.int32)):
-        """The operator's matrix is kept within a step while the residual falls by CHORD per iteration at least."""
+        """The operator's matrix is kept within a step while the residual falls well."""
         world = wp.tid()
         ctl.relinearise[world] = 0
         if ctl.active[world] == 0:
             return
-        if ctl.iterations[world] == 0 or ctl.reduction[world] > f64(CHORD) or ctl.alpha[world] != f64(1.0):
+        if ctl.iterations[world] == 0 or ctl.reduction[world] > ctl.chord or ctl.alpha[world] != f64(1.0):
             ctl.relinearise[world] = 1
             wp.atomic_max(any_flag, 0, 1)
 

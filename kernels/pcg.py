@@ -8,6 +8,7 @@ import types as _types
 
 import warp as wp
 
+from .lanes import lane_functions
 from .newton import control_struct
 from .types import kernel_module, precision
 
@@ -26,13 +27,12 @@ def pcg_struct():
         active: wp.array(dtype=wp.int32)
         iterations: wp.array(dtype=wp.int32)  # of this solve
         total: wp.array(dtype=wp.int32)  # of this step
-        rz: wp.array(dtype=wp.float64)
-        alpha: wp.array(dtype=wp.float64)
-        beta: wp.array(dtype=wp.float64)
+        rz: wp.array(dtype=wp.float64)  # of the iteration before
         target: wp.array(dtype=wp.float64)  # of the norm
         norm: wp.array(dtype=wp.float64)  # |r| in the D^-1 norm, which Newton's method judges by
         first_norm: wp.array(dtype=wp.float64)  # at the start of the solve
-        sums: wp.array2d(dtype=wp.float64)  # r.z and r.D^-1 r; p.Hp
+        sums: wp.array2d(dtype=wp.float64)  # r.z and r.D^-1 r
+        curvature: wp.array2d(dtype=wp.float64)  # p.Hp
         any_active: wp.array(dtype=wp.int32)
         max_iterations: wp.int32
 
@@ -67,6 +67,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
     Newton = control_struct()
     Control = pcg_struct()
     Groups = groups_struct(dtype)
+    row_sum = lane_functions(dtype).row_sum
     module = kernel_module(f"pcg_{dtype}{'_constrained' if constrained else ''}")
 
     @wp.kernel(module=module)
@@ -101,21 +102,27 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         r: wp.array2d(dtype=vec3),
         diagonal: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
+        warp: int,
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z = B r with 3x3 blocks B, and per slot r.z and r.D^-1 r."""
+        """z = B r with 3x3 blocks B, and r.z and r.D^-1 r per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        a = r[world, slot]
-        b = inverse[world, slot] * a
-        z[world, slot] = b
-        rows[0, world, slot] = f64(wp.dot(a, b))
-        D = diagonal[world, slot]
-        rows[1, world, slot] = (
-            f64(a[0]) * f64(a[0] / D[0]) + f64(a[1]) * f64(a[1] / D[1]) + f64(a[2]) * f64(a[2] / D[2])
-        )
+        rz = f64(0.0)
+        rr = f64(0.0)
+        if slot < z.shape[1]:
+            a = r[world, slot]
+            b = inverse[world, slot] * a
+            z[world, slot] = b
+            rz = f64(wp.dot(a, b))
+            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
+        rz = row_sum(rz, warp)
+        rr = row_sum(rr, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = rz
+            rows[1, world, slot / warp] = rr
 
     @wp.kernel(module=module)
     def begin(newton: Newton, ctl: Control):
@@ -144,25 +151,6 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
             wp.atomic_max(ctl.any_active, 0, 1)
 
     @wp.kernel(module=module)
-    def step_length(ctl: Control):
-        """alpha = r.z / p.Hp; a direction of no positive curvature ends the solve."""
-        world = wp.tid()
-        if world == 0:
-            ctl.any_active[0] = 0
-        if ctl.active[world] == 0:
-            return
-        pHp = ctl.sums[0, world]
-        ctl.total[world] = ctl.total[world] + 1
-        if pHp > f64(0.0) and wp.isfinite(pHp):
-            ctl.alpha[world] = ctl.rz[world] / pHp
-        else:
-            ctl.alpha[world] = f64(0.0)
-            if ctl.iterations[world] == 0:
-                ctl.alpha[world] = f64(1.0)
-            ctl.iterations[world] = ctl.max_iterations
-        ctl.iterations[world] = ctl.iterations[world] + 1
-
-    @wp.kernel(module=module)
     def update(
         ctl: Control,
         p_in: wp.array2d(dtype=vec3),
@@ -170,43 +158,45 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         x: wp.array2d(dtype=vec3),
         r: wp.array2d(dtype=vec3),
     ):
-        """x += alpha p, r -= alpha Hp."""
+        """x += alpha p, r -= alpha Hp with alpha = r.z / p.Hp; a direction of no positive curvature ends the solve."""
         world, slot = wp.tid()
+        if world == 0 and slot == 0:
+            ctl.any_active[0] = 0
         if ctl.active[world] == 0:
             return
-        alpha = T(ctl.alpha[world])
+        rz = ctl.sums[0, world]
+        pHp = ctl.curvature[0, world]
+        if slot == 0:
+            ctl.rz[world] = rz
+        length = f64(0.0)
+        if pHp > f64(0.0) and wp.isfinite(pHp):
+            length = rz / pHp
+        elif ctl.iterations[world] == 0:
+            length = f64(1.0)
+        alpha = T(length)
         x[world, slot] = x[world, slot] + alpha * p_in[world, slot]
         r[world, slot] = r[world, slot] - alpha * Hp[world, slot]
 
     @wp.kernel(module=module)
-    def direction_factor(ctl: Control):
-        """beta = (r.z)_new / (r.z)_old, and the end of the solve."""
-        world = wp.tid()
+    def new_direction(ctl: Control, z: wp.array2d(dtype=vec3), p_out: wp.array2d(dtype=vec3)):
+        """p = z + beta p with beta = (r.z)_new / (r.z)_old; the first thread of a world decides whether to go on."""
+        world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
         rz = ctl.sums[0, world]
-        norm = wp.sqrt(ctl.sums[1, world])
-        ctl.beta[world] = rz / ctl.rz[world]
-        ctl.rz[world] = rz
-        ctl.norm[world] = norm
-        if (
-            norm > ctl.target[world]
-            and ctl.iterations[world] < ctl.max_iterations
-            and rz > f64(0.0)
-            and wp.isfinite(rz)
-        ):
-            wp.atomic_max(ctl.any_active, 0, 1)
-        else:
-            ctl.active[world] = 0
-
-    @wp.kernel(module=module)
-    def new_direction(
-        ctl: Control, active: wp.array(dtype=wp.int32), z: wp.array2d(dtype=vec3), p_out: wp.array2d(dtype=vec3)
-    ):
-        """p = z + beta p."""
-        world, slot = wp.tid()
-        if active[world] != 0:
-            p_out[world, slot] = z[world, slot] + T(ctl.beta[world]) * p_out[world, slot]
+        p_out[world, slot] = z[world, slot] + T(rz / ctl.rz[world]) * p_out[world, slot]
+        if slot == 0:
+            norm = wp.sqrt(ctl.sums[1, world])
+            pHp = ctl.curvature[0, world]
+            count = ctl.iterations[world] + 1
+            ctl.norm[world] = norm
+            ctl.iterations[world] = count
+            ctl.total[world] = ctl.total[world] + 1
+            more = norm > ctl.target[world] and count < ctl.max_iterations
+            if more and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
+                wp.atomic_max(ctl.any_active, 0, 1)
+            else:
+                ctl.active[world] = 0  # threads that see it already leave a direction that nobody reads
 
     @wp.kernel(module=module)
     def group_partial(
@@ -269,9 +259,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         silence=silence,
         block_jacobi=block_jacobi,
         begin=begin,
-        step_length=step_length,
         update=update,
-        direction_factor=direction_factor,
         new_direction=new_direction,
         group_partial=group_partial,
         group_velocity=group_velocity,

@@ -9,8 +9,8 @@ from .types import kernel_module
 
 __all__ = ["CHUNK", "reduce_kernels"]
 
-TILE = 256
-CHUNK = 4096
+TILE = 1024
+CHUNK = 16384
 """Rows up to this length are summed by one block; longer ones in chunks of this length first."""
 
 

@@ -51,7 +51,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     Block = tied_struct(dtype)
     name = f"tied_{dtype}_{slots}_{ties}_{width}"
     module = kernel_module(name)
-    matrix_module = kernel_module(f"{name}_matrix")
+    matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
     Local = wp.types.matrix(shape=(slots, 3), dtype=T)
     Ties = wp.types.vector(length=ties, dtype=T)
     TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
@@ -104,14 +104,15 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
+        lanes: int,
         contribution: wp.array2d(dtype=vec3),
         energy: wp.array3d(dtype=wp.float64),
         min_J: wp.array(dtype=wp.float64),
         domain_J: wp.array(dtype=wp.float64),
     ):
-        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), and the energy e.s/2."""
+        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), and the energy e.s/2; one lane per element."""
         world, elem = wp.tid()
-        if active[world] == 0:
+        if active[world] == 0 or elem >= block.count:
             return
         U = load(block, u, world, elem)
         e = shears(block, U, elem)
@@ -200,40 +201,54 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         projected: int,
+        add: int,
         active: wp.array(dtype=wp.int32),
-        matrix: wp.array3d(dtype=mat33),
+        matrix: wp.array3d(dtype=vec3),
     ):
-        """K of each element as the 3x3 blocks of slots a <= b, row by row; `projected`: without the geometric part."""
-        world, b, elem = wp.tid()
+        """K of each element as the columns of the 3x3 blocks of slots a <= b, row by row; one thread does one column.
+
+        `projected`: without the geometric part; `add`: to what is there, of another part of the energy.
+        """
+        world, column, elem = wp.tid()
         if active[world] == 0:
             return
+        b = column / 3
+        axis = column % 3
         U = load(block, u, world, elem)
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         A = TieVectors()
         D = TieVectors()
-        y = TieVectors()
+        change = Ties()
         for t in range(NT):
             A[t] = block.X_first[t, elem] + line(block.first, U, t, elem)
             D[t] = block.X_second[t, elem] + line(block.second, U, t, elem)
-        for t in range(NT):
-            first = (t / W) * W
-            row = vec3()
-            for k in range(W):
-                s = first + k
-                row += block.coupling[t, k, elem] * (block.first[s, b, elem] * D[s] + block.second[s, b, elem] * A[s])
-            y[t] = mu * row
+            change[t] = block.first[t, b, elem] * D[t][axis] + block.second[t, b, elem] * A[t][axis]
         stress = Ties()
         if projected == 0:
-            stress = stresses(block, shears(block, U, elem), world, elem)
-        for a in range(b + 1):
-            K = mat33()
+            e = Ties()
             for t in range(NT):
-                K += wp.outer(block.first[t, a, elem] * D[t] + block.second[t, a, elem] * A[t], y[t])
-                if projected == 0:
-                    both = block.first[t, a, elem] * block.second[t, b, elem]
-                    both += block.second[t, a, elem] * block.first[t, b, elem]
-                    K += (stress[t] * both) * wp.identity(n=3, dtype=T)
-            matrix[world, a * NS - (a * (a - 1)) / 2 + b - a, elem] = K
+                X = block.X_first[t, elem]
+                Y = block.X_second[t, elem]
+                e[t] = wp.dot(X, D[t] - Y) + wp.dot(A[t] - X, D[t])
+            stress = stresses(block, e, world, elem)
+        out = Local()
+        for t in range(NT):
+            first = (t / W) * W
+            s = T(0.0)
+            for k in range(W):
+                s += block.coupling[t, k, elem] * change[first + k]
+            da = (mu * s) * A[t]
+            dd = (mu * s) * D[t]
+            da[axis] = da[axis] + stress[t] * block.first[t, b, elem]
+            dd[axis] = dd[axis] + stress[t] * block.second[t, b, elem]
+            for a in range(NS):
+                out[a] = out[a] + block.first[t, a, elem] * dd + block.second[t, a, elem] * da
+        for a in range(NS):
+            if a <= b:
+                pair = a * NS - (a * (a - 1)) / 2 + b - a
+                if add != 0:
+                    out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
+                matrix[world, 3 * pair + axis, elem] = out[a]
 
     return _types.SimpleNamespace(
         module=module,

@@ -5,7 +5,10 @@ import types as _types
 
 import warp as wp
 
-__all__ = ["kernel_module", "precision"]
+__all__ = ["SMALL", "kernel_module", "precision"]
+
+SMALL = 4
+"""`max_unroll` of modules whose short loops go over components: unrolled they index registers, not memory."""
 
 
 @functools.cache

@@ -274,7 +274,7 @@ def test_help_teaches(capfd, command):
     code, out, err = run(capfd, *command, "--help")
     assert (code, err) == (0, "")
     assert "usage: warpfea" in out
-    if command in ([], ["run"], ["render"]):
+    if command in ([], ["run"], ["render"], ["bench"]):
         assert "examples:" in out
 
 

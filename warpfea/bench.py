@@ -2,6 +2,7 @@
 
 Sizes are numbers of unknowns, met as closely as the problem allows. The error of the tip is measured against the same
 mesh and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
+`--peer` and `--growth` are in `bench_peer` and `bench_growth`.
 """
 
 from __future__ import annotations
@@ -28,11 +29,17 @@ from .model import Model
 from .simulation import Simulation
 from .solvers import NewtonPCG
 
-__all__ = ["Row", "bench", "machine", "measure"]
+__all__ = ["Row", "Run", "bench", "check_sizes", "figures", "machine", "measure", "run_once", "solver", "write"]
 
 SCHEMA = 1
 WARM_UP = 2
 TIGHTER = 100.0
+OPTIONS = {
+    "table": {"problem", "unknowns", "dtype", "linear", "steps", "repeat", "dt", "tol", "reference_up_to"},
+    "peer": {"rows", "large", "meshes", "dtype", "steps"},
+    "growth": {"problem", "unknowns"},
+}
+"""Options of each kind of measurement, besides those of all."""
 
 
 @dataclass(frozen=True)
@@ -55,30 +62,68 @@ class Row:
     compile_s: float
 
 
-def run_once(
-    model: Model, *, dt: float, steps: int, tol: float | None, linear: str = "pcg"
-) -> tuple[Simulation, list[float], float]:
-    """Simulate from rest: the simulation, seconds of each step, seconds until it was ready."""
+@dataclass(frozen=True)
+class Run:
+    """A simulation from rest that has been stepped.
+
+    Attributes:
+        sim: the simulation.
+        times: s of each step.
+        ready_s: s until it could step.
+        residual_force: largest |g|_2 over the free components of a step, N.
+    """
+
+    sim: Simulation
+    times: list[float]
+    ready_s: float
+    residual_force: float
+
+    def tip(self, axis: int) -> np.ndarray:
+        """Displacement of the tip along an axis after each step, m."""
+        return self.sim.probe("tip").displacement[0, :, axis]
+
+
+def solver(tol: float | None, **options: Any) -> NewtonPCG:
+    """The solver of all measurements."""
+    return NewtonPCG(tol=tol, **({"max_pcg": 20000} | options))
+
+
+def run_once(model: Model, *, dt: float, steps: int, solver: NewtonPCG) -> Run:
+    """Simulate from rest."""
     began = clock.perf_counter()
-    sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol, max_pcg=20000, linear=linear), ledger=False)
+    sim = Simulation(model, dt=dt, solver=solver, ledger=False)
     ready = clock.perf_counter() - began
-    times = []
+    times: list[float] = []
+    largest = 0.0
     for _ in range(steps):
         start = clock.perf_counter()
-        sim.step()  # reads its report, and so waits for the device
+        report = sim.step()  # reads its report, and so waits for the device
         times.append(clock.perf_counter() - start)
-    return sim, times, ready
+        largest = max(largest, float(report.residual_force.max()))
+    return Run(sim, times, ready, largest)
 
 
-def tip_of(sim: Simulation, axis: int) -> np.ndarray:
-    """Displacement of the tip along an axis after each step, m."""
-    return sim.probe("tip").displacement[0, :, axis]
+def figures(run: Run, times: list[float]) -> dict[str, Any]:
+    """The columns that all tables share; `times` (s) are those that count. Bytes are per free unknown."""
+    sim, steps = run.sim, len(run.times)
+    info = sim.model.info()
+    return {
+        "dtype": sim.model.dtype,
+        "elements": info["elements"],
+        "ms_per_step": 1e3 * statistics.median(times),
+        "newton_per_step": float(sim.totals["newton"][0]) / steps,
+        "pcg_per_step": float(sim.totals["pcg"][0]) / steps,
+        "bytes_per_unknown": sum(sim.bytes().values()) / info["unknowns"],
+        "residual": float(sim.max_residual),
+        "compile_s": run.ready_s,
+    }
 
 
 def measure(
     problem: Problem,
     size: Any,
     dtypes: list[str],
+    linear: Sequence[str] = ("pcg",),
     *,
     device: Any,
     steps: int,
@@ -86,44 +131,34 @@ def measure(
     dt: float,
     tol: float | None,
     with_reference: bool,
-    linear: Sequence[str] = ("pcg",),
 ) -> list[Row]:
     """Rows of one mesh, one per precision and linear solver."""
     builder = problem.build(size)
     reference = None
     if with_reference:
-        tight = NewtonPCG(tol=tol).tolerance("float64") / TIGHTER
-        reference = tip_of(run_once(builder.finalize(device=device), dt=dt, steps=steps, tol=tight)[0], problem.axis)
+        tight = solver(NewtonPCG(tol=tol).tolerance("float64") / TIGHTER)
+        reference = run_once(builder.finalize(device=device), dt=dt, steps=steps, solver=tight).tip(problem.axis)
     rows = []
-    for dtype, solver in itertools.product(dtypes, linear):
+    for dtype, name in itertools.product(dtypes, linear):
         began = clock.perf_counter()
         model = builder.finalize(device=device, dtype=dtype)
         setup = clock.perf_counter() - began
-        times: list[float] = []
-        sim, first, ready = run_once(model, dt=dt, steps=steps, tol=tol, linear=solver)
-        for k in range(repeat):
-            if k:
-                _, first, _ = run_once(model, dt=dt, steps=steps, tol=tol, linear=solver)
-            times += first[min(WARM_UP, steps - 1) :]
-        tip = tip_of(sim, problem.axis)
-        error = None if reference is None else float(np.abs(tip - reference).max() / np.abs(reference).max())
-        info = model.info()
+        first = min(WARM_UP, steps - 1)
+        how = solver(tol, linear=name)
+        run = run_once(model, dt=dt, steps=steps, solver=how)
+        times = run.times[first:]
+        for _ in range(repeat - 1):
+            times += run_once(model, dt=dt, steps=steps, solver=how).times[first:]
+        tip = run.tip(problem.axis)
         rows.append(
             Row(
                 problem=problem.name,
-                dtype=dtype,
-                linear=solver,
-                unknowns=info["unknowns"],
-                elements=info["elements"],
-                ms_per_step=1e3 * statistics.median(times),
-                newton_per_step=float(sim.totals["newton"][0]) / steps,
-                pcg_per_step=float(sim.totals["pcg"][0]) / steps,
-                bytes_per_unknown=sum(sim.bytes().values()) / info["unknowns"],
-                residual=float(sim.max_residual),
+                linear=name,
+                unknowns=model.info()["unknowns"],
                 tip=float(tip[-1]),
-                tip_error=error,
+                tip_error=None if reference is None else float(np.abs(tip - reference).max() / np.abs(reference).max()),
                 setup_s=setup,
-                compile_s=ready,
+                **figures(run, times),
             )
         )
     return rows
@@ -131,49 +166,74 @@ def measure(
 
 def bench(options: argparse.Namespace) -> int:
     """Do `warpfea bench`."""
-    from .cli.console import quiet_warp, write_json
+    from .cli.console import quiet_warp
     from .cli.parser import UsageError
     from .outputs import check_target
 
+    kind = "peer" if options.peer else "growth" if options.growth else "table"
+    for name in sorted(set().union(*OPTIONS.values()) - OPTIONS[kind]):
+        if getattr(options, name):
+            words = "goes with --peer" if kind == "table" else f"does not go with --{kind}"
+            raise UsageError(f"--{name.replace('_', '-')} {words}")
     if options.out is not None:
         if pathlib.Path(options.out).suffix != ".json":
             raise UsageError(f"--out {options.out}: the file name must end in .json")
         check_target(options.out, (".json",))
+    from .bench_growth import growth
+    from .bench_peer import peer
+
+    with quiet_warp():
+        {"table": table, "peer": peer, "growth": growth}[kind](options)
+    return 0
+
+
+def table(options: argparse.Namespace) -> None:
+    """Time and error in several sizes."""
     problems = [PROBLEMS[name] for name in options.problem or ["bar"]]
-    for problem in problems:
-        if options.unknowns and min(options.unknowns) < problem.smallest:
-            raise UsageError(f"--unknowns {min(options.unknowns)}: the smallest {problem.name} has {problem.smallest}")
+    check_sizes(problems, options.unknowns)
+    steps = options.steps or 10
+    how = {"steps": steps, "repeat": options.repeat or 3, "dt": options.dt or 1e-3, "tol": options.tol}
     settings: dict[str, Any] = {
         "problems": {p.name: list(options.unknowns or p.defaults) for p in problems},
         "dtypes": options.dtype or ["float64", "float32"],
         "linear": options.linear or ["pcg"],
-        "steps": options.steps,
-        "repeat": options.repeat,
-        "dt": options.dt,
-        "tol": options.tol,
+        **how,
         "reference_tolerance_factor": 1.0 / TIGHTER,
-        "reference_up_to": max(options.reference_up_to),
-        "warm_up_steps": min(WARM_UP, options.steps - 1),
+        "reference_up_to": max(options.reference_up_to or [100000]),
+        "warm_up_steps": min(WARM_UP, steps - 1),
     }
     rows: list[Row] = []
-    with quiet_warp():
-        print(HEADER, flush=True)
-        for problem, wanted in ((p, n) for p in problems for n in options.unknowns or p.defaults):
-            found = measure(
-                problem,
-                problem.size_for(wanted),
-                settings["dtypes"],
-                device=options.device,
-                steps=options.steps,
-                repeat=options.repeat,
-                dt=options.dt,
-                tol=options.tol,
-                with_reference=wanted <= settings["reference_up_to"],
-                linear=settings["linear"],
-            )
-            rows += found
-            for row in found:
-                print(_line(row), flush=True)
+    print(HEADER, flush=True)
+    for problem, wanted in ((p, n) for p in problems for n in options.unknowns or p.defaults):
+        found = measure(
+            problem,
+            problem.size_for(wanted),
+            settings["dtypes"],
+            settings["linear"],
+            device=options.device,
+            with_reference=wanted <= settings["reference_up_to"],
+            **how,
+        )
+        rows += found
+        for row in found:
+            print(_line(row), flush=True)
+    write(options, settings, rows)
+
+
+def check_sizes(problems: list[Problem], sizes: list[int]) -> None:
+    """Refuse sizes that a problem does not have. UsageError."""
+    from .cli.parser import UsageError
+
+    for problem in problems:
+        if sizes and min(sizes) < problem.smallest:
+            raise UsageError(f"--unknowns {min(sizes)}: the smallest {problem.name} has {problem.smallest}")
+
+
+def write(options: argparse.Namespace, settings: dict[str, Any], rows: list[Any], **more: Any) -> None:
+    """Write rows (dataclasses) with where they come from to --out, if given. OutputError."""
+    from .cli.console import write_json
+
+    if options.out is not None:
         content = {
             "schema": SCHEMA,
             "command": shlex.join(["warpfea", *(options.words or ["bench"])]),
@@ -181,11 +241,10 @@ def bench(options: argparse.Namespace) -> int:
             "machine": machine(options.device),
             "versions": _versions(),
             "settings": settings,
+            **more,
             "rows": [asdict(row) for row in rows],
         }
-    if options.out is not None:
         write_json(options.out, content)
-    return 0
 
 
 HEADER = (
@@ -198,8 +257,8 @@ def _line(r: Row) -> str:
     error = "-" if r.tip_error is None else f"{r.tip_error:.1e}"
     return (
         f"{r.problem:8} {r.dtype:8} {r.linear:6} {r.unknowns:9d} {r.elements:9d} {r.ms_per_step:10.2f} "
-        f"{r.newton_per_step:7.1f} {r.pcg_per_step:7.0f} {r.bytes_per_unknown:9.0f} "
-        f"{r.residual:9.1e} {r.tip:13.6e} {error:>9} {r.setup_s:9.1f} {r.compile_s:10.1f}"
+        f"{r.newton_per_step:7.1f} {r.pcg_per_step:7.0f} {r.bytes_per_unknown:9.0f} {r.residual:9.1e} "
+        f"{r.tip:13.6e} {error:>9} {r.setup_s:9.1f} {r.compile_s:10.1f}"
     )
 
 

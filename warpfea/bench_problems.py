@@ -21,12 +21,17 @@ from . import mesh as meshes
 from .beams import Rectangle
 from .builder import ModelBuilder
 from .materials import SVK, KelvinVoigt
+from .mesh import Mesh
 
 __all__ = ["PROBLEMS", "Problem"]
 
 E, NU, DENSITY = 7e8, 0.33, 2700.0
+LAW = SVK(E=E, nu=NU, density=DENSITY)
+DAMPED = SVK(E=E, nu=NU, density=DENSITY, damping=KelvinVoigt(eta=1e5, lambda_v=1e5))
 BAR = (3.0, 2.0, 1.0)
+SIDE = 0.1
 PLATE = (4.0, 2.0)
+THICKNESS = 0.1
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,7 @@ class Problem:
         name: as users choose it.
         size_for: wanted unknowns -> size.
         unknowns: size -> its unknowns.
-        build: size -> ModelBuilder with the probe "tip".
+        build: size, and by keyword the law and the load over its area (Pa) -> ModelBuilder with the probe "tip".
         axis: component of the tip's displacement that is compared.
         smallest: fewest unknowns.
         defaults: unknowns of a run without --unknowns.
@@ -46,7 +51,7 @@ class Problem:
     name: str
     size_for: Callable[[int], Any]
     unknowns: Callable[[Any], int]
-    build: Callable[[Any], ModelBuilder]
+    build: Callable[..., ModelBuilder]
     axis: int
     smallest: int
     defaults: tuple[int, ...]
@@ -66,38 +71,40 @@ def bar_cells(unknowns: int) -> tuple[int, int, int]:
     return best[0], best[1], best[2]
 
 
-def bar(cells: tuple[int, int, int]) -> ModelBuilder:
-    """The bar of T10 elements."""
+def bar(
+    size: tuple[int, int, int] | Mesh, *, law: SVK = LAW, traction: float = 5000.0 / (BAR[1] * BAR[2])
+) -> ModelBuilder:
+    """The bar of T10 elements, structured with so many cells or on any mesh of the box."""
     b = ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    body = b.add_solid(meshes.box(BAR, cells=cells), material=SVK(E=E, nu=NU, density=DENSITY), name="bar")
-    b.clamp(body.nodes("x-"))
-    b.add_traction(body.surface("x+"), (5000.0 / (BAR[1] * BAR[2]), 0.0, 0.0))
-    b.add_probe("tip", body.surface("x+"))
+    mesh = size if isinstance(size, Mesh) else meshes.box(BAR, cells=size)
+    body = b.add_solid(mesh, material=law, name="bar")
+    end = body.surface(lambda X: X[:, 0] > BAR[0] - 1e-9)
+    b.clamp(body.nodes(lambda X: X[:, 0] < 1e-9))
+    b.add_traction(end, (traction, 0.0, 0.0))
+    b.add_probe("tip", end)
     return b
 
 
-def beam(elements: int) -> ModelBuilder:
+def beam(elements: int, *, law: SVK = DAMPED, traction: float = 3100.0 / SIDE**2) -> ModelBuilder:
     """The beam of 3243 elements."""
     b = ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    law = SVK(E=E, nu=NU, density=DENSITY, damping=KelvinVoigt(eta=1e5, lambda_v=1e5))
     body = b.add_beam(
         [(0.0, 0.0, 0.0), (0.5 * elements, 0.0, 0.0)],
-        elements=elements, section=Rectangle(0.1, 0.1), normal=(0.0, 0.0, 1.0), material=law,
+        elements=elements, section=Rectangle(SIDE, SIDE), normal=(0.0, 0.0, 1.0), material=law,
     )  # fmt: skip
     b.clamp(body.start)
-    b.add_point_load(body.end, (0.0, 0.0, 3100.0))
+    b.add_point_load(body.end, (0.0, 0.0, traction * SIDE**2))
     b.add_probe("tip", body.end)
     return b
 
 
-def plate(cells: int) -> ModelBuilder:
+def plate(cells: int, *, law: SVK = LAW, traction: float = 1000.0 / (PLATE[1] * THICKNESS)) -> ModelBuilder:
     """The plate of 3443 elements, 2 cells x cells."""
     b = ModelBuilder(gravity=(0.0, 0.0, 0.0))
     mesh = meshes.grid(PLATE, cells=(2 * cells, cells))
-    thickness = 0.1
-    body = b.add_shell(mesh, thickness=thickness, material=SVK(E=E, nu=NU, density=DENSITY))
+    body = b.add_shell(mesh, thickness=THICKNESS, material=law)
     b.clamp(body.edge("x-"))
-    b.add_traction(body.surface("x+"), (0.0, 0.0, -1000.0 / (PLATE[1] * thickness)))
+    b.add_traction(body.surface("x+"), (0.0, 0.0, -traction))
     b.add_probe("tip", body.edge("x+"))
     return b
 

@@ -64,6 +64,7 @@ class Evaluation:
                 history,
                 one,
                 self._all(),
+                1,
                 contribution,
                 energy,
                 low,

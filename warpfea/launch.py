@@ -73,7 +73,7 @@ class Launcher:
         """Threads in whole warps, as sums over lanes want."""
         return -(-threads // WARP) * WARP if self.device.is_cuda else threads
 
-    def tiled(self, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int = 128) -> None:
+    def tiled(self, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
         """Launch one block per item of `dim`."""
         self._do(wp.launch_tiled, kernel, dim, inputs, block_dim)
 

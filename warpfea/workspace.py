@@ -10,6 +10,7 @@ import warp as wp
 from .integrators import Integrator
 from .kernels.constraints import JOINT_COLUMNS, SUM_ROWS
 from .kernels.gather import RESIDUAL_ROWS
+from .kernels.lanes import WARP
 from .kernels.newton import COMPONENT_ROWS, LANES, control_struct
 from .kernels.pcg import LANES as GROUP_LANES
 from .kernels.pcg import pcg_struct
@@ -69,6 +70,9 @@ class Workspace:
         self.explicit_work = self.array("explicit_work", (1, B), wp.float64)
         # scratch for kernels whose sums are not wanted
         self.spare_rows = self.array("spare_rows", (2, B, n) if model.constraints else (1, 1, 1), wp.float64)
+        # sums of the conjugate gradients come per warp
+        self.warp = WARP if model.device.is_cuda else 1
+        self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
         longest = max(n, model.element_count, model.constraints.count if model.constraints else 0)
@@ -97,7 +101,7 @@ class Workspace:
         self.newton.components = C
         if model.constraints:
             self.newton.violation = self.multipliers.violation
-        self.pcg = self._struct(pcg_struct(), B, sums=(2, B))
+        self.pcg = self._struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.step = self._struct(step_struct(), B)
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:

@@ -133,8 +133,8 @@ class ConstraintSolver:
                 launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 1, active])
             for c in range(len(sizes) - 2, -1, -1):
                 launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
-        args = [data, mul, w.inverse, r, z, int(into is not None), active, z if into is None else into, w.rows]
-        launch(k.project, (m.worlds, m.slots), args)
+        args = [data, mul, w.inverse, r, z, int(into is not None), active, w.warp]
+        launch(k.project, (m.worlds, launch.padded(m.slots)), [*args, z if into is None else into, w.warp_rows])
 
     @labelled("constraints")
     def predict(self, active: wp.array) -> None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..model import Model
     from ..workspace import Workspace
 
-__all__ = ["Assembled", "Pattern", "transposed_entries"]
+__all__ = ["Assembled", "Pattern", "make_pattern", "shaped"]
 
 
 def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
@@ -82,10 +82,10 @@ class Assembled:
         if "matrix" not in model.cache:
             model.cache["matrix"] = self._make_tables()
         self.pattern, self.mass, self.couplings, self.coupled = model.cache["matrix"]
-        self.kernels = [assembly_kernels(model.dtype, block.slots) for block in model.blocks]
+        self.runs = self._runs()
         self.common = block_kernels(model.dtype)
-        S = max(block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
-        self.scratch = work.array("element matrices", (model.worlds, S), model.types.mat33)
+        S = max(3 * block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
+        self.scratch = work.array("element matrices", (model.worlds, S), model.types.vec3)
 
     def _make_tables(self) -> tuple[Pattern, wp.array, Any, int]:
         """Pattern, masses of its upper entries, and what constraints add."""
@@ -101,10 +101,26 @@ class Assembled:
 
     def modules(self) -> set[wp.Module]:
         """Modules that assembly launches."""
-        out = {k.element_matrix.module for k in self.element_kernels} | {k.module for k in self.kernels}
+        out = {k.element_matrix.module for k in self.element_kernels}
+        out |= {assembly_kernels(self.model.dtype, block.slots).module for block in self.model.blocks}
         if self.model.constraints:
             out.add(self.common.coupling_module)
         return out
+
+    def _runs(self) -> list[list[tuple[Any, Any]]]:
+        """Blocks and their kernels; parts of one energy, which have the same elements, together."""
+        runs: list[list[tuple[Any, Any]]] = []
+        seen: list[np.ndarray] = []
+        for block, kernels in zip(self.model.blocks, self.element_kernels):
+            conn = np.concatenate([p.conn + p.body.slot_offset for p in block.parts])
+            for k, other in enumerate(seen):
+                if np.array_equal(conn, other):
+                    runs[k].append((block, kernels))
+                    break
+            else:
+                seen.append(conn)
+                runs.append([(block, kernels)])
+        return runs
 
     def _mass_of(self, pattern: Pattern) -> np.ndarray:
         """Scalar masses of the upper entries, kg."""
@@ -171,14 +187,14 @@ class Assembled:
         """
         m, w, launch = self.model, self.work, self.launch
         mass_factor, dq_dv = factors
-        for k, (block, elements, kernels) in enumerate(zip(m.blocks, self.element_kernels, self.kernels)):
-            pairs = block.slots * (block.slots + 1) // 2
-            matrix = _shaped(self.scratch, (m.worlds, pairs, block.count))
-            args = [block.data, u, w.v, w.history, dq_dv, int(projected), active, matrix]
-            launch(elements.element_matrix, (m.worlds, block.slots, block.count), args)
+        for first, parts in enumerate(self.runs):
+            for k, (block, elements) in enumerate(parts):
+                matrix = shaped(self.scratch, (m.worlds, 3 * block.slots * (block.slots + 1) // 2, block.count))
+                args = [block.data, u, w.v, w.history, dq_dv, int(projected), int(k > 0), active, matrix]
+                launch(elements.element_matrix, (m.worlds, 3 * block.slots, block.count), args)
             args = [m.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count, matrix]
-            args += [self.mass, int(k == 0), mass_factor, dq_dv, active, out]
-            launch(kernels.add_elements, (m.worlds, len(self.pattern.upper)), args)
+            args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]
+            launch(assembly_kernels(m.dtype, block.slots).add_elements, (m.worlds, len(self.pattern.upper)), args)
 
     def add_constraints(
         self, gradient: wp.array, stiffness: wp.array, dq_dv: wp.array, active: wp.array, out: wp.array
@@ -195,7 +211,7 @@ class Assembled:
         return sp.bsr_matrix((data, graph.indices, graph.indptr), shape=(n, n)).tocsr()
 
 
-def _shaped(array: wp.array, shape: tuple[int, ...]) -> wp.array:
+def shaped(array: wp.array, shape: tuple[int, ...]) -> wp.array:
     """The beginning of an array under another shape."""
     out: Any = wp.array(ptr=array.ptr, dtype=array.dtype, shape=shape, device=array.device)
     out._owner = array

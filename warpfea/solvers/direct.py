@@ -46,7 +46,7 @@ class Direct:
         assert residual.assembled is not None
         self.assembled = residual.assembled
         self.kernels = direct_kernels(model.dtype)
-        self.dim = (model.worlds, model.slots)
+        self.dim = (model.worlds, launch.padded(model.slots))
         self.factors = make_factors(model, self.assembled.pattern.graph)
         self.followers = [
             Followers(model, work, launch, part, self.assembled.pattern) for part in model.loads.followers
@@ -140,12 +140,12 @@ class Direct:
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
-        """z = H^-1 r; rows r.z and r.D^-1 r."""
+        """z = H^-1 r; r.z and r.D^-1 r in parts."""
         w = self.work
         for world in map(int, np.flatnonzero(active.numpy())):
             if not self._solve(r, z, world):
                 z[world].zero_()
-        self.launch(self.kernels.dot_rows, self.dim, [r, z, w.diagonal, active, w.rows])
+        self.launch(self.kernels.dot_rows, self.dim, [r, z, w.diagonal, active, w.warp, w.warp_rows])
 
     def _solve(self, r: wp.array, z: wp.array, world: int) -> bool:
         """Whether the world has factors; the first solution shows what they are good for."""

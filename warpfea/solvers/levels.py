@@ -22,7 +22,7 @@ GROUP_SLOTS = 64
 """Slots of a group whose affine motions are the coarse space: 16 unknowns of a level to one of the next."""
 WHOLE_SLOTS = 160
 """A model of up to so many slots is inverted as one dense matrix: it needs no levels."""
-BOTTOM_SLOTS = {"cpu": 160, "cuda": 1024}
+BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """So is a coarse level; on CUDA it costs less than the launches of more levels would."""
 MAX_LEVELS = 12
 
@@ -72,12 +72,16 @@ def make_levels(model: Model, pattern: Pattern) -> list[Level]:
     place = model.reference + origin * position[:, None]
     points = Points(place, position, np.cumsum(position) - 1, model.part)
     levels = []
+    bottom = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     for depth in range(MAX_LEVELS):
         n = pattern.graph.shape[0]
-        if n <= (BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"] if depth else WHOLE_SLOTS):
+        if n <= (bottom if depth else WHOLE_SLOTS):
             levels.append(Level(pattern, n, True, level_struct(model.dtype)()))
             return levels
-        level, points, pattern = _make_level(model, pattern, points)
+        # larger groups where that makes the next level the bottom: one dense product costs less than more levels
+        large = 2 * GROUP_SLOTS
+        capacity = large if 4 * n / GROUP_SLOTS > bottom >= 4.05 * n / large else GROUP_SLOTS
+        level, points, pattern = _make_level(model, pattern, points, capacity)
         levels.append(level)
         # joints tie what elements don't; further down anything near may share a group
         points.label = points.label if depth else model.component[_first_members(level)]
@@ -92,13 +96,13 @@ def _first_members(level: Level) -> np.ndarray:
     return np.repeat(slot[start[:-1]], 4)
 
 
-def _make_level(model: Model, pattern: Pattern, points: Points) -> tuple[Level, Points, Pattern]:
+def _make_level(model: Model, pattern: Pattern, points: Points, capacity: int) -> tuple[Level, Points, Pattern]:
     n = len(points.value)
     first = np.flatnonzero(np.diff(points.node, prepend=-1))
     sizes = np.diff(first, append=n)
     args = points.value[first], sizes, points.label[first]
     tile = bisect(*args, TILE_SLOTS)[points.node]
-    group = connected_groups(bisect(*args, GROUP_SLOTS)[points.node], pattern.graph)
+    group = connected_groups(bisect(*args, capacity)[points.node], pattern.graph)
     tiles, groups = int(tile.max()) + 1, int(group.max()) + 1
     data = level_struct(model.dtype)()
     order = np.argsort(tile, kind="stable")

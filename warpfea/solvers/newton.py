@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["NewtonLoop", "NewtonPCG"]
 
+CHORD = 0.02
+CHORD_SLOTS = 16384
 EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
 
 
@@ -139,6 +141,8 @@ class NewtonLoop:
         ctl.first_forcing = 0.1 if options.preconditioner == "block-jacobi" else 0.001
         if constrained:  # constraints are stiff: a loose first solve costs more iterations than it saves
             ctl.first_forcing = min(ctl.first_forcing, 0.01)
+        # a large matrix costs more than another iteration with that of the step's first
+        ctl.chord = CHORD if model.slots > CHORD_SLOTS else 0.0
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]

@@ -55,20 +55,18 @@ class PCG:
         self._translate(active)
 
     def _iterate(self) -> None:
-        m, w, k, launch = self.model, self.work, self.kernels, self.launch
+        w, k, launch = self.work, self.kernels, self.launch
         active = w.pcg.active
         self.residual.product(w.p, w.Hp, active)
-        self.residual.reduce(w.rows, 1, active, w.pcg.sums)
-        launch(k.step_length, m.worlds, [w.pcg])
+        self.residual.reduce(self.residual.curvature_rows, 1, active, w.pcg.curvature)
         launch(k.update, self.dim, [w.pcg, w.p, w.Hp, w.direction, w.r])
         self._precondition(active)
-        launch(k.direction_factor, m.worlds, [w.pcg])
-        launch(k.new_direction, self.dim, [w.pcg, active, w.z, w.p])
+        launch(k.new_direction, self.dim, [w.pcg, w.z, w.p])
 
     def _precondition(self, active: wp.array) -> None:
         w = self.work
         self.preconditioner.apply(w.r, w.z, active)
-        self.residual.reduce(w.rows, 2, active, w.pcg.sums)
+        self.residual.reduce(w.warp_rows, 2, active, w.pcg.sums)
 
     def _translate(self, active: wp.array) -> None:
         """x += Z (Z^T H Z)^-1 Z^T r."""

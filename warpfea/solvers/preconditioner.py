@@ -58,7 +58,7 @@ class BlockJacobi:
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.work, self.launch, self.residual = work, launch, residual
         self.kernels = pcg_kernels(model.dtype, model.constraints is not None)
-        self.dim = (model.worlds, model.slots)
+        self.dim = (model.worlds, launch.padded(model.slots))
 
     def register(self, state: State) -> None:
         """It remembers nothing."""
@@ -90,7 +90,7 @@ class BlockJacobi:
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
         w = self.work
-        self.launch(self.kernels.block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, z, w.rows])
+        self.launch(self.kernels.block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp, z, w.warp_rows])
         constraints = self.residual.constraints
         if constraints is not None and constraints.deflate:
             constraints.precondition(r, z, active)

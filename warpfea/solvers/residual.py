@@ -11,7 +11,7 @@ from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
 from ..launch import labelled
-from .assembled import Assembled
+from .assembled import Assembled, shaped
 
 if TYPE_CHECKING:
     from ..launch import Launcher
@@ -23,6 +23,8 @@ __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
 """Slots per element up to which H p from the elements is cheaper than from their matrix."""
+MANY_POINTS = 8
+"""Points of an element from which lanes share them."""
 
 
 class Reducer:
@@ -68,7 +70,8 @@ class Residual:
         self.massive = all(block.massive for block in model.blocks)
         # elements with many points per slot cost more than the matrix that they make
         many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
-        self.by_matrix = operator == "matrix" or (operator == "auto" and many)
+        # (on one core assembly costs more than it saves)
+        self.by_matrix = operator == "matrix" or (operator == "auto" and many and model.device.is_cuda)
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
             self.assembled = Assembled(model, work, launch, self.block_kernels)
@@ -111,8 +114,10 @@ class Residual:
         launch(self.newton.reset_min_J, m.worlds, [w.newton, active])
         launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         for block, kernels in zip(m.blocks, self.block_kernels):
-            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, w.contribution, w.energy_rows]
-            launch(kernels.internal_force, (m.worlds, block.count), [*args, w.newton.min_J, w.newton.domain_J])
+            lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1
+            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, lanes, w.contribution, w.energy_rows]
+            dim = (m.worlds, launch.padded(block.count * lanes))
+            launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
         self.push(active)
         if hold:
             self.hold_pushed(active)
@@ -164,7 +169,7 @@ class Residual:
 
     @labelled("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
-        """out = H p at the iterate, and p.Hp per slot in rows[0]."""
+        """out = H p at the iterate, and p.Hp in parts in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
         if self.massive and not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
@@ -181,16 +186,20 @@ class Residual:
         if self.constraints:
             self.constraints.product(p, active)
         rest = [start, entry, w.pushed_tangent, p, w.step.mass_factor, w.step.dq_dv, active, self.con, w.multipliers]
-        rest += [out, w.rows]
+        rest.append(w.warp)
+        padded = (m.worlds, launch.padded(m.slots))
         if self.by_matrix:
             assert self.assembled is not None
             pattern = self.assembled.pattern
             lanes = launch.lanes(pattern.width)
-            args = [m.topology, pattern.data, self.matrix, lanes, *rest]
-            launch(self.gather.matrix_product, (m.worlds, launch.padded(m.slots * lanes)), args)
+            threads = launch.padded(m.slots * lanes)
+            self.curvature_rows = shaped(w.rows, (1, m.worlds, threads // w.warp))
+            args = [m.topology, pattern.data, self.matrix, lanes, *rest, out, self.curvature_rows]
+            launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:
             kernel = self.gather.massive_product if self.massive else self.gather.product
-            launch(kernel, self.dim, [m.topology, w.contribution, *rest])
+            self.curvature_rows = w.warp_rows
+            launch(kernel, padded, [m.topology, w.contribution, *rest, out, w.warp_rows])
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""

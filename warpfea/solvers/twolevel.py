@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 __all__ = ["TwoLevel"]
 
-CHEBYSHEV_STEPS = 5
+CHEBYSHEV_STEPS = 3
 LARGEST = 3.5
 """Assumed largest eigenvalue of a preconditioned coarse matrix (2.7 to 3.5 were measured)."""
-RATIO = 16.0
+RATIO = 8.0
 """The largest over the smallest eigenvalue that the Chebyshev steps are made for."""
 REBUILD_COST = 40.0
 """Iterations that making the preconditioner costs."""
@@ -185,21 +185,23 @@ class TwoLevel:
             coarse, correct = z, 0
         else:
             coarse, correct = self._smooth(0, r, z, active), 1
-        args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, z, w.rows]
-        launch(k.add_coarse, self.dim, args)
+        args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
+        dim = (m.worlds, launch.padded(m.slots))
+        launch(k.add_coarse, dim, args)
         if self.tied:
             assert self.residual.constraints is not None
-            args = [w.inverse, r, w.diagonal, active, w.Hp, w.spare_rows]
-            launch(self.jacobi, self.dim, args)
+            args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
+            launch(self.jacobi, dim, args)
             self.residual.constraints.precondition(r, w.Hp, active, into=z)
 
     # application
 
     def _apply_dense(self, depth: int, r: wp.array, x: wp.array, active: wp.array) -> None:
         n, B = self.levels[depth].slots, self.model.worlds
-        flat_r = _flat(r, self.model.types.T, (B, 1, 3 * n))
-        flat_x = _flat(x, self.model.types.T, (B, 3 * n))
-        self.launch.tiled(self.kernels.apply_dense, (B, 3 * n), [self.arrays[depth].matrix, flat_r, active, flat_x])
+        flat_r, flat_x = (_flat(a, self.model.types.T, (B, 3 * n)) for a in (r, x))
+        lanes = self.launch.lanes(3 * n)
+        args = [self.arrays[depth].matrix, lanes, flat_r, active, flat_x]
+        self.launch(self.kernels.apply_dense, (B, self.launch.padded(3 * n * lanes)), args)
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = tiles times r; returns what is to be prolonged."""

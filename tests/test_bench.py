@@ -1,0 +1,156 @@
+"""`warpfea bench --peer` and `--growth`, called in this process on tiny rows; the peer's table and its meshes."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from warpfea import bench_growth, bench_peer
+from warpfea.bench_problems import PROBLEMS
+from warpfea.cli import main
+
+DATA = pathlib.Path(__file__).resolve().parent / "data"
+
+
+@pytest.fixture
+def bench(tmp_path, capfd):
+    """Exit code, what was printed, what was written."""
+
+    def run(*words):
+        target = tmp_path / "out.json"
+        code = main(["bench", *words, "--device", "cpu", "--out", str(target)])
+        out, err = capfd.readouterr()
+        return code, out + err, json.loads(target.read_text()) if target.exists() else None
+
+    return run
+
+
+def test_peer_measures_rows_by_label(bench):
+    code, text, content = bench("--peer", "--rows", "plate-16x8,bar-3x2x1,beam-30", "--steps", "4")
+    assert code == 0, text
+    labels = ["bar-3x2x1", "beam-30", "plate-16x8"]
+    assert content["settings"]["rows"] == labels
+    assert {"schema", "command", "commit", "machine", "versions"} <= set(content)
+    rows = content["rows"]
+    assert [r["label"] for r in rows] == labels
+    assert [r["unknowns"] for r in rows] == [315, 372, 1836]
+    assert [r["free_unknowns"] for r in rows] == [270, 360, 1728]
+    assert [r["elements"] for r in rows] == [36, 30, 128]
+    assert [r["peer_ms"] for r in rows] == [2.46, 4.1, 10.7]
+    for row in rows:
+        assert row["dtype"] == "float64"
+        assert row["required"] == 3.0
+        assert row["speedup"] == pytest.approx(row["peer_ms"] / row["ms_per_step"])
+        assert 1.0 <= row["newton_per_step"] <= row["pcg_per_step"]
+        assert row["bytes_per_unknown"] > 100.0
+        assert 0.0 < row["residual_force"] <= 5e-4
+        assert 0.0 <= row["tip_difference"] < 1e-6  # 0: no iterate lies between the two tolerances
+        assert row["label"] in text
+
+
+def test_float32_is_judged_against_float64(bench):
+    code, text, content = bench("--peer", "--rows", "bar-3x2x1", "--steps", "3", "--dtype", "float32")
+    assert code == 0, text
+    (row,) = content["rows"]
+    assert row["dtype"] == "float32"
+    assert 1e-9 < row["tip_difference"] < 1e-3
+
+
+def test_what_has_no_peer_is_timed_for_a_few_steps(bench, monkeypatch):
+    small = bench_peer.Case("bar-6x4x2", "bar", (6, 4, 2), 1755, None)
+    monkeypatch.setattr(bench_peer, "LARGE", small)
+    code, text, content = bench("--peer", "--large", "--rows", "bar-3x2x1", "--steps", "12")
+    assert code == 0, text
+    first, row = content["rows"]
+    assert first["label"] == "bar-3x2x1"
+    assert row["unknowns"] == small.unknowns
+    assert (row["peer_ms"], row["speedup"], row["required"], row["tip_difference"]) == (None,) * 4
+    assert content["settings"]["steps_without_peer"] == 10
+
+
+def test_rows_without_their_mesh_are_left_out_and_named(bench, tmp_path):
+    code, text, content = bench("--peer", "--rows", "bar-unstructured-*", "--meshes", str(tmp_path))
+    assert code == 0, text
+    assert content["rows"] == []
+    assert "bar-unstructured-4567: left out" in text
+    assert "bar_20822.npz" in text
+
+
+def test_times_that_count():
+    assert bench_peer.first_counted(120) == 20
+    assert [bench_peer.first_counted(n) for n in (1, 2, 10)] == [1, 2, 6]
+
+
+def test_table_of_the_peer():
+    assert len({case.label for case in bench_peer.PEER}) == 15
+    for case in (*bench_peer.PEER, bench_peer.LARGE):
+        if case.problem == "bar" and not isinstance(case.size, str):
+            assert case.unknowns == 3 * np.prod([2 * k + 1 for k in case.size])
+        elif case.problem != "bar" and case.unknowns < 30_000:
+            (body,) = PROBLEMS[case.problem].build(case.size).bodies
+            assert case.unknowns == 3 * body.slot_count
+    bars = {case.unknowns: bench_peer.required(case) for case in bench_peer.PEER}
+    assert {n for n, bar in bars.items() if bar == 40.0} == {883227}
+    assert {n for n, bar in bars.items() if bar == 3.0} == {n for n in bars if n < 100_000}
+    assert set(bars.values()) == {3.0, 10.0, 40.0}
+
+
+@pytest.mark.parametrize("case", [c for c in bench_peer.PEER if isinstance(c.size, str)], ids=lambda c: c.label)
+def test_unstructured_meshes_are_as_large_as_the_peers(case):
+    mesh = bench_peer.load(DATA / case.size)
+    assert mesh.volume() == pytest.approx(6.0, rel=1e-14)
+    assert mesh.straight_sided().all()
+    assert 3 * len(mesh.points) == pytest.approx(case.unknowns, rel=0.02)
+    assert len(mesh.cells) == pytest.approx(int(case.label.rpartition("-")[2]), rel=0.05)
+    (body,) = PROBLEMS["bar"].build(mesh).bodies
+    end = body.surface(lambda X: X[:, 0] > 3.0 - 1e-9)
+    assert np.all(mesh.points[end.nodes][:, :, 0] == 3.0)
+
+
+def test_growth_covers_the_product(bench):
+    code, text, content = bench("--growth", "--problem", "beam", "--sizes", "24,96")
+    assert code == 0, text
+    rows = content["rows"]
+    assert {(r["E"], r["dt"], r["nu"]) for r in rows} == {
+        (E, dt, nu) for E in (1e5, 1e8, 1e11) for dt in (1e-4, 1e-3, 1e-2) for nu in (0.3, 0.49)
+    }
+    assert len(rows) == 18
+    for row in rows:
+        assert row["unknowns"] == [24, 96]
+        assert row["outcome"] == ["converged"] * 2
+        assert row["growth"] == row["pcg"][1] / row["pcg"][0]
+    assert content["worst"] == {"beam": {"growth": max(r["growth"] for r in rows), "failures": 0}}
+
+
+def test_growth_shows_failures(bench, monkeypatch):
+    monkeypatch.setattr(bench_growth, "LIMITS", bench_growth.LIMITS | {"max_newton": 1})
+    monkeypatch.setattr(bench_growth, "MODULI", (1e8,))
+    code, text, content = bench("--growth", "--problem", "beam", "--sizes", "24,96")
+    assert code == 0, text
+    for row in content["rows"]:
+        assert all(outcome.startswith("ConvergenceError: ") for outcome in row["outcome"])
+        assert (row["pcg"], row["growth"]) == ([None, None], None)
+    assert content["worst"] == {"beam": {"growth": None, "failures": 12}}
+    assert "failed" in text
+
+
+BAD = {
+    "unknown row": (["--peer", "--rows", "bar-1"], ["'bar-1'", "bar-3x2x1"]),
+    "no such folder": (["--peer", "--meshes", "nowhere"], ["nowhere"]),
+    "both": (["--peer", "--growth"], ["--growth", "--peer"]),
+    "rows alone": (["--rows", "bar-3x2x1"], ["--rows", "--peer"]),
+    "sizes of the peer": (["--peer", "--unknowns", "1000"], ["--unknowns", "--peer"]),
+    "steps of growth": (["--growth", "--steps", "3"], ["--steps", "--growth"]),
+    "too small": (["--growth", "--sizes", "5"], ["5", "270"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_usage_is_named(bench, case):
+    words, named = BAD[case]
+    code, text, content = bench(*words)
+    assert code == 2
+    assert content is None
+    for word in named:
+        assert word in text
