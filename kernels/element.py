@@ -275,13 +275,15 @@ def element_kernels(
         V: Local,
         history: wp.array2d(dtype=sym6),
         dq: T,
+        lane: int,
+        lanes: int,
         world: int,
         elem: int,
     ) -> Local:
-        """K dU of an element."""
+        """A lane's share of the points of K dU."""
         c = coefficients(block, world, elem)
         f = Local()
-        for q in range(block.gradient.shape[0]):
+        for q in range(lane, block.gradient.shape[0], lanes):
             G = gradient_of(block, U, q, elem)
             dG = gradient_of(block, dU, q, elem)
             dP = m.increment(into_axes(block, G, q, elem), into_axes(block, dG, q, elem), c)
@@ -303,30 +305,39 @@ def element_kernels(
         mass_factor: wp.array(dtype=wp.float64),
         dq_dv: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
+        lanes: int,
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """c_M M p + (dq/dv) K p of straight elements, whose mass is one table times a number each."""
-        world, elem = wp.tid()
+        """c_M M p + (dq/dv) K p of straight elements, whose mass is one table times a number each.
+
+        So many lanes share the points of an element.
+        """
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        lane = index % lanes
+        elem = wp.min(index / lanes, block.count - 1)
         U = load(block, u, world, elem)
         dU = load(block, direction, world, elem)
         V = Local()
         if wp.static(damping == "rate"):
             V = load(block, v, world, elem)
         dq = T(dq_dv[world])
-        f = tangent_force(block, U, dU, V, history, dq, world, elem)
+        f = tangent_force(block, U, dU, V, history, dq, lane, lanes, world, elem)
         scale = T(mass_factor[world]) * block.density[elem]
         first = direction[world, block.conn[0, elem]]
         for i in range(NS):
-            a = vec3()
-            total = T(0.0)
-            for j in range(NS):
-                a += block.mass[i, j] * dU[j]
-                total += block.mass[i, j]
-            a += total * first
-            contribution[world, block.contribution_offset + i * block.count + elem] = dq * f[i] + scale * a
+            f[i] = lane_sum(f[i], lanes)
+        if lane == 0 and index < block.count * lanes:
+            for i in range(NS):
+                a = vec3()
+                total = T(0.0)
+                for j in range(NS):
+                    a += block.mass[i, j] * dU[j]
+                    total += block.mass[i, j]
+                a += total * first
+                contribution[world, block.contribution_offset + i * block.count + elem] = dq * f[i] + scale * a
 
     @wp.kernel(module=module)
     def tangent_product(
@@ -348,7 +359,7 @@ def element_kernels(
         V = Local()
         if wp.static(damping == "rate"):
             V = load(block, v, world, elem)
-        f = tangent_force(block, U, dU, V, history, T(dq_dv[world]), world, elem)
+        f = tangent_force(block, U, dU, V, history, T(dq_dv[world]), 0, 1, world, elem)
         for i in range(NS):
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
 
@@ -403,12 +414,25 @@ def element_kernels(
         return low
 
     @wp.kernel(module=matrix_module)
+    def prepare_matrix(
+        block: Block, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)
+    ):
+        """Rows of the displacement gradient, [world, 3 point + row, elem], for all columns of an element's matrix."""
+        world, q, elem = wp.tid()
+        if active[world] == 0:
+            return
+        G = gradient_of(block, load(block, u, world, elem), q, elem)
+        for i in range(3):
+            lines[world, 3 * q + i, elem] = G[i]
+
+    @wp.kernel(module=matrix_module)
     def element_matrix(
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
+        lines: wp.array3d(dtype=vec3),
         projected: int,
         add: int,
         active: wp.array(dtype=wp.int32),
@@ -425,7 +449,6 @@ def element_kernels(
         b = column / 3
         axis = column % 3
         c = coefficients(block, world, elem)
-        U = load(block, u, world, elem)
         V = Local()
         if wp.static(damping == "rate"):
             V = load(block, v, world, elem)
@@ -434,7 +457,9 @@ def element_kernels(
         unit[axis] = T(1.0)
         out = Local()
         for q in range(block.gradient.shape[0]):
-            G = gradient_of(block, U, q, elem)
+            G = wp.matrix_from_rows(
+                lines[world, 3 * q, elem], lines[world, 3 * q + 1, elem], lines[world, 3 * q + 2, elem]
+            )
             local = into_axes(block, G, q, elem)
             h = vec3()
             if wp.static(affine):
@@ -540,6 +565,7 @@ def element_kernels(
         tangent_product=tangent_product,
         massive_product=massive_product,
         diagonal_blocks=diagonal_blocks,
+        prepare_matrix=prepare_matrix,
         element_matrix=element_matrix,
         strain_history=strain_history,
         viscous_force=viscous_force,

@@ -194,12 +194,31 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             contribution[world, entry] = mu * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
 
     @wp.kernel(module=matrix_module)
+    def prepare_matrix(
+        block: Block, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)
+    ):
+        """x_a and x_b at the tying points, [world, tie and NT + tie, elem], for all columns of an element's matrix."""
+        world, tie, elem = wp.tid()
+        if active[world] == 0:
+            return
+        a = block.X_first[tie, elem]
+        d = block.X_second[tie, elem]
+        first = u[world, block.conn[0, elem]]
+        for i in range(NS):
+            x = u[world, block.conn[i, elem]] - block.is_position[i] * first
+            a += block.first[tie, i, elem] * x
+            d += block.second[tie, i, elem] * x
+        lines[world, tie, elem] = a
+        lines[world, NT + tie, elem] = d
+
+    @wp.kernel(module=matrix_module)
     def element_matrix(
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
+        lines: wp.array3d(dtype=vec3),
         projected: int,
         add: int,
         active: wp.array(dtype=wp.int32),
@@ -214,22 +233,20 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             return
         b = column / 3
         axis = column % 3
-        U = load(block, u, world, elem)
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         A = TieVectors()
         D = TieVectors()
         change = Ties()
+        e = Ties()
         for t in range(NT):
-            A[t] = block.X_first[t, elem] + line(block.first, U, t, elem)
-            D[t] = block.X_second[t, elem] + line(block.second, U, t, elem)
+            A[t] = lines[world, t, elem]
+            D[t] = lines[world, NT + t, elem]
             change[t] = block.first[t, b, elem] * D[t][axis] + block.second[t, b, elem] * A[t][axis]
+            X = block.X_first[t, elem]
+            Y = block.X_second[t, elem]
+            e[t] = wp.dot(X, D[t] - Y) + wp.dot(A[t] - X, D[t])
         stress = Ties()
         if projected == 0:
-            e = Ties()
-            for t in range(NT):
-                X = block.X_first[t, elem]
-                Y = block.X_second[t, elem]
-                e[t] = wp.dot(X, D[t] - Y) + wp.dot(A[t] - X, D[t])
             stress = stresses(block, e, world, elem)
         out = Local()
         for t in range(NT):
@@ -252,6 +269,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
 
     return _types.SimpleNamespace(
         module=module,
+        prepare_matrix=prepare_matrix,
         element_matrix=element_matrix,
         internal_force=internal_force,
         tangent_product=tangent_product,

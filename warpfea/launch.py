@@ -67,7 +67,7 @@ class Launcher:
         """Lanes that share a row with so many entries: a power of two; one on the CPU."""
         if not self.device.is_cuda:
             return 1
-        return min(WARP, 1 << max(0, (max(per_row, 1) - 1).bit_length() - 1))
+        return min(WARP, 1 << max(0, max(per_row, 1).bit_length() - 1))
 
     def padded(self, threads: int) -> int:
         """Threads in whole warps, as sums over lanes want."""

@@ -85,6 +85,8 @@ class Assembled:
         self.runs = self._runs()
         self.common = block_kernels(model.dtype)
         S = max(3 * block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
+        points = max(3 * block.points * block.count for block in model.blocks)
+        self.lines = work.array("element gradients", (model.worlds, points), model.types.vec3)
         self.scratch = work.array("element matrices", (model.worlds, S), model.types.vec3)
 
     def _make_tables(self) -> tuple[Pattern, wp.array, Any, int]:
@@ -190,7 +192,10 @@ class Assembled:
         for first, parts in enumerate(self.runs):
             for k, (block, elements) in enumerate(parts):
                 matrix = shaped(self.scratch, (m.worlds, 3 * block.slots * (block.slots + 1) // 2, block.count))
-                args = [block.data, u, w.v, w.history, dq_dv, int(projected), int(k > 0), active, matrix]
+                count = 2 if block.key.tying else 3
+                lines = shaped(self.lines, (m.worlds, count * block.points, block.count))
+                launch(elements.prepare_matrix, (m.worlds, block.points, block.count), [block.data, u, active, lines])
+                args = [block.data, u, w.v, w.history, dq_dv, lines, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (m.worlds, 3 * block.slots, block.count), args)
             args = [m.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count, matrix]
             args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]
