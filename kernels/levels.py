@@ -145,6 +145,7 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         level: Level,
         inverse: wp.array4d(dtype=T),
         by_row: int,
+        share: int,
         lanes: int,
         first_group: int,
         r: wp.array2d(dtype=vec3),
@@ -152,7 +153,7 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         z: wp.array2d(dtype=vec3),
         coarse: wp.array2d(dtype=vec3),
     ):
-        """z = tile inverse times r, one thread per slot; from thread `first_group` on P^T r, so many lanes per group.
+        """z = tile inverse times r, `share` lanes per slot; from thread `first_group` on P^T r, `lanes` per group.
 
         The inverse is symmetric: read by columns neighbouring threads read neighbouring numbers, which CUDA wants;
         read by rows one thread does, which the CPU wants.
@@ -161,29 +162,31 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         if index < first_group:
-            tile = index / TILE_SLOTS
-            place = index % TILE_SLOTS
+            part = index % share
+            place = (index / share) % TILE_SLOTS
+            tile = index / (share * TILE_SLOTS)
+            slot = level.tile_slot[wp.min(tile, level.tiles - 1), place]
             if tile >= level.tiles:
-                return
-            slot = level.tile_slot[tile, place]
-            if slot < 0:
-                return
+                slot = -1
             s = vec3()
-            for b in range(TILE_SLOTS):
-                other = level.tile_slot[tile, b]
-                if other >= 0:
-                    x = r[world, other]
-                    row = 3 * place
-                    column = 3 * b
-                    if by_row != 0:
-                        for i in range(3):
-                            for j in range(3):
-                                s[i] = s[i] + inverse[world, tile, row + i, column + j] * x[j]
-                    else:
-                        for j in range(3):
+            if slot >= 0:
+                for b in range(part, TILE_SLOTS, share):
+                    other = level.tile_slot[tile, b]
+                    if other >= 0:
+                        x = r[world, other]
+                        row = 3 * place
+                        column = 3 * b
+                        if by_row != 0:
                             for i in range(3):
-                                s[i] = s[i] + inverse[world, tile, column + j, row + i] * x[j]
-            z[world, slot] = s
+                                for j in range(3):
+                                    s[i] = s[i] + inverse[world, tile, row + i, column + j] * x[j]
+                        else:
+                            for j in range(3):
+                                for i in range(3):
+                                    s[i] = s[i] + inverse[world, tile, column + j, row + i] * x[j]
+            s = lane_sum(s, share)
+            if part == 0 and slot >= 0:
+                z[world, slot] = s
             return
         index -= first_group
         group = index / lanes
@@ -414,10 +417,24 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         lane = index % lanes
         row = wp.min(index / lanes, x.shape[1] - 1)
-        s = T(0.0)
-        for k in range(lane, r.shape[1], lanes):
-            s += matrix[world, row, k] * r[world, k]
-        s = scalar_sum(s, lanes)
+        # four sums at once keep enough loads under way
+        n = r.shape[1]
+        s0 = T(0.0)
+        s1 = T(0.0)
+        s2 = T(0.0)
+        s3 = T(0.0)
+        last = n - 3 * lanes
+        k = lane
+        while k < last:
+            s0 += matrix[world, row, k] * r[world, k]
+            s1 += matrix[world, row, k + lanes] * r[world, k + lanes]
+            s2 += matrix[world, row, k + 2 * lanes] * r[world, k + 2 * lanes]
+            s3 += matrix[world, row, k + 3 * lanes] * r[world, k + 3 * lanes]
+            k += 4 * lanes
+        while k < n:
+            s0 += matrix[world, row, k] * r[world, k]
+            k += lanes
+        s = scalar_sum((s0 + s1) + (s2 + s3), lanes)
         if lane == 0:
             x[world, row] = s
 

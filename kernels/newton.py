@@ -81,6 +81,7 @@ def control_struct():
         force: wp.array(dtype=wp.float64)  # |g| over the free components, N
         force_tol: wp.float64  # N; accepted without regard to the size of the forces; 0: never
         first_forcing: wp.float64
+        fixed_forcing: wp.int32  # all solves go as far as the first, whatever Newton's method needs
         chord: wp.float64  # reduction of the residual by which a step's matrix is used again
         relinearise: wp.array(dtype=wp.int32)  # the operator's matrix is to be made anew
         tol: wp.float64
@@ -316,7 +317,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
             if guard > f64(0.1):
                 eta = wp.max(eta, guard)
-            ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
+            if ctl.fixed_forcing == 0:
+                ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
             settle(ctl, world)
         else:
             ctl.searches[world] = ctl.searches[world] + 1

@@ -146,6 +146,8 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
                 # a loose tolerance of the forces must not leave constraints open
                 least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
         ctl.target[world] = wp.max(goal, least)
+        if newton.fixed_forcing != 0:
+            ctl.target[world] = newton.forcing[world] * norm
         if norm > ctl.target[world] and rz > f64(0.0) and ctl.max_iterations > 0:
             ctl.active[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)

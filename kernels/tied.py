@@ -212,6 +212,24 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         lines[world, NT + tie, elem] = d
 
     @wp.kernel(module=matrix_module)
+    def prepare_stress(block: Block, active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)):
+        """The stresses of the ties, at 2 NT + tie as first components."""
+        world, tie, elem = wp.tid()
+        if active[world] == 0:
+            return
+        first = (tie / W) * W
+        s = T(0.0)
+        for k in range(W):
+            t = first + k
+            a = lines[world, t, elem]
+            d = lines[world, NT + t, elem]
+            X = block.X_first[t, elem]
+            Y = block.X_second[t, elem]
+            s += block.coupling[tie, k, elem] * (wp.dot(X, d - Y) + wp.dot(a - X, d))
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        lines[world, 2 * NT + tie, elem] = vec3(mu * s, T(0.0), T(0.0))
+
+    @wp.kernel(module=matrix_module)
     def element_matrix(
         block: Block,
         u: wp.array2d(dtype=vec3),
@@ -234,30 +252,24 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         b = column / 3
         axis = column % 3
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
-        A = TieVectors()
-        D = TieVectors()
+        unit = vec3()
+        unit[axis] = T(1.0)
         change = Ties()
-        e = Ties()
         for t in range(NT):
-            A[t] = lines[world, t, elem]
-            D[t] = lines[world, NT + t, elem]
-            change[t] = block.first[t, b, elem] * D[t][axis] + block.second[t, b, elem] * A[t][axis]
-            X = block.X_first[t, elem]
-            Y = block.X_second[t, elem]
-            e[t] = wp.dot(X, D[t] - Y) + wp.dot(A[t] - X, D[t])
-        stress = Ties()
-        if projected == 0:
-            stress = stresses(block, e, world, elem)
+            x = wp.dot(unit, lines[world, t, elem])
+            y = wp.dot(unit, lines[world, NT + t, elem])
+            change[t] = block.first[t, b, elem] * y + block.second[t, b, elem] * x
         out = Local()
         for t in range(NT):
             first = (t / W) * W
             s = T(0.0)
             for k in range(W):
                 s += block.coupling[t, k, elem] * change[first + k]
-            da = (mu * s) * A[t]
-            dd = (mu * s) * D[t]
-            da[axis] = da[axis] + stress[t] * block.first[t, b, elem]
-            dd[axis] = dd[axis] + stress[t] * block.second[t, b, elem]
+            stress = T(0.0)
+            if projected == 0:
+                stress = lines[world, 2 * NT + t, elem][0]
+            da = (mu * s) * lines[world, t, elem] + (stress * block.first[t, b, elem]) * unit
+            dd = (mu * s) * lines[world, NT + t, elem] + (stress * block.second[t, b, elem]) * unit
             for a in range(NS):
                 out[a] = out[a] + block.first[t, a, elem] * dd + block.second[t, a, elem] * da
         for a in range(NS):
@@ -270,6 +282,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     return _types.SimpleNamespace(
         module=module,
         prepare_matrix=prepare_matrix,
+        prepare_stress=prepare_stress,
         element_matrix=element_matrix,
         internal_force=internal_force,
         tangent_product=tangent_product,

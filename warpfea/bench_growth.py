@@ -1,8 +1,8 @@
 """`warpfea bench --growth`: how PCG iterations grow with the mesh, over stiffness, step and Poisson's ratio.
 
-One step from rest of the problems of `bench_problems`, undamped, under 1e-6 E over the loaded area so that strains are
-small and the same for all E, to a relative residual of 1e-8. Iterations are those of the whole step; growth is that
-from the first size to the last. A step is not halved: one that does not converge is shown as failed.
+The first linear solve of a step from rest, to 1e-8 of its right side in the D^-1 norm, of the problems of
+`bench_problems`, undamped, under 1e-6 E over the loaded area so that strains are small and the same for all E. Growth
+is that of the iterations from the first size to the last. A solve that does not get there is shown as failed.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ STEPS = (1e-4, 1e-3, 1e-2)
 RATIOS = (0.3, 0.49)
 SIZES = (10_000, 100_000, 1_000_000)
 LOAD = 1e-6
-TOL = 1e-8
-LIMITS = {"max_newton": 10, "max_pcg": 5000, "max_halvings": 0}
+TOL = 0.1
+"""Of the step: any solve that works reaches it with the first Newton iteration."""
+LIMITS = {"forcing": 1e-8, "max_newton": 1, "max_pcg": 5000, "max_halvings": 0}
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class GrowthRow:
         E, dt, nu: Pa, s, -.
         unknowns: of each size.
         outcome: of each size, "converged" or the error.
-        newton, pcg: iterations of each size, None where it failed.
+        newton: iterations of each size, one where all is well.
+        pcg: iterations of each size, None where it failed.
         growth: PCG iterations of the last size over those of the first; None where either failed.
     """
 
@@ -100,6 +102,8 @@ def _step(sim: Simulation) -> _Cell:
         report = sim.step()
     except ConvergenceError as error:
         return _Cell(unknowns, f"ConvergenceError: {error}", None, None)
+    if report.pcg[0] >= LIMITS["max_pcg"]:
+        return _Cell(unknowns, f"{LIMITS['max_pcg']} iterations were not enough", int(report.newton[0]), None)
     return _Cell(unknowns, "converged", int(report.newton[0]), int(report.pcg[0]))
 
 
@@ -134,7 +138,7 @@ def _table(rows: list[GrowthRow]) -> str:
     head = f"{'problem':8} {'E, Pa':>6} {'dt, s':>6} {'nu':>5}"
     lines = [head + "".join(f" {f'PCG at {n}':>16}" for n in rows[0].unknowns) + f" {'growth':>7}"]
     for r in rows:
-        cells = ["failed" if p is None else f"{p} ({k} Newton)" for p, k in zip(r.pcg, r.newton)]
+        cells = ["failed" if p is None else str(p) for p in r.pcg]
         last = "-" if r.growth is None else f"{r.growth:.2f}"
         lines.append(
             f"{r.problem:8} {r.E:6.0e} {r.dt:6.0e} {r.nu:5.2f}" + "".join(f" {c:>16}" for c in cells) + f" {last:>7}"

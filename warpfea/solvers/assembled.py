@@ -192,9 +192,11 @@ class Assembled:
         for first, parts in enumerate(self.runs):
             for k, (block, elements) in enumerate(parts):
                 matrix = shaped(self.scratch, (m.worlds, 3 * block.slots * (block.slots + 1) // 2, block.count))
-                count = 2 if block.key.tying else 3
-                lines = shaped(self.lines, (m.worlds, count * block.points, block.count))
-                launch(elements.prepare_matrix, (m.worlds, block.points, block.count), [block.data, u, active, lines])
+                lines = shaped(self.lines, (m.worlds, 3 * block.points, block.count))
+                points = (m.worlds, block.points, block.count)
+                launch(elements.prepare_matrix, points, [block.data, u, active, lines])
+                if block.key.tying and not projected:
+                    launch(elements.prepare_stress, points, [block.data, active, lines])
                 args = [block.data, u, w.v, w.history, dq_dv, lines, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (m.worlds, 3 * block.slots, block.count), args)
             args = [m.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count, matrix]

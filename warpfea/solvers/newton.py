@@ -38,6 +38,7 @@ class NewtonPCG:
             stressed body without loads has a scale. None: 1e-8 in float64, 1e-4 in float32.
         force_tol: a step is accepted also when |g|, the plain norm over the free components, is at most so many newtons
             (gradient slots count in N m); 0: never.
+        forcing: relative residual of the linear solves; None: Eisenstat and Walker's, no further than needed.
         max_newton: iterations before a step is refused.
         max_pcg: iterations per linear solve.
         max_halvings: how often a refused step may be halved.
@@ -58,6 +59,7 @@ class NewtonPCG:
 
     tol: float | None = None
     force_tol: float = 0.0
+    forcing: float | None = None
     max_newton: int = 30
     max_pcg: int = 2000
     max_halvings: int = 8
@@ -77,6 +79,8 @@ class NewtonPCG:
             raise ModelError(f"NewtonPCG: linear = {self.linear!r} is neither 'pcg' nor 'direct'")
         if self.linear == "direct" and self.preconditioner != "auto":
             raise ModelError(f"NewtonPCG: preconditioner = {self.preconditioner!r} is not for linear = 'direct'")
+        if self.forcing is not None and not (math.isfinite(self.forcing) and 0.0 < self.forcing < 1.0):
+            raise ModelError(f"NewtonPCG: forcing = {self.forcing!r} must lie between 0 and 1")
         if self.operator not in ("auto", "elements", "matrix"):
             raise ModelError(f"NewtonPCG: operator = {self.operator!r} is none of 'auto', 'elements', 'matrix'")
         for name in ("max_newton", "max_pcg", "max_outer"):
@@ -141,6 +145,9 @@ class NewtonLoop:
         ctl.first_forcing = 0.1 if options.preconditioner == "block-jacobi" else 0.001
         if constrained:  # constraints are stiff: a loose first solve costs more iterations than it saves
             ctl.first_forcing = min(ctl.first_forcing, 0.01)
+        ctl.fixed_forcing = int(options.forcing is not None)
+        if options.forcing is not None:
+            ctl.first_forcing = options.forcing
         # a large matrix costs more than another iteration with that of the step's first
         ctl.chord = CHORD if model.slots > CHORD_SLOTS else 0.0
         ctl.force_tol = options.force_tol

@@ -206,9 +206,10 @@ class TwoLevel:
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = tiles times r; returns what is to be prolonged."""
         level, arrays, below = self.levels[depth], self.arrays[depth], self.arrays[depth + 1].vectors
-        first_group = self.launch.padded(TILE_SLOTS * level.tiles)
+        share = 4 if self.model.device.is_cuda else 1
+        first_group = self.launch.padded(share * TILE_SLOTS * level.tiles)
         lanes = self.launch.lanes(GROUP_SLOTS)
-        args = [level.data, arrays.matrix, self.by_row, lanes, first_group, r, active, z, below["r"]]
+        args = [level.data, arrays.matrix, self.by_row, share, lanes, first_group, r, active, z, below["r"]]
         self.launch(self.kernels.smooth, (self.model.worlds, first_group + lanes * level.groups), args)
         if self.levels[depth + 1].dense:
             self._apply_dense(depth + 1, below["r"], below["x"], active)
