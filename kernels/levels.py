@@ -42,11 +42,21 @@ def level_struct(dtype: str):
 
 
 @functools.cache
-def level_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels of the levels in one precision."""
+def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamespace:
+    """Kernels of the levels in one precision.
+
+    `storage`: precision of the inverses, by default the same. Another one holds them scaled to a unit diagonal of A,
+    R B R with R^2 = diag A, and with so much on the diagonal that rounding leaves them positive definite.
+    """
+    storage = storage or dtype
+    S = precision(storage).T
+    scaled = storage != dtype
+    ROUNDING = {"float64": 2.0**-53, "float32": 2.0**-24}[storage]
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
+    vec4 = wp.types.vector(length=4, dtype=T)
+    mat44 = wp.types.matrix(shape=(4, 4), dtype=T)
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     lanes_of = lane_functions(dtype)
@@ -54,7 +64,7 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     scalar_sum = lanes_of.scalar_sum
     # a pivot below this share of its diagonal is rounding: the functions are dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[dtype]
-    module = kernel_module(f"levels_{dtype}", max_unroll=SMALL)
+    module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SMALL)
     build_module = kernel_module(f"levels_build_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=build_module)
@@ -143,7 +153,8 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def smooth(
         level: Level,
-        inverse: wp.array4d(dtype=T),
+        inverse: wp.array4d(dtype=S),
+        root: wp.array3d(dtype=T),
         by_row: int,
         share: int,
         lanes: int,
@@ -174,18 +185,24 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
                     other = level.tile_slot[tile, b]
                     if other >= 0:
                         x = r[world, other]
+                        if wp.static(scaled):
+                            for j in range(3):
+                                x[j] = x[j] * root[world, tile, 3 * b + j]
                         row = 3 * place
                         column = 3 * b
                         if by_row != 0:
                             for i in range(3):
                                 for j in range(3):
-                                    s[i] = s[i] + inverse[world, tile, row + i, column + j] * x[j]
+                                    s[i] = s[i] + T(inverse[world, tile, row + i, column + j]) * x[j]
                         else:
                             for j in range(3):
                                 for i in range(3):
-                                    s[i] = s[i] + inverse[world, tile, column + j, row + i] * x[j]
+                                    s[i] = s[i] + T(inverse[world, tile, column + j, row + i]) * x[j]
             s = lane_sum(s, share)
             if part == 0 and slot >= 0:
+                if wp.static(scaled):
+                    for i in range(3):
+                        s[i] = s[i] * root[world, tile, 3 * place + i]
                 z[world, slot] = s
             return
         index -= first_group
@@ -380,32 +397,122 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=T),
     ):
-        """One pivot of block Gauss-Jordan."""
+        """One pivot of block Gauss-Jordan; a thread does 4 x 4 entries, which share what they read."""
+        world, i4, j4 = wp.tid()
+        if active[world] == 0:
+            return
+        i = 4 * i4
+        j = 4 * j4
+        # a tile's size is a multiple of 4: the entries lie on the same side of it
+        in_row = i >= first and i < first + TILE
+        in_column = j >= first and j < first + TILE
+        if in_column:
+            for a in range(4):
+                for b in range(4):
+                    x = T(0.0)
+                    if in_row:
+                        x = pivot[world, 0, i - first + a, j - first + b]
+                    else:
+                        x = -left[world, j - first + b, i + a]
+                    matrix[world, i + a, j + b] = x
+            return
+        s = mat44()
+        for m in range(TILE):
+            column = vec4()
+            line = vec4()
+            for a in range(4):
+                if in_row:
+                    column[a] = pivot[world, 0, i - first + a, m]
+                else:
+                    column[a] = -left[world, m, i + a]
+                line[a] = top[world, m, j + a]
+            s += wp.outer(column, line)
+        for a in range(4):
+            for b in range(4):
+                if in_row:
+                    matrix[world, i + a, j + b] = s[a, b]
+                else:
+                    matrix[world, i + a, j + b] = matrix[world, i + a, j + b] + s[a, b]
+
+    @wp.func
+    def inverse_root(d: T) -> T:
+        """1/sqrt of a pivot's diagonal, 0 without an unknown."""
+        return wp.where(d == T(0.0), T(0.0), T(1.0) / wp.sqrt(wp.abs(d)))
+
+    @wp.kernel(module=module)
+    def store_tiles(
+        tiles: int,
+        diagonal: wp.array3d(dtype=T),
+        matrix: wp.array4d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        root: wp.array3d(dtype=T),
+        stored: wp.array4d(dtype=S),
+    ):
+        """Inverses of tiles into their storage, one thread per row."""
+        world, tile, i = wp.tid()
+        if active[world] == 0:
+            return
+        trace = T(0.0)
+        for j in range(TILE):
+            trace += matrix[world, tile, j, j] * wp.abs(diagonal[world, tile, j])
+        own = inverse_root(diagonal[world, tile, i])
+        root[world, tile, i] = own
+        for j in range(TILE):
+            other = inverse_root(diagonal[world, tile, j])
+            x = T(0.0)
+            if own > T(0.0) and other > T(0.0):
+                x = matrix[world, tile, i, j] / (own * other)
+                if i == j:
+                    x += T(ROUNDING) * trace
+            stored[world, tile, i, j] = S(x)
+
+    @wp.kernel(module=module)
+    def store_dense(
+        diagonal: wp.array2d(dtype=T),
+        trace: wp.array2d(dtype=f64),
+        matrix: wp.array3d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        root: wp.array2d(dtype=T),
+        stored: wp.array3d(dtype=S),
+    ):
+        """The dense inverse into its storage."""
         world, i, j = wp.tid()
         if active[world] == 0:
             return
-        row = i - first
-        column = j - first
-        in_row = row >= 0 and row < TILE
-        in_column = column >= 0 and column < TILE
-        if in_row and in_column:
-            matrix[world, i, j] = pivot[world, 0, row, column]
-        elif in_column:
-            matrix[world, i, j] = -left[world, column, i]
+        own = inverse_root(diagonal[world, i])
+        other = inverse_root(diagonal[world, j])
+        x = T(0.0)
+        if own > T(0.0) and other > T(0.0):
+            x = matrix[world, i, j] / (own * other)
+            if i == j:
+                x += T(ROUNDING) * T(trace[0, world])
+        stored[world, i, j] = S(x)
+        if i == j:
+            root[world, i] = own
+
+    @wp.kernel(module=module)
+    def dense_traces(
+        diagonal: wp.array2d(dtype=T),
+        matrix: wp.array3d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """Terms of the trace of the scaled inverse."""
+        world, i = wp.tid()
+        if active[world] != 0:
+            rows[0, world, i] = f64(matrix[world, i, i] * wp.abs(diagonal[world, i]))
+
+    @wp.func
+    def part_of(root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, k: int) -> T:
+        if wp.static(scaled):
+            return r[world, k] * root[world, k]
         else:
-            s = T(0.0)
-            if in_row:
-                for m in range(TILE):
-                    s += pivot[world, 0, row, m] * top[world, m, j]
-                matrix[world, i, j] = s
-            else:
-                for m in range(TILE):
-                    s += left[world, m, i] * top[world, m, j]
-                matrix[world, i, j] = matrix[world, i, j] - s
+            return r[world, k]
 
     @wp.kernel(module=module)
     def apply_dense(
-        matrix: wp.array3d(dtype=T),
+        matrix: wp.array3d(dtype=S),
+        root: wp.array2d(dtype=T),
         lanes: int,
         r: wp.array2d(dtype=T),
         active: wp.array(dtype=wp.int32),
@@ -426,16 +533,18 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         last = n - 3 * lanes
         k = lane
         while k < last:
-            s0 += matrix[world, row, k] * r[world, k]
-            s1 += matrix[world, row, k + lanes] * r[world, k + lanes]
-            s2 += matrix[world, row, k + 2 * lanes] * r[world, k + 2 * lanes]
-            s3 += matrix[world, row, k + 3 * lanes] * r[world, k + 3 * lanes]
+            s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
+            s1 += T(matrix[world, row, k + lanes]) * part_of(root, r, world, k + lanes)
+            s2 += T(matrix[world, row, k + 2 * lanes]) * part_of(root, r, world, k + 2 * lanes)
+            s3 += T(matrix[world, row, k + 3 * lanes]) * part_of(root, r, world, k + 3 * lanes)
             k += 4 * lanes
         while k < n:
-            s0 += matrix[world, row, k] * r[world, k]
+            s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
             k += lanes
         s = scalar_sum((s0 + s1) + (s2 + s3), lanes)
         if lane == 0:
+            if wp.static(scaled):
+                s = s * root[world, row]
             x[world, row] = s
 
     return _types.SimpleNamespace(
@@ -451,5 +560,8 @@ def level_kernels(dtype: str) -> _types.SimpleNamespace:
         take_pivot=take_pivot,
         take_panels=take_panels,
         eliminate=eliminate,
+        store_tiles=store_tiles,
+        store_dense=store_dense,
+        dense_traces=dense_traces,
         apply_dense=apply_dense,
     )

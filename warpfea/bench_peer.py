@@ -32,6 +32,7 @@ STEPS = 120
 FIRST = 20
 """First step whose time counts."""
 TIP_STEP = 100
+OPTIONS = {"preconditioner_dtype": "float32"}
 FORCE_TOL = 5e-4
 TIGHTER = 10.0
 
@@ -119,7 +120,7 @@ def measure(case: Case, dtype: str, *, device: Any, steps: int, meshes: pathlib.
     setup = clock.perf_counter() - began
     if case.peer_ms is None:
         steps = min(steps, LARGE_STEPS)
-    run = run_once(model, dt=DT, steps=steps, solver=solver(None, force_tol=FORCE_TOL))
+    run = run_once(model, dt=DT, steps=steps, solver=solver(None, force_tol=FORCE_TOL, **OPTIONS))
     at = min(steps, TIP_STEP)
     tip = float(run.tip(problem.axis)[at - 1])
     row = PeerRow(
@@ -193,6 +194,7 @@ def peer(options: argparse.Namespace) -> None:
         "steps": steps,
         "first_step_timed": first_counted(steps),
         "force_tol": FORCE_TOL,
+        **OPTIONS,
         "tip_after_step": min(steps, TIP_STEP),
         "reference_tolerance_factor": 1.0 / TIGHTER,
         "steps_without_peer": min(steps, LARGE_STEPS),

@@ -47,6 +47,8 @@ class NewtonPCG:
             constraints.
         linear: "pcg", or "direct": H is factorised (SuperLU on the host; on a GPU cuDSS where it is installed), for
             reference and the hardest cases. PCG's iterations are then one or two, and steps are not recorded as graphs.
+        preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
+            model's. They are made in the model's precision; float32 halves what an application reads.
         operator: H p from "elements", from the "matrix" assembled at every iterate, or "auto", by which is cheaper.
         multipliers: how constraint forces are found: "newton", with every Newton step, or "outer", the classical
             augmented Lagrangian, in a loop around the Newton solves.
@@ -65,6 +67,7 @@ class NewtonPCG:
     max_halvings: int = 8
     preconditioner: str = "auto"
     linear: str = "pcg"
+    preconditioner_dtype: str | None = None
     operator: str = "auto"
     multipliers: str = "newton"
     penalty: float = 1000.0
@@ -79,6 +82,10 @@ class NewtonPCG:
             raise ModelError(f"NewtonPCG: linear = {self.linear!r} is neither 'pcg' nor 'direct'")
         if self.linear == "direct" and self.preconditioner != "auto":
             raise ModelError(f"NewtonPCG: preconditioner = {self.preconditioner!r} is not for linear = 'direct'")
+        if self.preconditioner_dtype not in (None, "float32", "float64"):
+            raise ModelError(
+                f"NewtonPCG: preconditioner_dtype = {self.preconditioner_dtype!r} is none of 'float32', 'float64', None"
+            )
         if self.forcing is not None and not (math.isfinite(self.forcing) and 0.0 < self.forcing < 1.0):
             raise ModelError(f"NewtonPCG: forcing = {self.forcing!r} must lie between 0 and 1")
         if self.operator not in ("auto", "elements", "matrix"):
@@ -134,7 +141,9 @@ class NewtonLoop:
             assembled=options.preconditioner != "block-jacobi",
         )
         self.direct = Direct(model, work, launch, self.residual) if direct else None
-        self.preconditioner = self.direct or make(options.preconditioner, model, work, launch, self.residual)
+        self.preconditioner = self.direct or make(
+            options.preconditioner, options.preconditioner_dtype, model, work, launch, self.residual
+        )
         self.pcg = PCG(
             model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
         )

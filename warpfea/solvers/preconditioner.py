@@ -96,10 +96,12 @@ class BlockJacobi:
             constraints.precondition(r, z, active)
 
 
-def make(name: str, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> Preconditioner:
+def make(
+    name: str, storage: str | None, model: Model, work: Workspace, launch: Launcher, residual: Residual
+) -> Preconditioner:
     """The preconditioner `name`; "auto" is the best there is. Raises ModelError listing the names."""
     if name in ("auto", "two-level"):
-        return TwoLevel(model, work, launch, residual)
+        return TwoLevel(model, work, launch, residual, storage)
     if name == "block-jacobi":
         return BlockJacobi(model, work, launch, residual)
     raise ModelError(f"preconditioner {name!r} is unknown; there are auto, two-level, block-jacobi")

@@ -23,7 +23,6 @@ __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
 """Slots per element up to which H p from the elements is cheaper than from their matrix."""
-FEW_ELEMENTS = 60000
 MANY_POINTS = 8
 """Points of an element from which lanes share them."""
 
@@ -174,11 +173,8 @@ class Residual:
         m, w, launch = self.model, self.work, self.launch
         if self.massive and not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
-                # few elements leave a device idle: lanes share their points then
-                lanes = launch.lanes(block.points) if block.count < FEW_ELEMENTS else 1
-                args = [block.data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, lanes, p]
-                dim = (m.worlds, launch.padded(block.count * lanes))
-                launch(kernels.massive_product, dim, [*args, w.contribution])
+                args = [block.data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p, w.contribution]
+                launch(kernels.massive_product, (m.worlds, block.count), args)
         elif not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
                 args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]

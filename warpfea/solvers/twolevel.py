@@ -24,6 +24,7 @@ from ..kernels.blocks import block_kernels
 from ..kernels.lag import lag_kernels, lag_struct
 from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels
 from ..kernels.pcg import pcg_kernels
+from ..kernels.types import precision
 from ..launch import labelled
 from .levels import GROUP_SLOTS, Level, make_levels
 
@@ -48,20 +49,29 @@ REBUILD_COST = 40.0
 class LevelArrays:
     """Matrices and vectors of one level, [world, ...]."""
 
-    def __init__(self, model: Model, work: Workspace, level: Level, depth: int) -> None:
+    def __init__(self, model: Model, work: Workspace, level: Level, depth: int, storage: str) -> None:
         B, n, T = model.worlds, level.slots, model.types.T
+        S = precision(storage).T
+        other = storage != model.dtype
         name = f"level {depth}"
         self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
         if level.dense:
             N = TILE * -(-n // TILE_SLOTS)
             self.size = N
             self.matrix = work.array(f"{name} inverse", (B, N, N), T)
+            self.stored = work.array(f"{name} stored", (B, N, N), S) if other else self.matrix
+            self.root = work.array(f"{name} root", (B, N if other else 1), T)
+            self.rows = work.array(f"{name} rows", (1, B, N if other else 1), wp.float64)
+            self.trace = work.array(f"{name} trace", (1, B), wp.float64)
             self.left = work.array(f"{name} panels", (B, TILE, N), T)
             self.top = work.array(f"{name} panels 2", (B, TILE, N), T)
             self.scale = work.array(f"{name} diagonal", (B, N), T)
             self.pivot = work.array(f"{name} pivot", (B, 1, TILE, TILE), T)
         else:
-            self.matrix = work.array(f"{name} inverse", (B, level.tiles, TILE, TILE), T)
+            shape = (B, level.tiles, TILE, TILE)
+            self.matrix = work.array(f"{name} inverse", shape, T)
+            self.stored = work.array(f"{name} stored", shape, S) if other else self.matrix
+            self.root = work.array(f"{name} root", shape[:3] if other else (1, 1, 1), T)
         tiles = 1 if level.dense else level.tiles
         self.diagonal = work.array(f"{name} pivots", (B, tiles, TILE), T)
         self.column = work.array(f"{name} column", (B, tiles, TILE), T)
@@ -74,11 +84,14 @@ class LevelArrays:
 class TwoLevel:
     """See the module; it is made anew when the rule of kernels/lag.py says so."""
 
-    def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, residual: Residual, storage: str | None = None
+    ) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
+        self.storage = storage or model.dtype
         assert residual.assembled is not None
         self.assembled = residual.assembled
-        self.kernels = level_kernels(model.dtype)
+        self.kernels = level_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
         self.lag_kernels = lag_kernels(model.dtype)
         self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
@@ -87,7 +100,7 @@ class TwoLevel:
         if "levels" not in model.cache:
             model.cache["levels"] = make_levels(model, self.assembled.pattern)
         self.levels: list[Level] = model.cache["levels"]
-        self.arrays = [LevelArrays(model, work, level, k) for k, level in enumerate(self.levels)]
+        self.arrays = [LevelArrays(model, work, level, k, self.storage) for k, level in enumerate(self.levels)]
         self.value = self.assembled.values("preconditioner matrix")
         self.lanes = LANES if model.device.is_cuda else 1
         self.by_row = 0 if model.device.is_cuda else 1
@@ -200,7 +213,8 @@ class TwoLevel:
         n, B = self.levels[depth].slots, self.model.worlds
         flat_r, flat_x = (_flat(a, self.model.types.T, (B, 3 * n)) for a in (r, x))
         lanes = self.launch.lanes(3 * n)
-        args = [self.arrays[depth].matrix, lanes, flat_r, active, flat_x]
+        arrays = self.arrays[depth]
+        args = [arrays.stored, arrays.root, lanes, flat_r, active, flat_x]
         self.launch(self.kernels.apply_dense, (B, self.launch.padded(3 * n * lanes)), args)
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
@@ -209,7 +223,19 @@ class TwoLevel:
         share = 4 if self.model.device.is_cuda else 1
         first_group = self.launch.padded(share * TILE_SLOTS * level.tiles)
         lanes = self.launch.lanes(GROUP_SLOTS)
-        args = [level.data, arrays.matrix, self.by_row, share, lanes, first_group, r, active, z, below["r"]]
+        args = [
+            level.data,
+            arrays.stored,
+            arrays.root,
+            self.by_row,
+            share,
+            lanes,
+            first_group,
+            r,
+            active,
+            z,
+            below["r"],
+        ]
         self.launch(self.kernels.smooth, (self.model.worlds, first_group + lanes * level.groups), args)
         if self.levels[depth + 1].dense:
             self._apply_dense(depth + 1, below["r"], below["x"], active)
@@ -277,6 +303,9 @@ class TwoLevel:
         args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
         self.launch(k.fill_tiles, (B, level.tiles, TILE_SLOTS), args)
         self._gauss_jordan(level.tiles, arrays.matrix, arrays, flags, keep=keep)
+        if arrays.stored is not arrays.matrix:
+            args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]
+            self.launch(k.store_tiles, (B, level.tiles, TILE), args)
 
     def _gauss_jordan(self, tiles: int, matrix: wp.array, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
         args = [self.lanes, tiles, int(keep), flags, arrays.diagonal, arrays.column, matrix]
@@ -295,7 +324,12 @@ class TwoLevel:
             args = [arrays.matrix, arrays.pivot, first, flags, arrays.left, arrays.top]
             launch(k.take_panels, (B, TILE, N), args)
             args = [arrays.pivot, arrays.left, arrays.top, first, flags, arrays.matrix]
-            launch(k.eliminate, (B, N, N), args)
+            launch(k.eliminate, (B, N // 4, N // 4), args)
+        if arrays.stored is not arrays.matrix:
+            launch(k.dense_traces, (B, N), [arrays.scale, arrays.matrix, flags, arrays.rows])
+            self.residual.reduce(arrays.rows, 1, flags, arrays.trace)
+            args = [arrays.scale, arrays.trace, arrays.matrix, flags, arrays.root, arrays.stored]
+            launch(k.store_dense, (B, N, N), args)
 
 
 def _flat(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:
