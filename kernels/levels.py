@@ -56,16 +56,15 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
     vec4 = wp.types.vector(length=4, dtype=T)
-    mat44 = wp.types.matrix(shape=(4, 4), dtype=T)
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     lanes_of = lane_functions(dtype)
     sync, lane_sum, row_sum = lanes_of.sync, lanes_of.lane_sum, lanes_of.row_sum
     scalar_sum = lanes_of.scalar_sum
     # a pivot below this share of its diagonal is rounding: the functions are dependent
-    NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[dtype]
+    NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
     module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SMALL)
-    build_module = kernel_module(f"levels_build_{dtype}", max_unroll=SMALL)
+    build_module = kernel_module(f"levels_build_{dtype}{'_' + storage if scaled else ''}", max_unroll=SMALL)
 
     @wp.kernel(module=build_module)
     def fill_tiles(
@@ -397,42 +396,35 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=T),
     ):
-        """One pivot of block Gauss-Jordan; a thread does 4 x 4 entries, which share what they read."""
-        world, i4, j4 = wp.tid()
+        """One pivot of block Gauss-Jordan; a thread does four rows of a column, which share what they read."""
+        world, i4, j = wp.tid()
         if active[world] == 0:
             return
         i = 4 * i4
-        j = 4 * j4
-        # a tile's size is a multiple of 4: the entries lie on the same side of it
+        # a tile's size is a multiple of 4: the rows lie on the same side of it
         in_row = i >= first and i < first + TILE
         in_column = j >= first and j < first + TILE
-        if in_column:
+        s = vec4()
+        if in_row and in_column:
             for a in range(4):
-                for b in range(4):
-                    x = T(0.0)
-                    if in_row:
-                        x = pivot[world, 0, i - first + a, j - first + b]
-                    else:
-                        x = -left[world, j - first + b, i + a]
-                    matrix[world, i + a, j + b] = x
-            return
-        s = mat44()
-        for m in range(TILE):
-            column = vec4()
-            line = vec4()
+                s[a] = pivot[world, 0, i - first + a, j - first]
+        elif in_column:
             for a in range(4):
-                if in_row:
-                    column[a] = pivot[world, 0, i - first + a, m]
-                else:
-                    column[a] = -left[world, m, i + a]
-                line[a] = top[world, m, j + a]
-            s += wp.outer(column, line)
+                s[a] = -left[world, j - first, i + a]
+        elif in_row:
+            for m in range(TILE):
+                x = top[world, m, j]
+                for a in range(4):
+                    s[a] = s[a] + pivot[world, 0, i - first + a, m] * x
+        else:
+            for a in range(4):
+                s[a] = matrix[world, i + a, j]
+            for m in range(TILE):
+                x = top[world, m, j]
+                for a in range(4):
+                    s[a] = s[a] - left[world, m, i + a] * x
         for a in range(4):
-            for b in range(4):
-                if in_row:
-                    matrix[world, i + a, j + b] = s[a, b]
-                else:
-                    matrix[world, i + a, j + b] = matrix[world, i + a, j + b] + s[a, b]
+            matrix[world, i + a, j] = s[a]
 
     @wp.func
     def inverse_root(d: T) -> T:

@@ -204,7 +204,8 @@ def host_blocks(body: Body, *, tables: bool) -> Iterator[HostBlock]:
         if material.damping and material.damping.eta == 0.0 and material.damping.lambda_v == 0.0:
             damping = None
         for is_flat, rule in ((True, body.rule), (False, body.curved_rule)):
-            members = np.flatnonzero((body.material_of == k) & (flat == is_flat))
+            chosen = (body.material_of == k) & (flat == is_flat)
+            members = body.element_order[chosen[body.element_order]]
             if len(members):
                 for part, integral in enumerate(body.family.scheme(rule)):
                     law, values = integral.law(material) if integral.law else (material.law, material.coefficients())

@@ -13,8 +13,12 @@ from .elements import Family
 from .errors import ModelError
 from .materials import Material
 from .mesh import Mesh
+from .partition import morton_order
 
 __all__ = ["Body", "ElementSet", "MaterialPoint", "NodeSet", "SurfaceSet"]
+
+LARGE = 20000
+"""Nodes from which a body's slots and elements are ordered by place; smaller ones fit into caches anyway."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +142,14 @@ class Body:
 
     @cached_property
     def node_slot(self) -> np.ndarray:
-        """(nodes,) first body slot of each mesh node, -1 for unused nodes."""
+        """(nodes,) first body slot of each mesh node, -1 for unused nodes.
+
+        Large bodies number them along a curve that fills space, so that neighbours lie close in memory.
+        """
         counts = self.node_slot_count
-        first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        order = morton_order(self.mesh.points) if len(counts) > LARGE else np.arange(len(counts))
+        first = np.empty(len(counts), dtype=np.int64)
+        first[order] = np.concatenate([[0], np.cumsum(counts[order])[:-1]])
         return np.where(counts > 0, first, -1)
 
     @property
@@ -180,10 +189,19 @@ class Body:
 
     @property
     def slots(self) -> np.ndarray:
-        """(slots,) indices of the body's slots in the model. Raises ModelError before finalize."""
+        """(slots,) indices of the body's slots in the model, nodes in mesh order. Raises ModelError before finalize."""
         if self.slot_offset < 0:
             raise ModelError(f"body {self.name!r}: slots are numbered by ModelBuilder.finalize")
-        return self.slot_offset + np.arange(self.slot_count)
+        counts = self.node_slot_count
+        within = np.arange(self.slot_count) - np.repeat(np.cumsum(counts) - counts, counts)
+        return self.slot_offset + np.repeat(self.node_slot, counts) + within
+
+    @cached_property
+    def element_order(self) -> np.ndarray:
+        """(elements,) the order that elements are computed in: large bodies as their nodes are numbered."""
+        if len(self.mesh.points) <= LARGE:
+            return np.arange(len(self.mesh.cells))
+        return morton_order(self.mesh.points[self.mesh.cells].mean(axis=1))
 
     # named sets
 

@@ -1,11 +1,11 @@
-"""Groups of nearby nodes by recursive bisection, all groups of one depth at once."""
+"""Nearby nodes: groups by recursive bisection, and an order that keeps them together."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["bisect", "connected_groups"]
+__all__ = ["bisect", "connected_groups", "morton_order"]
 
 
 def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity: int) -> np.ndarray:
@@ -55,3 +55,15 @@ def connected_groups(group: np.ndarray, graph: sp.csr_matrix) -> np.ndarray:
         (np.ones(int(inside.sum()), dtype=np.int8), (links.row[inside], links.col[inside])), graph.shape
     )
     return np.asarray(sp.csgraph.connected_components(within.tocsr(), directed=False)[1])
+
+
+def morton_order(places: np.ndarray) -> np.ndarray:
+    """Order of points (n, 3) along Morton's curve over their box."""
+    low = places.min(axis=0)
+    extent = max(float(np.ptp(places, axis=0).max()), 1e-300)
+    cell = np.minimum((places - low) / extent * 2**20, 2**20 - 1).astype(np.uint64)
+    code = np.zeros(len(places), dtype=np.uint64)
+    for bit in range(20):
+        for axis in range(3):
+            code |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")

@@ -324,7 +324,7 @@ class TwoLevel:
             args = [arrays.matrix, arrays.pivot, first, flags, arrays.left, arrays.top]
             launch(k.take_panels, (B, TILE, N), args)
             args = [arrays.pivot, arrays.left, arrays.top, first, flags, arrays.matrix]
-            launch(k.eliminate, (B, N // 4, N // 4), args)
+            launch(k.eliminate, (B, N // 4, N), args)
         if arrays.stored is not arrays.matrix:
             launch(k.dense_traces, (B, N), [arrays.scale, arrays.matrix, flags, arrays.rows])
             self.residual.reduce(arrays.rows, 1, flags, arrays.trace)
