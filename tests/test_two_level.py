@@ -1,0 +1,443 @@
+"""The two-level preconditioner: its partition, matrices and inverses against numpy, and what it promises."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import warp as wp
+
+import warpfea as wf
+from warpfea.bench_problems import PROBLEMS
+from warpfea.partition import bisect, connected_groups, morton_order
+
+
+def simulation(builder, *, device="cpu", dtype="float64", dt=1e-3, shake=0.0, **options):
+    """A simulation after one step, with the operator made at its state, shaken by so much."""
+    model = builder.finalize(device=device, dtype=dtype)
+    sim = wf.Simulation(model, dt=dt, solver=wf.NewtonPCG(**options), ledger=False, capture=False)
+    sim.step()
+    work = sim.stepper.work
+    if shake:
+        u = work.u.numpy()
+        u += shake * np.random.default_rng(0).standard_normal(u.shape) * (model.free_host > 0)
+        work.u.assign(u)
+    work.newton.relinearise.fill_(1)
+    return sim
+
+
+def on(sim):
+    return wp.ones(sim.model.worlds, dtype=wp.int32, device=sim.model.device)
+
+
+def product(sim, p):
+    work, residual = sim.stepper.work, sim.stepper.newton.residual
+    work.p.assign(p.reshape(work.p.numpy().shape))
+    if residual.by_matrix:
+        residual._assemble()
+    residual.product(work.p, work.Hp, on(sim))
+    return work.Hp.numpy()[0].ravel().astype(float)
+
+
+def assembled(sim, *, projected):
+    work, matrix = sim.stepper.work, sim.stepper.newton.residual.assembled
+    out = matrix.values("test")
+    factors = (work.step.mass_factor, work.step.dq_dv)
+    matrix.assemble(work.u, factors, on(sim), out, projected=projected)
+    return matrix.matrix(out)
+
+
+def apply(sim, r):
+    work = sim.stepper.work
+    work.r.assign(r.reshape(work.r.numpy().shape))
+    sim.stepper.newton.preconditioner.apply(work.r, work.z, on(sim))
+    return work.z.numpy()[0].ravel().astype(float)
+
+
+def random_free(sim, seed=1):
+    free = sim.model.free_host.ravel()
+    return np.random.default_rng(seed).standard_normal(free.size) * free
+
+
+def bar(n, **law):
+    problem = PROBLEMS["bar"]
+    return problem.build(problem.size_for(n), **law)
+
+
+def damped(form):
+    material = wf.SVK(E=1e6, nu=0.3, density=1000.0, damping=wf.KelvinVoigt(eta=50.0, lambda_v=70.0, form=form))
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    box = b.add_solid(wf.mesh.box((0.4, 0.1, 0.1), cells=(4, 1, 1)), material=material)
+    b.clamp(box.nodes("x-"))
+    return b
+
+
+def rubber():
+    material = wf.MooneyRivlin(mu10=3e5, mu01=1e5, k=1e7, density=1000.0)
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    box = b.add_solid(wf.mesh.box((0.4, 0.1, 0.1), cells=(4, 1, 1)), material=material)
+    b.clamp(box.nodes("x-"))
+    return b
+
+
+SCENES = {
+    "T10": lambda: bar(300),
+    "T10 rubber": rubber,
+    "T10 incremental": lambda: damped("incremental"),
+    "T10 rate": lambda: damped("rate"),
+    "3243": lambda: PROBLEMS["beam"].build(4),
+    "3443": lambda: PROBLEMS["plate"].build(2),
+}
+
+
+# the partition
+
+
+@pytest.mark.parametrize("weight", [1, 4])
+def test_groups_fit_and_stay_within_their_label(weight):
+    rng = np.random.default_rng(0)
+    X, labels = rng.random((500, 3)), rng.integers(0, 3, 500)
+    group = bisect(X, np.full(500, weight), labels, 16)
+    sizes = np.bincount(group, minlength=0) * weight
+    assert sizes.min() > 0
+    assert sizes.max() <= 16
+    assert sizes.mean() > 10  # they are well filled
+    for g in range(len(sizes)):
+        assert len(np.unique(labels[group == g])) == 1
+    extent = np.mean([np.ptp(X[group == g], axis=0).max() for g in range(len(sizes))])
+    assert extent < 0.6  # and compact
+
+
+def test_items_larger_than_a_group_are_refused():
+    with pytest.raises(ValueError, match="does not fit"):
+        bisect(np.zeros((2, 3)), np.array([4, 20]), np.zeros(2), 16)
+
+
+def test_groups_are_split_into_connected_parts():
+    graph = sp.csr_matrix(np.array([[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
+    np.testing.assert_array_equal(connected_groups(np.array([0, 0, 0, 1]), graph), [0, 0, 1, 2])
+
+
+def test_mortons_curve_keeps_neighbours_together():
+    X = np.random.default_rng(0).random((4000, 3))
+    jumps = [np.linalg.norm(np.diff(X[order], axis=0), axis=1).mean() for order in (np.arange(4000), morton_order(X))]
+    assert jumps[1] < 0.2 * jumps[0]
+
+
+def test_large_bodies_are_numbered_by_place_and_report_in_file_order(monkeypatch):
+    ends = []
+    for limit in (10**9, 0):
+        monkeypatch.setattr("warpfea.bodies.LARGE", limit)
+        b = bar(1000)
+        model = b.finalize(device="cpu")
+        sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(tol=1e-11))
+        sim.step(3)
+        body = model.bodies[0]
+        own = sim.state.displacement.numpy()[:, body.slots]  # slots are in file order too
+        np.testing.assert_array_equal(own, sim.displacements(body))
+        ends.append((sim.positions(body), sim.field("von_mises", body), body.slots))
+    assert not np.array_equal(ends[0][2], ends[1][2])
+    for k in range(2):
+        np.testing.assert_allclose(ends[0][k], ends[1][k], rtol=1e-9, atol=1e-9 * np.abs(ends[0][k]).max())
+
+
+# the matrix
+
+
+@pytest.mark.parametrize("operator", ["elements", "matrix"])
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_matrix_is_the_operator(scene, operator):
+    sim = simulation(SCENES[scene](), shake=1e-3, operator=operator)
+    p = random_free(sim)
+    H = assembled(sim, projected=False)
+    expected = (H @ p) * sim.model.free_host.ravel()
+    np.testing.assert_allclose(product(sim, p), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_operators_walk_the_same_way():
+    ends = []
+    for operator in ("elements", "matrix"):
+        sim = wf.Simulation(
+            PROBLEMS["plate"].build(2).finalize(device="cpu"),
+            dt=1e-3,
+            solver=wf.NewtonPCG(tol=1e-11, operator=operator),
+        )
+        sim.step(5)
+        ends.append(sim.probe("tip").displacement)
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_projected_matrix_is_positive(scene):
+    sim = simulation(SCENES[scene](), shake=1e-3)
+    H = assembled(sim, projected=True).toarray()
+    np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-13 * np.abs(H).max())
+    assert np.linalg.eigvalsh(H)[0] > 0.0
+
+
+def test_compression_makes_H_indefinite_but_not_what_the_preconditioner_is_made_of():
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    box = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(10, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1.0))
+    b.clamp(box.nodes("x-"))
+    sim = simulation(b, dt=1.0)
+    u = sim.stepper.work.u.numpy()
+    X = box.mesh.points[:, 0] - box.mesh.points[:, 0].min()
+    u[0, :, 0] = -0.3 * X
+    sim.stepper.work.u.assign(u)
+    values = [np.linalg.eigvalsh(assembled(sim, projected=projected).toarray())[0] for projected in (False, True)]
+    assert values[0] < 0.0 < values[1]
+
+
+# levels
+
+
+def dense_apply(sim):
+    n = 3 * sim.model.slots
+    return np.stack([apply(sim, np.eye(n)[k]) for k in range(n)], axis=1)
+
+
+@pytest.mark.parametrize("scene", ["T10", "3243"])
+def test_a_small_model_is_inverted_as_a_whole(scene):
+    sim = simulation(SCENES[scene]())
+    assert sim.stepper.newton.preconditioner.levels[0].dense
+    free = sim.model.free_host.ravel() > 0
+    place = sim.stepper.newton.preconditioner.place
+    sim.stepper.work.u.assign(place)
+    H = assembled(sim, projected=True).toarray()[free][:, free]
+    B = dense_apply(sim)[free][:, free]
+    np.testing.assert_allclose(B @ H, np.eye(len(H)), rtol=0, atol=1e-7)
+
+
+def coarse_functions(sim, depth=0):
+    """P of a level from its groups and weights, (3 slots, 3 coarse slots)."""
+    level = sim.stepper.newton.preconditioner.levels[depth]
+    n = level.slots
+    group, weight = level.data.group_of.numpy(), level.data.weight.numpy()
+    columns = (4 * group[:, None] + np.arange(4)).ravel()
+    P = sp.csr_matrix((weight.ravel(), (np.repeat(np.arange(n), 4), columns)), shape=(n, 4 * level.groups))
+    return sp.kron(P, sp.eye(3)).tocsr()
+
+
+@pytest.mark.parametrize(("name", "size"), [("bar", (7, 5, 2)), ("beam", 60), ("plate", 6)])
+def test_tiles_and_coarse_space_against_numpy(name, size):
+    sim = simulation(PROBLEMS[name].build(size))
+    pre = sim.stepper.newton.preconditioner
+    level, below = pre.levels
+    assert not level.dense
+    assert below.dense
+    model = sim.model
+    free = model.free_host.ravel()
+    sim.stepper.work.u.assign(pre.place)
+    H = assembled(sim, projected=True)
+    # any affine motion of the whole body is one of the coarse space: it moves gradient slots by B E
+    P = coarse_functions(sim)
+    B = np.random.default_rng(0).standard_normal((3, 3))
+    motion = model.reference @ B.T + np.outer(model.slot_kind == 0, [1.0, 2.0, 3.0])
+    fit = sp.linalg.lsqr(P, motion.ravel(), atol=1e-15, btol=1e-15)[0]
+    np.testing.assert_allclose(P @ fit, motion.ravel(), rtol=0, atol=1e-8 * np.abs(motion).max())
+    # the coarse matrix, and the sum of both parts
+    F = sp.diags(free)
+    A = (P.T @ F @ H @ F @ P).toarray()
+    value = pre.arrays[1].value.numpy()[0]
+    graph = below.pattern.graph
+    device = sp.bsr_matrix((value, graph.indices, graph.indptr), shape=A.shape).toarray()
+    np.testing.assert_allclose(device, A, rtol=0, atol=1e-12 * np.abs(A).max())
+    r = random_free(sim)
+    scale = 1.0 / np.sqrt(np.where(np.diag(A) > 0, np.diag(A), 1.0))
+    coarse = scale * (np.linalg.pinv(scale[:, None] * A * scale, rcond=1e-11, hermitian=True) @ (scale * (P.T @ r)))
+    expected = free * (P @ coarse)
+    for tile in level.data.tile_slot.numpy():
+        dofs = (3 * tile[tile >= 0][:, None] + np.arange(3)).ravel()
+        expected[dofs] += np.linalg.solve(H[dofs][:, dofs].toarray(), r[dofs])
+    np.testing.assert_allclose(apply(sim, r), expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("options", [{}, {"preconditioner_dtype": "float32"}])
+@pytest.mark.parametrize(("name", "size"), [("bar", (13, 9, 5)), ("plate", 10), ("beam", 900)])
+def test_it_is_symmetric_and_positive_through_all_levels(name, size, options):
+    sim = simulation(PROBLEMS[name].build(size), **options)
+    assert len(sim.stepper.newton.preconditioner.levels) >= 3 or name == "plate"
+    a, b = random_free(sim, 1), random_free(sim, 2)
+    Ba, Bb = apply(sim, a), apply(sim, b)
+    tolerance = 1e-9 if not options else 1e-5
+    assert a @ Bb == pytest.approx(b @ Ba, abs=tolerance * np.sqrt((a @ Ba) * (b @ Bb)))
+    assert a @ Ba > 0.0
+    assert b @ Bb > 0.0
+    assert np.abs(Ba[sim.model.free_host.ravel() == 0]).max() == 0.0
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_functions_that_depend_on_each_other_are_dropped(dtype):
+    """A tile inverse of a singular matrix: positive semi-definite, exact on what is left, and finite."""
+    from warpfea.kernels.levels import LANES, TILE, level_kernels
+
+    rng = np.random.default_rng(0)
+    half = rng.standard_normal((TILE, TILE - 5))
+    half[7] = 0.0  # a row without an unknown
+    A = half @ half.T
+    T = {"float64": wp.float64, "float32": wp.float32}[dtype]
+    matrix = wp.array(A[None, None], dtype=T, device="cpu")
+    diagonal = wp.array(np.diag(A)[None, None], dtype=T, device="cpu")
+    column = wp.zeros((1, 1, TILE), dtype=T, device="cpu")
+    active = wp.ones(1, dtype=wp.int32, device="cpu")
+    args = [1, 1, 0, active, diagonal, column, matrix]
+    wp.launch(level_kernels(dtype).invert_tiles, dim=1, inputs=args, device="cpu", block_dim=LANES)
+    B = matrix.numpy()[0, 0].astype(float)
+    kept = np.diag(B) != 0.0
+    assert 0 < np.sum(~kept) <= 6
+    assert not kept[7]
+    assert np.all(B[~kept] == 0.0)
+    rest = A[kept][:, kept]
+    error = np.abs(B[kept][:, kept] @ rest - np.eye(kept.sum())).max()
+    assert error < {"float64": 1e-6, "float32": 0.3}[dtype]
+    assert np.linalg.eigvalsh(0.5 * (B + B.T))[0] > -1e-5 * np.abs(B).max()
+
+
+def test_a_negative_row_gets_its_diagonal():
+    from warpfea.kernels.levels import LANES, TILE, level_kernels
+
+    A = np.eye(TILE)
+    A[3, 3] = -2.0
+    matrix = wp.array(A[None, None], dtype=wp.float64, device="cpu")
+    diagonal = wp.array(np.diag(A)[None, None], dtype=wp.float64, device="cpu")
+    column = wp.zeros((1, 1, TILE), dtype=wp.float64, device="cpu")
+    active = wp.ones(1, dtype=wp.int32, device="cpu")
+    args = [1, 1, 1, active, diagonal, column, matrix]
+    wp.launch(level_kernels("float64").invert_tiles, dim=1, inputs=args, device="cpu", block_dim=LANES)
+    B = matrix.numpy()[0, 0]
+    expected = np.ones(TILE)
+    expected[3] = 0.5
+    np.testing.assert_allclose(B, np.diag(expected))
+
+
+# what it promises
+
+
+def test_iterations_hardly_grow_with_the_mesh():
+    counts = []
+    for n in (1000, 9000):
+        law = wf.SVK(E=1e11, nu=0.3, density=2700.0)
+        sim = wf.Simulation(
+            bar(n, law=law, traction=10.0).finalize(device="cpu"),
+            dt=1e-2,
+            solver=wf.NewtonPCG(tol=0.1, forcing=1e-8, max_newton=1),
+            ledger=False,
+        )
+        counts.append(int(sim.step().pcg[0]))
+    assert counts[1] < 1.5 * counts[0]
+    assert counts[1] < 80
+
+
+@pytest.mark.parametrize(("name", "size"), [("bar", (7, 5, 2)), ("beam", 60), ("plate", 4)])
+def test_it_needs_fewer_iterations_than_3x3_blocks(name, size):
+    counts, tips = {}, {}
+    for kind in ("two-level", "block-jacobi"):
+        solver = wf.NewtonPCG(preconditioner=kind, tol=1e-10)
+        sim = wf.Simulation(PROBLEMS[name].build(size).finalize(device="cpu"), dt=1e-3, solver=solver, ledger=False)
+        counts[kind] = sum(int(sim.step().pcg[0]) for _ in range(3))
+        tips[kind] = sim.probe("tip").displacement[0, -1]
+    assert counts["two-level"] < 0.75 * counts["block-jacobi"]
+    np.testing.assert_allclose(
+        tips["two-level"], tips["block-jacobi"], rtol=0, atol=1e-8 * np.abs(tips["two-level"]).max()
+    )
+
+
+def spinner(**options):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    box = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(6, 2, 2)), material=wf.SVK(E=1e7, nu=0.3, density=1000.0))
+    b.set_initial(box, angular_velocity=(0, 0, 40.0))
+    return wf.Simulation(b.finalize(device="cpu"), dt=2e-3, solver=wf.NewtonPCG(**options), ledger=False)
+
+
+def test_it_is_kept_while_it_serves_and_made_anew_when_it_does_not():
+    sim = spinner()
+    made = 0
+    place = sim.state.preconditioner_displacement.numpy().copy()
+    for _ in range(40):  # three turns in all
+        sim.step()
+        now = sim.state.preconditioner_displacement.numpy().copy()
+        made += not np.array_equal(now, place)
+        place = now
+    assert 2 <= made <= 20
+
+
+def test_a_run_from_its_middle_makes_it_where_it_was_made():
+    one = spinner()
+    one.step(13)
+    middle = one.state.like()
+    assert np.abs(middle.preconditioner_displacement.numpy()).max() > 0.0
+    one.step(12)
+    other = spinner()
+    other.reset(state=middle)
+    other.step(12)
+    for name in ("displacement", "velocity", "preconditioner", "preconditioner_displacement"):
+        np.testing.assert_array_equal(getattr(one.state, name).numpy(), getattr(other.state, name).numpy())
+
+
+def test_worlds_have_their_own():
+    b = bar(1000)
+    model = b.finalize(device="cpu", worlds=3)
+    gravity = np.array([(0, 0, -1.0), (0, 0, -300.0), (50.0, 0, 0)])
+    model.set_gravity(gravity)
+    sim = wf.Simulation(model, dt=5e-3)
+    sim.step(6)
+    for world in range(3):
+        single = bar(1000).finalize(device="cpu")
+        single.set_gravity(gravity[world])
+        own = wf.Simulation(single, dt=5e-3)
+        own.step(6)
+        for name in ("displacement", "preconditioner", "preconditioner_displacement"):
+            row = getattr(sim.state, name).numpy()[world]
+            np.testing.assert_array_equal(row, getattr(own.state, name).numpy()[0])
+
+
+def test_storage_in_single_precision_changes_the_way_but_not_the_end():
+    ends = []
+    for storage in (None, "float32"):
+        solver = wf.NewtonPCG(tol=1e-11, preconditioner_dtype=storage)
+        sim = wf.Simulation(bar(1000).finalize(device="cpu"), dt=1e-3, solver=solver, ledger=False)
+        reports = [sim.step() for _ in range(5)]
+        ends.append((sim.probe("tip").displacement[0, -1, 0], sum(int(r.pcg[0]) for r in reports), sim.bytes()))
+    assert ends[0][0] == pytest.approx(ends[1][0], rel=1e-9)
+    assert ends[1][1] <= 1.1 * ends[0][1]
+    assert ends[1][2]["work.level 0 stored"] < 0.51 * ends[0][2]["work.level 0 inverse"]
+
+
+def test_a_tolerance_in_newtons():
+    reports = []
+    for tol in (0.0, 5e-4):
+        solver = wf.NewtonPCG(tol=1e-12, force_tol=tol, preconditioner="block-jacobi")
+        sim = wf.Simulation(bar(300).finalize(device="cpu"), dt=1e-3, solver=solver, ledger=False)
+        reports.append(sim.step())
+        free = sim.model.free_host
+        g = np.linalg.norm(sim.stepper.work.g.numpy()[0] * free)
+        assert reports[-1].residual_force[0] == pytest.approx(g, rel=1e-12)
+    assert reports[0].residual_force[0] < 1e-6 < reports[1].residual_force[0] <= 5e-4
+    assert reports[1].newton[0] < reports[0].newton[0]
+
+
+def test_forcing_is_the_relative_residual_of_a_solve():
+    sim = wf.Simulation(
+        bar(1000).finalize(device="cpu"), dt=1e-3, solver=wf.NewtonPCG(forcing=1e-5, tol=1e-9), ledger=False
+    )
+    sim.step()
+    control = sim.stepper.work.pcg
+    assert 1e-7 < control.norm.numpy()[0] / control.first_norm.numpy()[0] <= 1e-5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"operator": "magic"}, "'auto', 'elements', 'matrix'"),
+        ({"preconditioner_dtype": "float16"}, "'float32', 'float64'"),
+        ({"force_tol": -1.0}, "zero or positive"),
+        ({"forcing": 2.0}, "between 0 and 1"),
+    ],
+)
+def test_options_out_of_range_are_named(options, message):
+    with pytest.raises(wf.ModelError, match=message):
+        wf.NewtonPCG(**options)
+
+
+def test_an_unknown_preconditioner_lists_those_there_are():
+    model = bar(300).finalize(device="cpu")
+    with pytest.raises(wf.ModelError, match="auto, two-level, block-jacobi"):
+        wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(preconditioner="ilu"))
