@@ -95,7 +95,7 @@ def prepare(model: Model, operator: str) -> tuple[Simulation, Residual]:
     elements = len(np.concatenate([body.mesh.cells for body in model.bodies]))
     length = (model.lumped_host.sum() / DENSITY / elements) ** (1.0 / 3.0)
     scale = DISPLACEMENT * np.where(model.is_position_host > 0.0, length, 1.0)
-    _assign(w.u, scale[:, None] * _random(model, 1))
+    _assign(model, w.u, scale[:, None] * _random(model, 1))
     w.step.dq_dv.fill_(DT)
     w.step.mass_factor.fill_(1.0 / DT)
     if residual.by_matrix:
@@ -109,14 +109,14 @@ def _random(model: Model, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((model.slots, 3)) * model.free_host
 
 
-def _assign(field: wp.array, values: np.ndarray) -> None:
-    field.assign(values[None].astype(np.float64 if field.dtype._wp_scalar_type_ is wp.float64 else np.float32))
+def _assign(model: Model, field: wp.array, values: np.ndarray) -> None:
+    field.assign(np.tile(values, (model.worlds, 1, 1)).astype(model.dtype))
 
 
 def apply(model: Model, residual: Residual) -> tuple[Callable[[], None], wp.array, wp.array]:
     """The product as a call, its direction and its result; it has been done once."""
     direction, out = (wp.zeros((model.worlds, model.slots), dtype=model.types.vec3, device=model.device) for _ in "po")
-    _assign(direction, _random(model, 2))
+    _assign(model, direction, _random(model, 2))
     active = wp.ones(model.worlds, dtype=wp.int32, device=model.device)
 
     def call() -> None:
@@ -208,10 +208,11 @@ def product(options: argparse.Namespace) -> None:
         for wanted, dtype in itertools.product(sizes[problem.name], dtypes):
             began = clock.perf_counter()
             model = problem.build(problem.size_for(wanted)).finalize(device=device, dtype=dtype)
-            how = {"setup": clock.perf_counter() - began, "repeat": repeat, "copy": copy}
+            setup = clock.perf_counter() - began
             operators = ["auto"]
             while operators:
-                rows.append(measure(model, problem.name, operators.pop(), **how))
+                operator = operators.pop()
+                rows.append(measure(model, problem.name, operator, setup=setup, repeat=repeat, copy=copy))
                 gc.collect()  # a simulation refers to itself: its memory is wanted for the next
                 print(_line(rows[-1]), flush=True)
                 write(options, settings, rows)
