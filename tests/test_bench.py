@@ -1,4 +1,4 @@
-"""`warpfea bench --peer` and `--growth`, called in this process on tiny rows; the peer's table and its meshes."""
+"""`warpfea bench --peer`, `--growth` and `--cpu`, in this process on tiny rows; the peer's table and its meshes."""
 
 import json
 import pathlib
@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 import pytest
 
-from warpfea import bench_growth, bench_peer
+from warpfea import bench_cpu, bench_growth, bench_peer
 from warpfea.bench_problems import PROBLEMS
 from warpfea.cli import main
 
@@ -135,6 +135,46 @@ def test_growth_shows_failures(bench, monkeypatch):
     assert "failed" in text
 
 
+def test_cpu_steps_with_three_solvers(bench, monkeypatch):
+    sizes = {"a": (1, 1, 1), "b": (3, 2, 1)}
+    cases = [bench_cpu.CpuCase(f"bar-{k}", "bar", size, (1.0, 2.0)) for k, size in sizes.items()]
+    monkeypatch.setattr(bench_cpu, "CASES", (*cases, bench_cpu.CpuCase("beam-1", "beam", 1)))
+    code, text, content = bench("--cpu", "--rows", "bar-*", "--steps", "3")
+    assert code == 0, text
+    rows = content["rows"]
+    assert [(r["label"], r["solver"]) for r in rows] == [(f"bar-{k}", s) for k in sizes for s in bench_cpu.SOLVERS]
+    for row in rows:
+        assert (row["dtype"], row["steps"], row["note"]) == ("float64", 3, None)
+        assert (row["chrono_1"], row["chrono_2"]) == (1.0, 2.0)
+        assert 0.0 < row["residual_force"] <= 5e-4
+        assert row["ms_per_step"] > 0.0
+        assert row["unknowns"] == PROBLEMS["bar"].unknowns(sizes[row["label"][-1]])
+    assert content["settings"]["first_step_timed"] == 2
+
+
+def test_cpu_leaves_out_what_takes_too_long(bench, monkeypatch):
+    cases = [bench_cpu.CpuCase(f"bar-{k}", "bar", (k, 1, 1)) for k in (1, 2, 3)]
+    monkeypatch.setattr(bench_cpu, "CASES", tuple(cases))
+    code, text, content = bench("--cpu", "--steps", "3", "--limit", "1e-9")
+    assert code == 0, text
+    rows = [r for r in content["rows"] if r["solver"] == "direct"]
+    assert [r["steps"] for r in rows] == [1, 0, 0]
+    assert rows[0]["note"].startswith("step 1 took")
+    assert rows[1]["note"] == rows[2]["note"]
+    assert "s per step with 54 unknowns" in rows[1]["note"]
+    assert rows[1]["ms_per_step"] is None
+
+
+def test_rows_of_the_cpu_are_as_large_as_they_say():
+    for case in bench_cpu.CASES:
+        kind, _, size = case.label.partition("-")
+        if kind == "bar":
+            assert PROBLEMS["bar"].unknowns(case.size) == pytest.approx(1000.0 * float(size[:-1]), rel=0.06)
+    elements = {c.label: np.prod(c.size) for c in bench_cpu.CASES if c.problem != "bar"}
+    expected = {"beam-256": 256, "beam-4096": 4096, "plate-16x16": 256, "plate-64x64": 4096, "brick-1080": 1080}
+    assert elements == expected
+
+
 BAD = {
     "unknown row": (["--peer", "--rows", "bar-1"], ["'bar-1'", "bar-3x2x1"]),
     "no such folder": (["--peer", "--meshes", "nowhere"], ["nowhere"]),
@@ -142,6 +182,10 @@ BAD = {
     "rows alone": (["--rows", "bar-3x2x1"], ["--rows", "--peer"]),
     "sizes of the peer": (["--peer", "--unknowns", "1000"], ["--unknowns", "--peer"]),
     "steps of growth": (["--growth", "--steps", "3"], ["--steps", "--growth"]),
+    "steps of the product": (["--product", "--steps", "3"], ["--steps", "--product"]),
+    "limit of the peer": (["--peer", "--limit", "3"], ["--limit", "--peer"]),
+    "precision on the CPU": (["--cpu", "--dtype", "float32"], ["--dtype", "--cpu"]),
+    "unknown row of the CPU": (["--cpu", "--rows", "bar"], ["'bar'", "brick-1080"]),
     "too small": (["--growth", "--sizes", "5"], ["5", "270"]),
 }
 

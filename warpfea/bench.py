@@ -2,13 +2,14 @@
 
 Sizes are numbers of unknowns, met as closely as the problem allows. The error of the tip is measured against the same
 mesh and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
-`--peer` and `--growth` are in `bench_peer` and `bench_growth`.
+`--peer`, `--growth`, `--product` and `--cpu` are in `bench_peer`, `bench_growth`, `bench_product` and `bench_cpu`.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import os
 import pathlib
 import platform
@@ -38,6 +39,8 @@ OPTIONS = {
     "table": {"problem", "unknowns", "dtype", "linear", "steps", "repeat", "dt", "tol", "reference_up_to"},
     "peer": {"rows", "large", "meshes", "dtype", "steps"},
     "growth": {"problem", "unknowns"},
+    "product": {"problem", "unknowns", "dtype", "repeat"},
+    "cpu": {"rows", "steps", "limit"},
 }
 """Options of each kind of measurement, besides those of all."""
 
@@ -88,8 +91,8 @@ def solver(tol: float | None, **options: Any) -> NewtonPCG:
     return NewtonPCG(tol=tol, **({"max_pcg": 20000} | options))
 
 
-def run_once(model: Model, *, dt: float, steps: int, solver: NewtonPCG) -> Run:
-    """Simulate from rest."""
+def run_once(model: Model, *, dt: float, steps: int, solver: NewtonPCG, limit: float = math.inf) -> Run:
+    """Simulate from rest; a step that takes longer than `limit` seconds is the last."""
     began = clock.perf_counter()
     sim = Simulation(model, dt=dt, solver=solver, ledger=False)
     ready = clock.perf_counter() - began
@@ -100,6 +103,8 @@ def run_once(model: Model, *, dt: float, steps: int, solver: NewtonPCG) -> Run:
         report = sim.step()  # reads its report, and so waits for the device
         times.append(clock.perf_counter() - start)
         largest = max(largest, float(report.residual_force.max()))
+        if times[-1] > limit:
+            break
     return Run(sim, times, ready, largest)
 
 
@@ -170,20 +175,23 @@ def bench(options: argparse.Namespace) -> int:
     from .cli.parser import UsageError
     from .outputs import check_target
 
-    kind = "peer" if options.peer else "growth" if options.growth else "table"
+    kind = next((name for name in OPTIONS if getattr(options, name, False)), "table")
     for name in sorted(set().union(*OPTIONS.values()) - OPTIONS[kind]):
         if getattr(options, name):
-            words = "goes with --peer" if kind == "table" else f"does not go with --{kind}"
+            others = " or ".join(f"--{k}" for k in OPTIONS if name in OPTIONS[k])
+            words = f"goes with {others}" if kind == "table" else f"does not go with --{kind}"
             raise UsageError(f"--{name.replace('_', '-')} {words}")
     if options.out is not None:
         if pathlib.Path(options.out).suffix != ".json":
             raise UsageError(f"--out {options.out}: the file name must end in .json")
         check_target(options.out, (".json",))
+    from .bench_cpu import cpu
     from .bench_growth import growth
     from .bench_peer import peer
+    from .bench_product import product
 
     with quiet_warp():
-        {"table": table, "peer": peer, "growth": growth}[kind](options)
+        {"table": table, "peer": peer, "growth": growth, "product": product, "cpu": cpu}[kind](options)
     return 0
 
 

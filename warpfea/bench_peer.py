@@ -13,6 +13,7 @@ import argparse
 import fnmatch
 import pathlib
 import time as clock
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +24,7 @@ from .bench_problems import PROBLEMS
 from .mesh import Mesh, check
 from .solvers import NewtonPCG
 
-__all__ = ["LARGE", "PEER", "Case", "PeerRow", "peer", "required"]
+__all__ = ["DT", "FORCE_TOL", "LARGE", "PEER", "Case", "PeerRow", "by_label", "peer", "required"]
 
 SOURCE = "the authors' own CUDA code (Newton + cuDSS, fixed sparsity), H200, two Newton iterations per step"
 MESHES = pathlib.Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -164,17 +165,22 @@ def load(path: pathlib.Path) -> Mesh:
 
 def chosen(rows: str | None, large: bool) -> list[Case]:
     """Cases by label. UsageError for a label that fits none."""
-    from .cli.parser import UsageError
-
     if rows is None:
         return [*PEER, *([LARGE] if large else [])]
-    every, out = [*PEER, LARGE], [LARGE] if large else []
-    for word in rows.split(","):
-        found = [case for case in every if fnmatch.fnmatchcase(case.label, word)]
-        if not found:
+    every = [*PEER, LARGE]
+    out = by_label(rows, every)
+    return [case for case in every if case in out or (large and case is LARGE)]
+
+
+def by_label(rows: str, every: Sequence[Any]) -> list[Any]:
+    """Cases whose labels fit one of the words with commas, in their order. UsageError for a word that fits none."""
+    from .cli.parser import UsageError
+
+    words = rows.split(",")
+    for word in words:
+        if not any(fnmatch.fnmatchcase(case.label, word) for case in every):
             raise UsageError(f"--rows: no row {word!r}; there are {', '.join(case.label for case in every)}")
-        out += found
-    return [case for case in every if case in out]
+    return [case for case in every if any(fnmatch.fnmatchcase(case.label, word) for word in words)]
 
 
 def peer(options: argparse.Namespace) -> None:

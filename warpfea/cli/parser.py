@@ -312,15 +312,23 @@ def _add_bench(commands: Any) -> None:
         description="ms per step, PCG iterations, bytes per unknown, residual and tip error of bodies (SVK, "
         "E = 7e8 Pa, nu = 0.33, 2700 kg/m^3) that are clamped at x = 0 and loaded at the other end. bar: T10, "
         "3 x 2 x 1 m, 5000 N along x. beam: 3243, elements of 0.5 x 0.1 x 0.1 m, 3100 N across. plate: 3443, "
-        "4 x 2 x 0.1 m, 1000 N down.",
+        "4 x 2 x 0.1 m, 1000 N down. ENMC, FN18, H3843: the bar of ANCF solids.",
         epilog="examples:\n  warpfea bench --problem plate --unknowns 1e4,1e5\n"
         "  warpfea bench --peer --large --out peer.json\n  warpfea bench --peer --rows 'beam-*,bar-3x2x1'\n"
-        "  warpfea bench --growth --out growth.json",
+        "  warpfea bench --growth --out growth.json\n  warpfea bench --product --out product.json\n"
+        "  warpfea bench --cpu --out cpu.json",
     )
     kind = to.add_mutually_exclusive_group()
     kind.add_argument("--peer", action="store_true", help="120 steps to 5e-4 N on the peer's sizes, beside its times")
     kind.add_argument("--growth", action="store_true", help="PCG iterations of a step for all E, dt and nu, by size")
-    to.add_argument("--problem", action="append", choices=("bar", "beam", "plate"), help="may be repeated; default bar")
+    kind.add_argument("--product", action="store_true", help="unknowns per second of the operator H v, its limits")
+    kind.add_argument("--cpu", action="store_true", help="ms per step of three linear solvers on this CPU, to 5e-4 N")
+    to.add_argument(
+        "--problem",
+        action="append",
+        choices=("bar", "beam", "plate", "ENMC", "FN18", "H3843"),
+        help="may be repeated; default bar, of --growth and --product several",
+    )
     to.add_argument(
         "--unknowns", "--sizes", type=counts, default=[], metavar="N,N,...", help="sizes (default: a few per problem)"
     )
@@ -329,13 +337,13 @@ def _add_bench(commands: Any) -> None:
         "--dtype",
         action="append",
         choices=("float64", "float32"),
-        help="may be repeated; default both, of --peer float64",
+        help="may be repeated; default both, of --peer float64 (--cpu: float64 only)",
     )
     to.add_argument(
         "--linear", action="append", choices=("pcg", "direct"), help="linear solver, may be repeated; default pcg"
     )
-    to.add_argument("--steps", type=count, metavar="N", help="steps that are simulated (default 10, of --peer 120)")
-    to.add_argument("--repeat", type=count, metavar="N", help="runs, of which the median counts (default 3)")
+    to.add_argument("--steps", type=count, metavar="N", help="steps to simulate (default 10, --peer 120, --cpu 6)")
+    to.add_argument("--repeat", type=count, metavar="N", help="runs; the median counts (default 3, --product 9)")
     to.add_argument("--dt", type=positive, metavar="S", help="step, s (default 1e-3)")
     to.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
     to.add_argument(
@@ -344,8 +352,9 @@ def _add_bench(commands: Any) -> None:
         metavar="N",
         help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
     )
-    group = to.add_argument_group("with --peer")
+    group = to.add_argument_group("with --peer or --cpu")
     group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
+    group.add_argument("--limit", type=positive, metavar="S", help="--cpu: s that a step may take (default 60)")
     group.add_argument("--large", action="store_true", help="a bar of 4 million unknowns too, ten steps")
     group.add_argument("--meshes", metavar="FOLDER", help="unstructured meshes (default: tests/data of the checkout)")
     to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")

@@ -1,0 +1,113 @@
+"""`warpfea bench --product` on tiny problems: its operators are H, its counts are those of the tables."""
+
+import json
+import types
+
+import numpy as np
+import pytest
+
+from warpfea import bench_product
+from warpfea.bench_cost import cost
+from warpfea.bench_problems import LAW, PROBLEMS
+from warpfea.cli import main
+
+SIZES = {"bar": (2, 1, 1), "beam": 2, "plate": 1, "ENMC": (1, 1, 1), "FN18": (1, 1, 1)}
+
+
+def model_of(name, dtype="float64"):
+    """A small model without damping."""
+    return PROBLEMS[name].build(SIZES[name], law=LAW).finalize(device="cpu", dtype=dtype)
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_both_operators_are_the_matrix_of_the_step(name):
+    model = model_of(name)
+    got = {}
+    for operator in ("elements", "matrix"):
+        sim, residual = bench_product.prepare(model, operator)
+        assert residual.by_matrix == (operator == "matrix")
+        _, direction, out = bench_product.apply(model, residual)
+        got[operator] = out.numpy()[0]
+    state = model.state()
+    state.displacement.assign(sim.stepper.work.u)
+    assert np.abs(sim.stepper.work.u.numpy()).max() > 0.0
+    p, dt = direction.numpy()[0], bench_product.DT
+    expected = model.mass_host @ p / dt + dt * (model.tangent_matrix(state) @ p.ravel()).reshape(-1, 3)
+    expected *= model.free_host
+    for value in got.values():
+        assert np.abs(value - expected).max() < 1e-11 * np.abs(expected).max()
+
+
+def test_bytes_and_operations_of_straight_tetrahedra():
+    model = model_of("bar")
+    _, residual = bench_product.prepare(model, "elements")
+    bench_product.apply(model, residual)
+    E, S, Q, n, w = model.info()["elements"], 10, 4, model.slots, 8
+    C, v = E * S, 3 * 8
+    elements = 11 * w * E + 4 * E * (S + 1) + 2 * v * n + v * C
+    slots = 4 * (n + 1) + 4 * C + v * C + 3 * v * n + 8 * n  # on the CPU a row per slot
+    tables = w * (3 * S * Q + Q + S * S + S + 11)  # gradients, weights, mass, kinds of slots, coefficients
+    counted = cost(residual)
+    assert counted.bytes == elements + slots + tables
+    assert counted.flops == E * (Q * (54 * S + 305 + 136) + 7 * S * S + 24 * S) + 3 * C + 10 * n
+
+
+def test_bytes_of_the_matrix():
+    model = model_of("plate", "float32")
+    _, residual = bench_product.prepare(model, "matrix")
+    bench_product.apply(model, residual)
+    n, m = model.slots, residual.assembled.pattern.entries
+    assert cost(residual).bytes == 4 * (n + 1) + (4 + 36) * m + 3 * 12 * n + 8 * n
+
+
+def test_product_measures_both_operators(tmp_path, capfd):
+    target = tmp_path / "out.json"
+    words = [
+        "--product",
+        "--problem",
+        "beam",
+        "--sizes",
+        "24",
+        "--repeat",
+        "1",
+        "--device",
+        "cpu",
+        "--out",
+        str(target),
+    ]
+    assert main(["bench", *words]) == 0
+    text = capfd.readouterr().out
+    content = json.loads(target.read_text())
+    assert {"schema", "command", "commit", "machine", "versions", "settings"} <= set(content)
+    rows = content["rows"]
+    assert [(r["dtype"], r["operator"]) for r in rows] == [
+        (dtype, operator) for dtype in ("float64", "float32") for operator in ("elements", "matrix")
+    ]
+    for row in rows:
+        assert row["chosen"] == (row["operator"] == "elements")  # on the CPU
+        assert row["unknowns"] == 24
+        assert row["unknowns_per_s"] == pytest.approx(24e3 / row["ms"])
+        assert row["GBps"] == pytest.approx(1e-9 * row["bytes_per_unknown"] * row["unknowns_per_s"])
+        assert row["bandwidth_share"] == pytest.approx(row["GBps"] / row["copy_GBps"])
+        assert row["Gflops"] == pytest.approx(1e-9 * row["flops_per_unknown"] * row["unknowns_per_s"])
+        assert (row["peak_Gflops"], row["limit"], row["limit_share"]) == (None, None, None)
+        assert row["memory_per_unknown"] > row["bytes_per_unknown"]
+        assert row["operator"] in text
+
+
+def test_peaks_by_name():
+    def device(name, is_cuda=True):
+        return types.SimpleNamespace(is_cuda=is_cuda, name=name)
+
+    assert bench_product.peak(device("NVIDIA H200"), "float64") == 34e3
+    assert bench_product.peak(device("NVIDIA H200"), "float32") == 67e3
+    assert bench_product.peak(device("NVIDIA GeForce RTX 4090"), "float32") is None
+    assert bench_product.peak(device("H200", is_cuda=False), "float32") is None
+
+
+@pytest.mark.parametrize("name", [*SIZES, "H3843"])
+def test_unknowns_of_a_size(name):
+    size = PROBLEMS[name].size_for(1000)
+    model = PROBLEMS[name].build(size).finalize(device="cpu")
+    assert PROBLEMS[name].unknowns(size) == model.info()["unknowns"]
+    assert PROBLEMS[name].unknowns(size) == pytest.approx(1000, rel=0.3)
