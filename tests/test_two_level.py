@@ -162,7 +162,7 @@ def test_operators_walk_the_same_way():
         )
         sim.step(5)
         ends.append(sim.probe("tip").displacement)
-    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-9)
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-9 * np.abs(ends[0]).max())
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -251,7 +251,7 @@ def test_tiles_and_coarse_space_against_numpy(name, size):
 
 
 @pytest.mark.parametrize("options", [{}, {"preconditioner_dtype": "float32"}])
-@pytest.mark.parametrize(("name", "size"), [("bar", (13, 9, 5)), ("plate", 10), ("beam", 900)])
+@pytest.mark.parametrize(("name", "size"), [("bar", (13, 9, 5)), ("plate", 10), ("beam", 2000)])
 def test_it_is_symmetric_and_positive_through_all_levels(name, size, options):
     sim = simulation(PROBLEMS[name].build(size), **options)
     assert len(sim.stepper.newton.preconditioner.levels) >= 3 or name == "plate"
