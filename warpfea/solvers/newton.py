@@ -157,8 +157,8 @@ class NewtonLoop:
         ctl.fixed_forcing = int(options.forcing is not None)
         if options.forcing is not None:
             ctl.first_forcing = options.forcing
-        # a large matrix costs more than another iteration with that of the step's first
-        ctl.chord = CHORD if model.slots > CHORD_SLOTS else 0.0
+        # a large matrix costs more than another iteration with that of the step's first; to one core all are large
+        ctl.chord = CHORD if model.slots > CHORD_SLOTS or not model.device.is_cuda else 0.0
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]

@@ -70,8 +70,7 @@ class Residual:
         self.massive = all(block.massive for block in model.blocks)
         # elements with many points per slot cost more than the matrix that they make
         many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
-        # (on one core assembly costs more than it saves)
-        self.by_matrix = operator == "matrix" or (operator == "auto" and many and model.device.is_cuda)
+        self.by_matrix = operator == "matrix" or (operator == "auto" and many)
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
             self.assembled = Assembled(model, work, launch, self.block_kernels)
