@@ -19,7 +19,8 @@ from .kernels.constraints import JOINT_COLUMNS
 from .kernels.step import LEDGER, REPORT, STATUS
 from .results import Results
 from .run_loop import close_all, interruptible, step_bar
-from .solvers import NewtonPCG
+from . import solvers
+from .solvers import Jacobi, NewtonPCG
 from .state import State
 from .stepper import Stepper
 
@@ -119,7 +120,7 @@ class Simulation(Results):
         *,
         dt: float,
         integrator: str = "backward_euler",
-        solver: NewtonPCG | None = None,
+        solver: NewtonPCG | Jacobi | str | None = None,
         constraint_tol: float | None = None,
         ledger: bool = True,
         record: bool = True,
@@ -127,7 +128,7 @@ class Simulation(Results):
         on_failure: str | None = None,
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
-        scheme, options = integrators.get(integrator), solver or NewtonPCG()
+        scheme, options = integrators.get(integrator), solvers.get(solver)
         self._start(model, state, scheme, options, ledger, capture, on_compile, constraint_tol)
         self.dt = dt
         if on_failure not in (None, "raise", "freeze"):
@@ -151,7 +152,7 @@ class Simulation(Results):
         model: Model,
         state: State | None,
         scheme: Any,
-        solver: NewtonPCG,
+        solver: NewtonPCG | Jacobi,
         ledger: bool,
         capture: bool,
         on_compile: Callable[[int, int, str], None] | None = None,
@@ -233,7 +234,7 @@ class Simulation(Results):
         before = self.last.status if self.last is not None else np.zeros(len(rows), int)
         fresh = (status == STATUS["failed"]) & (before != STATUS["failed"])
         self.last = StepReport(
-            converged=status == STATUS["running"],
+            converged=(status == STATUS["running"]) & (column["rough"] == 0.0),
             newton=column["newton"].astype(int),
             pcg=column["pcg"].astype(int),
             residual=column["residual"].copy(),
@@ -247,11 +248,11 @@ class Simulation(Results):
             residual_force=column["residual_force"].copy(),
         )
         self.steps += 1
-        self._stepped |= self.last.converged
+        good = status == STATUS["running"]
+        self._stepped |= good
         self._stepped &= status != STATUS["failed"]
         self.totals["newton"] += self.last.newton
         self.totals["pcg"] += self.last.pcg
-        good = self.last.converged
         if good.any():
             self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
             self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
@@ -333,7 +334,7 @@ class Simulation(Results):
                     for out in opened:
                         out.write(self)
                     bar(report)
-                    if (on_step is not None and on_step(self) is False) or interrupted() or not report.converged.any():
+                    if (on_step is not None and on_step(self) is False) or interrupted() or (report.status != STATUS["running"]).all():
                         break
             except BaseException:
                 close_all(opened, self)

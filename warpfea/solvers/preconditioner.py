@@ -100,6 +100,8 @@ def make(name: str, model: Model, work: Workspace, launch: Launcher, residual: R
     """The preconditioner `name`; "auto" is the best there is. Raises ModelError listing the names."""
     if name in ("auto", "two-level"):
         return TwoLevel(model, work, launch, residual)
+    if name == "tiles":
+        return TwoLevel(model, work, launch, residual, coarse=False)
     if name == "block-jacobi":
         return BlockJacobi(model, work, launch, residual)
     raise ModelError(f"preconditioner {name!r} is unknown; there are auto, two-level, block-jacobi")

@@ -73,7 +73,9 @@ class LevelArrays:
 class TwoLevel:
     """See the module. It is made where the rule of kernels/lag.py says, at the state's `preconditioner_displacement`."""
 
-    def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, residual: Residual, *, coarse: bool = True
+    ) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
         assert residual.assembled is not None
         self.assembled = residual.assembled
@@ -83,9 +85,10 @@ class TwoLevel:
         self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
         self.newton = residual.newton
         self.dim = (model.worlds, model.slots)
-        if "levels" not in model.cache:
-            model.cache["levels"] = make_levels(model, self.assembled.pattern)
-        self.levels: list[Level] = model.cache["levels"]
+        key = "levels" if coarse else "tiles"
+        if key not in model.cache:
+            model.cache[key] = make_levels(model, self.assembled.pattern, coarse=coarse)
+        self.levels: list[Level] = model.cache[key]
         self.arrays = [LevelArrays(model, work, level, k) for k, level in enumerate(self.levels)]
         self.value = self.assembled.values("preconditioner matrix")
         self.lanes = LANES if model.device.is_cuda else 1
@@ -183,7 +186,7 @@ class TwoLevel:
             self._apply_dense(0, r, z, active)
             coarse, correct = z, 0
         else:
-            coarse, correct = self._smooth(0, r, z, active), 1
+            coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
         args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, z, w.rows]
         launch(k.add_coarse, self.dim, args)
         if self.tied:
@@ -202,8 +205,13 @@ class TwoLevel:
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = tiles times r; returns what is to be prolonged."""
-        level, arrays, below = self.levels[depth], self.arrays[depth], self.arrays[depth + 1].vectors
+        level, arrays = self.levels[depth], self.arrays[depth]
         first_group = self.launch.padded(TILE_SLOTS * level.tiles)
+        if depth + 1 == len(self.levels):  # tiles alone
+            args = [level.data, arrays.matrix, self.by_row, 1, first_group, r, active, z, z]
+            self.launch(self.kernels.smooth, (self.model.worlds, first_group), args)
+            return z
+        below = self.arrays[depth + 1].vectors
         lanes = self.launch.lanes(GROUP_SLOTS)
         args = [level.data, arrays.matrix, self.by_row, lanes, first_group, r, active, z, below["r"]]
         self.launch(self.kernels.smooth, (self.model.worlds, first_group + lanes * level.groups), args)
@@ -263,6 +271,8 @@ class TwoLevel:
                 self._invert_dense(level, arrays, value, flags)
                 return
             self._invert_tiles(level, arrays, value, flags, keep=depth == 0)
+            if depth + 1 == len(self.levels):
+                return
             assert level.galerkin is not None
             free = self.all_free if depth else m.topology.free
             args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
