@@ -1,7 +1,7 @@
 """Accelerated descent with a fixed preconditioner B: v += p, p made of B r and of the last few moves.
 
-Pairs (s, y) of the last moves s = v' - v and of what they did to the residual r = -g, y = r - r', which is H s where H is
-constant. One thread per slot, and one per world for the small systems.
+Pairs (s, y) of the last moves s = v' - v and of what they did to the residual r = -g, y = r - r', which is H s where
+H is constant. One thread per slot, and one per world for the small systems.
 """
 
 import functools
@@ -9,13 +9,14 @@ import types as _types
 
 import warp as wp
 
-from .newton import FAIL_GROWTH, FAIL_JACOBIAN, FAIL_NAN, control_struct, newton_kernels
+from .newton import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_NAN, control_struct, newton_kernels
 from .pcg import pcg_struct
 from .types import kernel_module, precision
 
 __all__ = ["PAIRS", "jacobi_kernels", "jacobi_struct"]
 
-PAIRS = 5
+PAIRS = 4
+"""Moves that are remembered: 1 and 3 to 5 were tried, beyond 3 it hardly matters."""
 DEPENDENT = 1.0e-10  # a pivot below this share of its diagonal: a move that the others hold already
 
 
@@ -33,8 +34,8 @@ def jacobi_struct():
         first_norm: wp.array(dtype=wp.float64)  # |g| at the start of the attempt
         rho: wp.array(dtype=wp.float64)  # of the Chebyshev recursion
         growth: wp.float64  # |g| over that of the start beyond which a step is refused
+        gap: wp.float64  # m, violation of a constraint beyond which a step is refused
         step: wp.float64  # factor of B r
-        window: wp.int32  # pairs in use
         centre: wp.float64  # of the interval of eigenvalues
         half: wp.float64
 
@@ -50,9 +51,8 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
     shared = newton_kernels(dtype, constrained)
     measure, record = shared.measure, shared.record
-    residual_norm = acceleration == "anderson2"
-    name = acceleration.replace("-", "_")
-    module = kernel_module(f"jacobi_{dtype}_{name}{'_constrained' if constrained else ''}")
+    paired = acceleration in ("secants", "anderson")
+    module = kernel_module(f"jacobi_{dtype}_{acceleration}{'_constrained' if constrained else ''}")
 
     @wp.func
     def settle(ctl: Newton, jac: Jacobi, world: int):
@@ -71,7 +71,11 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
             ctl.active[world] = 0
             if ctl.norm[world] > jac.growth * jac.first_norm[world]:
                 ctl.failed[world] = FAIL_GROWTH
-            elif ctl.floor_excess[world] > f64(1.0):  # else rounding explains what is left
+            if wp.static(constrained):
+                if ctl.open[world] * ctl.constraint_tol > jac.gap:
+                    ctl.failed[world] = FAIL_CONSTRAINT
+            # rounding may explain what is left
+            if ctl.failed[world] == 0 and ctl.floor_excess[world] > f64(1.0):
                 ctl.rough[world] = 1
 
     @wp.kernel(module=module)
@@ -94,22 +98,17 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
         measure(ctl, world)
         ctl.iterations[world] = ctl.iterations[world] + 1
         ctl.total_iterations[world] = ctl.total_iterations[world] + 1
-        if wp.static(constrained):
-            ctl.stepped[world] = 1
-            ctl.outer[world] = ctl.outer[world] + 1
         settle(ctl, jac, world)
 
     @wp.func
-    def pair_of(k: int, window: int, age: int) -> int:
+    def pair_of(k: int, age: int) -> int:
         """Place of the pair that is `age` moves old at iteration k."""
-        return (k - 1 - age) % window
+        return (k - 1 - age) % PAIRS
 
     @wp.kernel(module=module)
     def remember(
         ctl: Newton,
-        jac: Jacobi,
         gradient: wp.array2d(dtype=vec3),
-        diagonal: wp.array2d(dtype=vec3),
         free: wp.array(dtype=vec3),
         move: wp.array2d(dtype=vec3),
         before: wp.array2d(dtype=vec3),
@@ -118,28 +117,26 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
         y: wp.array3d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """r = -g on the free components; the newest pair; rows w_j.y and w_j.r, w = s, or D^-1 y."""
+        """r = -g on the free components; the newest pair; rows s_j.y and s_j.r."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
         new = -wp.cw_mul(gradient[world, slot], free[slot])
         r[world, slot] = new
-        if wp.static(acceleration in ("none", "chebyshev")):
+        if wp.static(not paired):
             return
         k = ctl.iterations[world]
         change = vec3()
         if k > 0:
-            at = pair_of(k, jac.window, 0)
+            at = pair_of(k, 0)
             change = before[world, slot] - new
             s[at, world, slot] = move[world, slot]
             y[at, world, slot] = change
         before[world, slot] = new
-        for j in range(jac.window):
+        for j in range(PAIRS):
             w = vec3()
             if j < k:
                 w = s[j, world, slot]
-                if wp.static(residual_norm):
-                    w = wp.cw_div(y[j, world, slot], diagonal[world, slot])
             rows[j, world, slot] = f64(wp.dot(w, change))
             rows[PAIRS + j, world, slot] = f64(wp.dot(w, new))
 
@@ -164,44 +161,47 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
             else:
                 v = f64(0.0)
             jac.right[world, i] = v
-            at = pair_of(k, jac.window, i)
+            at = pair_of(k, i)
             jac.gamma[world, at] = add * jac.gamma[world, at] + v
 
     @wp.kernel(module=module)
+    def recursion(ctl: Newton, jac: Jacobi):
+        """Chebyshev's factors of the last move and of z, for eigenvalues in centre -+ half."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        ratio = jac.centre / jac.half
+        if ctl.iterations[world] == 0:
+            jac.rho[world] = f64(1.0) / ratio
+            jac.gamma[world, 0] = f64(0.0)
+            jac.gamma[world, 1] = f64(1.0) / jac.centre
+        else:
+            new = f64(1.0) / (f64(2.0) * ratio - jac.rho[world])
+            jac.gamma[world, 0] = new * jac.rho[world]
+            jac.gamma[world, 1] = f64(2.0) * new / jac.half
+            jac.rho[world] = new
+
+    @wp.kernel(module=module)
     def shares(ctl: Newton, jac: Jacobi):
-        """The pairs' part of the move: G gamma = W^T r by Cholesky, newest pair first."""
+        """The pairs' part of the move: G gamma = S^T r by Cholesky, newest pair first."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
         k = ctl.iterations[world]
-        if wp.static(acceleration == "chebyshev"):
-            ratio = jac.centre / jac.half
-            keep = f64(0.0)
-            step = f64(1.0) / jac.centre
-            if k == 0:
-                jac.rho[world] = f64(1.0) / ratio
-            else:
-                new = f64(1.0) / (f64(2.0) * ratio - jac.rho[world])
-                keep = new * jac.rho[world]
-                step = f64(2.0) * new / jac.half
-                jac.rho[world] = new
-            jac.gamma[world, 0] = keep
-            jac.gamma[world, 1] = step
-            return
-        for j in range(jac.window):
+        for j in range(PAIRS):
             jac.gamma[world, j] = f64(0.0)
-        count = wp.min(k, jac.window)
+        count = wp.min(k, PAIRS)
         if count == 0:
             return
-        at = pair_of(k, jac.window, 0)
-        for j in range(jac.window):
+        at = pair_of(k, 0)
+        for j in range(PAIRS):
             jac.gram[world, at, j] = jac.sums[j, world]
             jac.gram[world, j, at] = jac.sums[j, world]
         for i in range(count):
-            a = pair_of(k, jac.window, i)
+            a = pair_of(k, i)
             jac.right[world, i] = jac.sums[PAIRS + a, world]
             for j in range(i + 1):
-                v = jac.gram[world, a, pair_of(k, jac.window, j)]
+                v = jac.gram[world, a, pair_of(k, j)]
                 for m in range(j):
                     v -= jac.factor[world, i, m] * jac.factor[world, j, m]
                 if j == i:
@@ -222,19 +222,17 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
         if ctl.active[world] == 0:
             return
         a = r[world, slot]
-        for j in range(wp.min(ctl.iterations[world], jac.window)):
+        for j in range(wp.min(ctl.iterations[world], PAIRS)):
             a -= T(jac.gamma[world, j]) * y[j, world, slot]
         r[world, slot] = a
 
     @wp.kernel(module=module)
-    def conjugate_rows(
-        ctl: Newton, jac: Jacobi, y: wp.array3d(dtype=vec3), z: wp.array2d(dtype=vec3), rows: wp.array3d(dtype=f64)
-    ):
+    def conjugate_rows(ctl: Newton, y: wp.array3d(dtype=vec3), z: wp.array2d(dtype=vec3), rows: wp.array3d(dtype=f64)):
         """Rows y_j.z."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
-        for j in range(jac.window):
+        for j in range(PAIRS):
             rows[j, world, slot] = f64(0.0)
             if j < ctl.iterations[world]:
                 rows[j, world, slot] = f64(wp.dot(y[j, world, slot], z[world, slot]))
@@ -246,9 +244,9 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
         if ctl.active[world] == 0:
             return
         k = ctl.iterations[world]
-        count = wp.min(k, jac.window)
+        count = wp.min(k, PAIRS)
         for i in range(count):
-            jac.right[world, i] = -jac.step * jac.sums[pair_of(k, jac.window, i), world]
+            jac.right[world, i] = -jac.step * jac.sums[pair_of(k, i), world]
         substitute(jac, world, k, count, f64(1.0))
 
     @wp.kernel(module=module)
@@ -270,8 +268,8 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
             move[world, slot] = a
         else:
             a = T(jac.step) * z[world, slot]
-            if wp.static(acceleration != "none"):
-                for j in range(wp.min(ctl.iterations[world], jac.window)):
+            if wp.static(paired):
+                for j in range(wp.min(ctl.iterations[world], PAIRS)):
                     a += T(jac.gamma[world, j]) * s[j, world, slot]
             move[world, slot] = a
 
@@ -314,6 +312,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
         begin=begin,
         judge=judge,
         remember=remember,
+        recursion=recursion,
         shares=shares,
         project=project,
         conjugate_rows=conjugate_rows,
