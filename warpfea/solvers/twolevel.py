@@ -96,8 +96,8 @@ class TwoLevel:
         constraints = residual.constraints
         self.tied = constraints is not None and not self.levels[0].dense
         self.lag: Any = None
-        coarse = max([level.slots for level in self.levels[1:]], default=1)
-        self.all_free = wp.full(coarse, 1.0, dtype=model.types.vec3, device=model.device)
+        most = max([level.slots for level in self.levels[1:]], default=1)
+        self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
