@@ -1,9 +1,9 @@
 """Error and cost of wf.Jacobi: `python tests/jacobi_report.py --out tests/results/jacobi_cpu.json`.
 
-Four scenes from rest under gravity: a soft and a stiff T10 bar and a slender 3243 beam, each clamped at one end, and the
-double pendulum with its joints. For 2 to 32 iterations, with and without the coarse space, and each acceleration: the
-largest error of the tip in any step, over the way that it goes, against Newton's method with tol = 1e-10; ms per step;
-the relative residual that the steps say is left; the share of steps within the default tolerance. Newton's method
+Four scenes from rest under gravity: a soft and a stiff T10 bar and a slender 3243 beam, each clamped at one end, and
+the double pendulum with its joints. For 2 to 32 iterations, with and without the coarse space, and each acceleration:
+the largest error of the tip in any step, over the way that it goes, against Newton's method with tol = 1e-10; ms per
+step; the relative residual that the steps say is left; the share of steps within the default tolerance. Newton's method
 itself stands beside it, also with loose tolerances.
 """
 

@@ -96,6 +96,7 @@ class TwoLevel:
         constraints = residual.constraints
         self.tied = constraints is not None and not self.levels[0].dense
         self.lag: Any = None
+        self.rebuild_cost = REBUILD_COST
         most = max([level.slots for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
@@ -108,7 +109,7 @@ class TwoLevel:
                 size = 1 if name == "any_build" else m.worlds
                 setattr(lag, name, self.work.array(f"LagControl.{name}", (size,), var.type.dtype))
         lag.kept = state.register("preconditioner", wp.float64, (5,), (0.0, -1.0, -1.0, 0.0, 0.0))
-        lag.limit = REBUILD_COST
+        lag.limit = self.rebuild_cost
         lag.stale.fill_(1)
         lag.mass_factor.fill_(-1.0)
         self.lag = lag
