@@ -14,10 +14,11 @@ by the rule of kernels/lag.py. Accelerations:
   position-based dynamics", for eigenvalues of B H between LARGEST / max(4, iterations^2 / 4) and LARGEST.
 - "none": p = 0.5 z.
 
-Measured by tests/jacobi_report.py: "secants" needs the fewest iterations, by more the more there are; "anderson" is
-within a factor of ten up to 16; "chebyshev" serves stiff bodies at about 8 iterations as well, and stalls at what its
-interval leaves out. Tried and left: Anderson of type II in the D^-1 norm (like type I), B r in full
-or by half in place of 0.7 (no clear difference), multipliers changed in every iteration (diverges).
+Measured by tests/jacobi_report.py: "secants" needs the fewest iterations on solids and joints, by more the more there
+are; "anderson" is about as good up to 8 and better on a slender beam, by a factor of two; "chebyshev" serves stiff
+bodies at about 8 iterations as well, stalls at what its interval leaves out, and fails with joints. Tried and left:
+Anderson of type II in the D^-1 norm (like type I), B r in full or by half in place of 0.7 (no clear difference),
+multipliers changed in every iteration (diverges).
 
 Constraints: the multipliers stand still through a step and are changed once, by rho c, when it is accepted.
 """
