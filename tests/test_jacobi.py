@@ -20,7 +20,17 @@ RESULT = pathlib.Path(__file__).resolve().parent / "results" / "jacobi_cpu.json"
 SOFT = wf.SVK(E=1e5, nu=0.3, density=1000.0)
 
 
-def bar(*, dtype="float64", worlds=1, cells=(5, 2, 2), material=SOFT, clamp=True, pull=0.0, gravity=(0, 0, -9.81)):
+def bar(
+    *,
+    device="cpu",
+    dtype="float64",
+    worlds=1,
+    cells=(5, 2, 2),
+    material=SOFT,
+    clamp=True,
+    pull=0.0,
+    gravity=(0, 0, -9.81),
+):
     """More slots than are inverted as a whole, so that there are tiles and a coarse space."""
     b = wf.ModelBuilder(gravity=gravity)
     body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=cells), material=material)
@@ -29,7 +39,7 @@ def bar(*, dtype="float64", worlds=1, cells=(5, 2, 2), material=SOFT, clamp=True
     if pull:
         b.add_traction(body.surface("x+"), (pull, 0, 0))
     b.add_probe("tip", body.surface("x+"))
-    return b.finalize(device="cpu", dtype=dtype, worlds=worlds)
+    return b.finalize(device=device, dtype=dtype, worlds=worlds)
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +86,16 @@ def test_float32(soft, data):
     sim, found = way(bar(dtype="float32"))
     assert data.error(found, expected) < 1e-3
     assert sim.last.residual[0] < 0.1
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("coarse", [True, False])
+def test_cuda_equals_cpu(data, coarse):
+    for acceleration in ("secants", "chebyshev"):
+        _, expected = way(bar(), coarse=coarse, acceleration=acceleration)
+        sim, found = way(bar(device="cuda:0"), coarse=coarse, acceleration=acceleration)
+        assert data.error(found, expected) < 1e-8
+        assert sim.totals["rough"][0] == 20
 
 
 def test_what_is_left_is_told(soft):

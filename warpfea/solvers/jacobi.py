@@ -51,7 +51,7 @@ GAP = 1e-3
 """So is one that leaves a constraint open by more than this share of the model's size."""
 REBUILD_COST = 10.0
 """Iterations that making B anew is worth: less than for Newton's method, since an old B costs accuracy here, not time
-(5, 10, 20, 40 were tried on bars that swing by 60 degrees: with 40 the error is up to 70 times as large, and a tenth of
+(5, 10, 20, 40 were tried on soft bars that swing far: with 40 the error is up to 70 times as large, and a tenth of
 the time is saved)."""
 STEP = {"secants": 0.7, "anderson": 0.7, "chebyshev": 1.0, "none": 0.5}
 LARGEST = 3.5
