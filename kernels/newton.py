@@ -11,6 +11,7 @@ __all__ = [
     "COMPONENT_ROWS",
     "FAIL_CONSTRAINT",
     "FAIL_CURVATURE",
+    "FAIL_GROWTH",
     "FAIL_ITERATIONS",
     "FAIL_JACOBIAN",
     "FAIL_LINE_SEARCH",
@@ -26,6 +27,7 @@ FAIL_JACOBIAN = 3
 FAIL_NAN = 4
 FAIL_CURVATURE = 5
 FAIL_CONSTRAINT = 6
+FAIL_GROWTH = 7
 
 ARMIJO = 1.0e-4
 WOLFE = 0.8
@@ -86,6 +88,7 @@ def control_struct():
         relinearise: wp.array(dtype=wp.int32)  # the operator's matrix is to be made anew
         tol: wp.float64
         eps: wp.float64
+        rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
         max_iterations: wp.int32
         components: wp.int32
         nonpotential: wp.int32
@@ -429,6 +432,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
 
     return _types.SimpleNamespace(
         module=module,
+        measure=measure,
+        record=record,
         reset_min_J=reset_min_J,
         begin=begin,
         begin_search=begin_search,

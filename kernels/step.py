@@ -30,6 +30,7 @@ REPORT = (
     "violation",
     "outer",
     "residual_force",
+    "rough",
 )
 """Columns of the report of a step, [world, column] in float64; probes follow."""
 
@@ -117,6 +118,7 @@ def step_kernels(
         step.running[world] = alive
         step.refused[world] = 0
         newton.total_iterations[world] = 0
+        newton.rough[world] = 0
         if wp.static(constrained):
             newton.outer[world] = 0
         pcg.total[world] = 0
@@ -384,6 +386,7 @@ def step_kernels(
         report[world, 9] = f64(0.0)
         report[world, 10] = f64(0.0)
         report[world, 11] = newton.force[world]
+        report[world, 12] = f64(newton.rough[world])
         if wp.static(constrained):
             largest = f64(0.0)
             for c in range(newton.components):

@@ -58,7 +58,7 @@ from .model import Model  # noqa: E402
 from .render import GIFWriter, PNGWriter  # noqa: E402
 from .scene import scene  # noqa: E402
 from .simulation import Simulation, StepReport  # noqa: E402
-from .solvers import NewtonPCG  # noqa: E402
+from .solvers import Jacobi, NewtonPCG  # noqa: E402
 from .state import State  # noqa: E402
 from .statics import solve_static  # noqa: E402
 from .usd import USDWriter  # noqa: E402
@@ -76,6 +76,7 @@ __all__ = [
     "ElementSet",
     "Error",
     "GIFWriter",
+    "Jacobi",
     "Joint",
     "KelvinVoigt",
     "MaterialPoint",

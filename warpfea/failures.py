@@ -11,11 +11,13 @@ from .evaluation import lowest_jacobian
 from .kernels.newton import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
+    FAIL_GROWTH,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
     FAIL_LINE_SEARCH,
     FAIL_NAN,
 )
+from .solvers import NewtonPCG
 
 if TYPE_CHECKING:
     from .model import Model
@@ -29,6 +31,7 @@ REASONS = {
     FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
     FAIL_NAN: "a force or energy was not finite",
     FAIL_CURVATURE: "no descent direction was found",
+    FAIL_GROWTH: "the residual grew more than tenfold",
 }
 OPEN = 1e-4
 """Violation at the start, over the model's size, that a dynamic run refuses to snap shut."""
@@ -84,10 +87,11 @@ def _unsatisfied(sim: Simulation, world: int, time: float, halvings: int) -> Con
     tol = sim.stepper.newton.constraint_tol
     names, values = _violated(sim.model, sim.stepper.work.multipliers.value.numpy()[world], tol)
     listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
+    few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
     return ConstraintError(
         f"step from t = {time:.6g} s with dt = {sim.dt:g} s: constraints could not be satisfied in world {world} after "
         f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or with "
-        f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m)",
+        f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}",
         joints=names, violations=values, time=time, world=world, state=sim.state,
     )  # fmt: skip
 

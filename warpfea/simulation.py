@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import integrators
+from . import integrators, solvers
 from .bodies import NodeSet
 from .constraints import Joint
 from .errors import ConstraintError, ConvergenceError, ModelError
@@ -19,7 +19,7 @@ from .kernels.constraints import JOINT_COLUMNS
 from .kernels.step import LEDGER, REPORT, STATUS
 from .results import Results
 from .run_loop import close_all, interruptible, step_bar
-from .solvers import NewtonPCG
+from .solvers import Jacobi, NewtonPCG
 from .state import State
 from .stepper import Stepper
 
@@ -34,8 +34,9 @@ class StepReport:
     """What a step took, each an array [world].
 
     Attributes:
-        converged: the step was accepted.
-        newton, pcg: iterations, refused attempts included.
+        converged: the step was accepted and is within the solver's tolerance. With wf.Jacobi a world may go on without:
+            False with status 0.
+        newton, pcg: iterations, refused attempts included; Jacobi's count as newton.
         residual: |g| over the largest force, of the last attempt.
         halvings: refused attempts.
         status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
@@ -97,7 +98,7 @@ class Simulation(Results):
         state: where it starts; by default model.state(). It is advanced in place.
         dt: step, s. `sim.dt` may be set later.
         integrator: "backward_euler" or "bdf2".
-        solver: NewtonPCG options.
+        solver: "newton-pcg" or "jacobi", or options: wf.NewtonPCG(...), wf.Jacobi(...).
         constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
             float64, 1e-5 in float32.
         ledger: keep the energy ledger.
@@ -119,7 +120,7 @@ class Simulation(Results):
         *,
         dt: float,
         integrator: str = "backward_euler",
-        solver: NewtonPCG | None = None,
+        solver: NewtonPCG | Jacobi | str | None = None,
         constraint_tol: float | None = None,
         ledger: bool = True,
         record: bool = True,
@@ -127,7 +128,7 @@ class Simulation(Results):
         on_failure: str | None = None,
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
-        scheme, options = integrators.get(integrator), solver or NewtonPCG()
+        scheme, options = integrators.get(integrator), solvers.get(solver)
         self._start(model, state, scheme, options, ledger, capture, on_compile, constraint_tol)
         self.dt = dt
         if on_failure not in (None, "raise", "freeze"):
@@ -151,7 +152,7 @@ class Simulation(Results):
         model: Model,
         state: State | None,
         scheme: Any,
-        solver: NewtonPCG,
+        solver: NewtonPCG | Jacobi,
         ledger: bool,
         capture: bool,
         on_compile: Callable[[int, int, str], None] | None = None,
@@ -182,7 +183,7 @@ class Simulation(Results):
         check_closed(self)
         self.steps = 0
         self.last: StepReport | None = None
-        self.totals = {"newton": np.zeros(model.worlds, int), "pcg": np.zeros(model.worlds, int)}
+        self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough")}
         self.max_residual = 0.0
         self.max_violation = 0.0
         self.record = True
@@ -233,7 +234,7 @@ class Simulation(Results):
         before = self.last.status if self.last is not None else np.zeros(len(rows), int)
         fresh = (status == STATUS["failed"]) & (before != STATUS["failed"])
         self.last = StepReport(
-            converged=status == STATUS["running"],
+            converged=(status == STATUS["running"]) & (column["rough"] == 0.0),
             newton=column["newton"].astype(int),
             pcg=column["pcg"].astype(int),
             residual=column["residual"].copy(),
@@ -247,11 +248,12 @@ class Simulation(Results):
             residual_force=column["residual_force"].copy(),
         )
         self.steps += 1
-        self._stepped |= self.last.converged
+        good = status == STATUS["running"]
+        self._stepped |= good
         self._stepped &= status != STATUS["failed"]
         self.totals["newton"] += self.last.newton
         self.totals["pcg"] += self.last.pcg
-        good = self.last.converged
+        self.totals["rough"] += good & ~self.last.converged
         if good.any():
             self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
             self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
@@ -333,7 +335,11 @@ class Simulation(Results):
                     for out in opened:
                         out.write(self)
                     bar(report)
-                    if (on_step is not None and on_step(self) is False) or interrupted() or not report.converged.any():
+                    if (
+                        (on_step is not None and on_step(self) is False)
+                        or interrupted()
+                        or (report.status != STATUS["running"]).all()
+                    ):
                         break
             except BaseException:
                 close_all(opened, self)

@@ -100,6 +100,8 @@ def solve_static(
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number")
     check_model(model)
     model.check_static_supports()
+    if not isinstance(solver, (NewtonPCG, type(None))):
+        raise ModelError(f"solve_static: solver = {solver!r} must be wf.NewtonPCG(...): an equilibrium is to be found")
     options = solver or NewtonPCG(max_pcg=20000, max_newton=50)
     if tol is not None:
         if not (math.isfinite(tol) and 0.0 < tol < 1.0):

@@ -15,7 +15,7 @@ from .errors import ModelError
 from .integrators import Integrator
 from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_kernels
 from .launch import Launcher, labelled
-from .solvers.newton import NewtonLoop, NewtonPCG
+from .solvers import Jacobi, NewtonPCG, make_loop
 from .state import State
 from .workspace import Workspace
 
@@ -38,7 +38,7 @@ class Stepper:
         model: Model,
         state: State,
         integrator: Integrator,
-        solver: NewtonPCG,
+        solver: NewtonPCG | Jacobi,
         *,
         ledger: bool,
         capture: bool,
@@ -71,7 +71,7 @@ class Stepper:
             state.register("constraint_force", wp.float64, (model.constraints.count,))
             state.register("constraint_target", wp.float64, (model.constraints.count,), np.nan)
         self.work = Workspace(model, integrator, max_newton=solver.max_newton, ledger=ledger)
-        self.newton = NewtonLoop(
+        self.newton = make_loop(
             model, self.work, self.launch, solver, inertia=not integrator.static, constraint_tol=constraint_tol
         )
         self.newton.preconditioner.register(state)
@@ -154,9 +154,7 @@ class Stepper:
 
         m = self.model
         out = {self.kernels.module, reduce_kernels().module}
-        out.add(self.newton.kernels.module)
-        out.add(self.newton.pcg.kernels.module)
-        out |= self.newton.preconditioner.modules() | self.newton.residual.modules()
+        out |= self.newton.modules()
         out |= {kernel.module for kernel in m.loads.used_kernels()}
         if self.backup is not None:
             out.add(state_kernels().module)

@@ -93,7 +93,7 @@ class Workspace:
         self.multipliers: Any = allocate(model, self)
         self.constraint_work = self.array("constraint_work", (2, B) if model.constraints else (1, 1), wp.float64)
         optional = () if model.constraints else ("constraint_sums", "stepped", "outer", "open")
-        self.newton = self._struct(
+        self.newton = self.struct(
             control_struct(), B, skip=("violation", *optional),
             history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
             constraint_sums=(SUM_ROWS, B),
@@ -101,8 +101,8 @@ class Workspace:
         self.newton.components = C
         if model.constraints:
             self.newton.violation = self.multipliers.violation
-        self.pcg = self._struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
-        self.step = self._struct(step_struct(), B)
+        self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
+        self.step = self.struct(step_struct(), B)
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Zeroed array; its bytes are counted."""
@@ -110,7 +110,7 @@ class Workspace:
         self.bytes[name] = int(np.prod(shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
         return out
 
-    def _struct(self, kind: Any, worlds: int, skip: tuple[str, ...] = (), **shapes: tuple[int, ...]) -> Any:
+    def struct(self, kind: Any, worlds: int, skip: tuple[str, ...] = (), **shapes: tuple[int, ...]) -> Any:
         """A control struct with an array [world] for each array field, unless a shape is given."""
         out = kind()
         special = {

@@ -238,6 +238,12 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
     how.add_argument("--dt", type=positive, metavar="S", help="step, s")
     how.add_argument("--integrator", metavar="NAME", help="backward_euler or bdf2")
+    how.add_argument(
+        "--solver",
+        choices=("newton-pcg", "jacobi"),
+        default="newton-pcg",
+        help="of a step, by default newton-pcg; jacobi: few cheap iterations, what is left is told",
+    )
     how.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
 
 

@@ -12,7 +12,7 @@ from ..errors import Error, ModelError
 from ..model import Model
 from ..scene import Scene, find, load_file
 from ..simulation import Simulation
-from ..solvers import NewtonPCG
+from ..solvers import SOLVERS
 from .console import compile_bar
 from .parser import UsageError
 from .part import OPTIONS, SUFFIXES, part_scene
@@ -28,7 +28,7 @@ class Source:
         label: what the user wrote.
         scene: the scene. values: what it is called with.
         parameters: what a summary says.
-        dt, integrator, dtype, device, tol: of the run.
+        dt, integrator, dtype, device, tol, solver: of the run.
     """
 
     label: str
@@ -40,6 +40,7 @@ class Source:
     dtype: str
     device: str | None
     tol: float | None
+    solver: str
 
     def model(self) -> Model:
         """Call the scene and finalize; an error of the scene's own code is a ModelError with file and line."""
@@ -56,7 +57,7 @@ class Source:
 
     def simulation(self, model: Model, show: bool | None) -> Simulation:
         """The simulation; shows a bar while kernels compile."""
-        solver = NewtonPCG(tol=self.tol)
+        solver = SOLVERS[self.solver](tol=self.tol)
         with compile_bar(show) as bar:
             return Simulation(model, dt=self.dt, integrator=self.integrator, solver=solver, on_compile=bar)
 
@@ -106,4 +107,5 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         dtype=options.dtype or saved.get("dtype") or "float64",
         device=options.device,
         tol=options.tol or found.tol,
+        solver=options.solver,
     )

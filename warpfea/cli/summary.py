@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..simulation import Simulation
+from ..solvers import Jacobi
 from .console import number, table
 from .source import Source
 
@@ -31,6 +32,7 @@ KEYS = (
     "newton_iterations",
     "pcg_iterations",
     "max_residual",
+    "rough_steps",
     "energies",
     "probes",
     "violation",
@@ -47,8 +49,8 @@ def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wal
     """The summary of a run of one world, SI units.
 
     `t_end` is the time that was reached, `wall_s` the seconds from building to the closing of files, `compile_s` those
-    of them in which the simulation was made; energies and probes are the last values, `violation` the largest of the
-    constraints in any step, m.
+    of them in which the simulation was made; `rough_steps` are those accepted short of the tolerance (Jacobi); energies
+    and probes are the last values, `violation` the largest of the constraints in any step, m.
     """
     probes = {}
     for probe in sim.model.probes:
@@ -71,6 +73,7 @@ def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wal
         "newton_iterations": int(sim.totals["newton"].sum()),
         "pcg_iterations": int(sim.totals["pcg"].sum()),
         "max_residual": sim.max_residual,
+        "rough_steps": int(sim.totals["rough"].sum()),
         "energies": {name: float(values[0]) for name, values in sim.energies().items()},
         "probes": probes,
         "violation": sim.max_violation,
@@ -126,11 +129,16 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
         ["time", f"{s['wall_s']:.1f} s, of which {s['compile_s']:.1f} s for kernels and set-up"],
         [
             "iterations",
-            f"{s['newton_iterations'] / steps:.1f} Newton and {s['pcg_iterations'] / steps:.0f} PCG per step, "
-            f"residual up to {_text(s['max_residual'], 2)}"
+            f"{_counts(s, sim)} per step, residual up to {_text(s['max_residual'], 2)}"
             + (f", violation up to {_text(s['violation'], 2)} m" if sim.model.constraints else ""),
         ],
     ]
+    if s["rough_steps"]:
+        reached = s["steps"] - s["rough_steps"]
+        tol = number(sim.solver.tolerance(s["dtype"]))
+        rows.append(
+            ["NOT CONVERGED", f"{reached} of {s['steps']} steps ({reached / steps:.0%}) reached the tolerance {tol}"]
+        )
     e = s["energies"]
     parts = [f"{name} {_text(e[name])}" for name in ("kinetic", "strain", "potential", "work", "viscous")]
     rows.append(["energy", f"{', '.join(parts)} J"])
@@ -142,6 +150,14 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
     rows += _joints(sim)
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return table(rows)
+
+
+def _counts(s: dict[str, Any], sim: Simulation) -> str:
+    """Iterations per step."""
+    first = s["newton_iterations"] / max(s["steps"], 1)
+    if isinstance(sim.solver, Jacobi):
+        return f"{first:.1f} of Jacobi"
+    return f"{first:.1f} Newton and {s['pcg_iterations'] / max(s['steps'], 1):.0f} PCG"
 
 
 def _joints(sim: Simulation) -> list[list[str]]:

@@ -1,5 +1,33 @@
 """Solvers of a step."""
 
-from .newton import NewtonPCG
+from __future__ import annotations
 
-__all__ = ["NewtonPCG"]
+from typing import Any
+
+from ..errors import ModelError
+from .jacobi import Jacobi, JacobiLoop
+from .newton import NewtonLoop, NewtonPCG
+
+__all__ = ["SOLVERS", "Jacobi", "NewtonPCG", "get", "make_loop"]
+
+SOLVERS: dict[str, type[NewtonPCG] | type[Jacobi]] = {"newton-pcg": NewtonPCG, "jacobi": Jacobi}
+"""Solvers by name."""
+
+
+def get(solver: Any) -> NewtonPCG | Jacobi:
+    """Options of the solver that a name, options, or None for the default mean. Raises ModelError listing the names."""
+    if solver is None:
+        return NewtonPCG()
+    if isinstance(solver, str) and solver in SOLVERS:
+        return SOLVERS[solver]()
+    if isinstance(solver, (NewtonPCG, Jacobi)):
+        return solver
+    names = ", ".join(repr(name) for name in SOLVERS)
+    raise ModelError(f"solver = {solver!r} is unknown; there are {names}, or options such as wf.NewtonPCG(...)")
+
+
+def make_loop(model: Any, work: Any, launch: Any, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
+    """The loop that the options describe."""
+    if isinstance(options, Jacobi):
+        return JacobiLoop(model, work, launch, options, **more)
+    return NewtonLoop(model, work, launch, options, **more)

@@ -65,12 +65,14 @@ class Points:
     label: np.ndarray
 
 
-def make_levels(model: Model, pattern: Pattern) -> list[Level]:
-    """The levels of a model, finest first; `pattern` is that of H."""
+def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[Level]:
+    """The levels of a model, finest first; `pattern` is that of H. Without `coarse` the tiles of the first alone."""
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
     place = model.reference + origin * position[:, None]
     points = Points(place, position, np.cumsum(position) - 1, model.part)
+    if not coarse:
+        return [_make_level(model, pattern, points, GROUP_SLOTS)[0]]
     levels = []
     bottom = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     for depth in range(MAX_LEVELS):

@@ -171,6 +171,11 @@ class NewtonLoop:
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
 
+    def modules(self) -> set[wp.Module]:
+        """Modules that the loop launches, but those of the reductions and of the constraints."""
+        out = {self.kernels.module, self.pcg.kernels.module}
+        return out | self.preconditioner.modules() | self.residual.modules()
+
     def run(self) -> None:
         """Iterate from work.v until every active world has converged or failed."""
         w = self.work

@@ -44,7 +44,7 @@ class PCG:
         launch(k.start, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
         if m.component_count > 1:
             launch(k.silence, self.dim, [w.newton, m.component_of_slot, active, w.r])
-        self._translate(active)
+        self.translate(active)
         self.preconditioner.prepare(active)
         self._precondition(active)
         w.pcg.any_active.zero_()
@@ -52,7 +52,7 @@ class PCG:
         launch(self.residual.newton.copy_active, self.dim, [w.z, w.pcg.active, w.p])
         wp.capture_while(w.pcg.any_active, self._iterate)
         self.preconditioner.judge(active)
-        self._translate(active)
+        self.translate(active)
 
     def _iterate(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
@@ -68,7 +68,7 @@ class PCG:
         self.preconditioner.apply(w.r, w.z, active)
         self.residual.reduce(w.warp_rows, 2, active, w.pcg.sums)
 
-    def _translate(self, active: wp.array) -> None:
+    def translate(self, active: wp.array) -> None:
         """x += Z (Z^T H Z)^-1 Z^T r."""
         if not self.deflate:
             return

@@ -102,6 +102,8 @@ def make(
     """The preconditioner `name`; "auto" is the best there is. Raises ModelError listing the names."""
     if name in ("auto", "two-level"):
         return TwoLevel(model, work, launch, residual, storage)
+    if name == "tiles":
+        return TwoLevel(model, work, launch, residual, storage, coarse=False)
     if name == "block-jacobi":
         return BlockJacobi(model, work, launch, residual)
     raise ModelError(f"preconditioner {name!r} is unknown; there are auto, two-level, block-jacobi")

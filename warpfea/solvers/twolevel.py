@@ -85,7 +85,14 @@ class TwoLevel:
     """See the module; it is made anew when the rule of kernels/lag.py says so."""
 
     def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, residual: Residual, storage: str | None = None
+        self,
+        model: Model,
+        work: Workspace,
+        launch: Launcher,
+        residual: Residual,
+        storage: str | None = None,
+        *,
+        coarse: bool = True,
     ) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
         self.storage = storage or model.dtype
@@ -97,9 +104,10 @@ class TwoLevel:
         self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
         self.newton = residual.newton
         self.dim = (model.worlds, model.slots)
-        if "levels" not in model.cache:
-            model.cache["levels"] = make_levels(model, self.assembled.pattern)
-        self.levels: list[Level] = model.cache["levels"]
+        key = "levels" if coarse else "tiles"
+        if key not in model.cache:
+            model.cache[key] = make_levels(model, self.assembled.pattern, coarse=coarse)
+        self.levels: list[Level] = model.cache[key]
         self.arrays = [LevelArrays(model, work, level, k, self.storage) for k, level in enumerate(self.levels)]
         self.value = self.assembled.values("preconditioner matrix")
         self.lanes = LANES if model.device.is_cuda else 1
@@ -107,8 +115,9 @@ class TwoLevel:
         constraints = residual.constraints
         self.tied = constraints is not None and not self.levels[0].dense
         self.lag: Any = None
-        coarse = max([level.slots for level in self.levels[1:]], default=1)
-        self.all_free = wp.full(coarse, 1.0, dtype=model.types.vec3, device=model.device)
+        self.rebuild_cost = REBUILD_COST
+        most = max([level.slots for level in self.levels[1:]], default=1)
+        self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
@@ -119,7 +128,7 @@ class TwoLevel:
                 size = 1 if name == "any_build" else m.worlds
                 setattr(lag, name, self.work.array(f"LagControl.{name}", (size,), var.type.dtype))
         lag.kept = state.register("preconditioner", wp.float64, (5,), (0.0, -1.0, -1.0, 0.0, 0.0))
-        lag.limit = REBUILD_COST
+        lag.limit = self.rebuild_cost
         lag.stale.fill_(1)
         lag.mass_factor.fill_(-1.0)
         self.lag = lag
@@ -197,7 +206,7 @@ class TwoLevel:
             self._apply_dense(0, r, z, active)
             coarse, correct = z, 0
         else:
-            coarse, correct = self._smooth(0, r, z, active), 1
+            coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
         args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
         launch(k.add_coarse, dim, args)
@@ -219,24 +228,18 @@ class TwoLevel:
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = tiles times r; returns what is to be prolonged."""
-        level, arrays, below = self.levels[depth], self.arrays[depth], self.arrays[depth + 1].vectors
+        level, arrays = self.levels[depth], self.arrays[depth]
+        last = depth + 1 == len(self.levels)  # tiles alone
+        coarse = z if last else self.arrays[depth + 1].vectors["r"]
         share = 4 if self.model.device.is_cuda else 1
         first_group = self.launch.padded(share * TILE_SLOTS * level.tiles)
         lanes = self.launch.lanes(GROUP_SLOTS)
-        args = [
-            level.data,
-            arrays.stored,
-            arrays.root,
-            self.by_row,
-            share,
-            lanes,
-            first_group,
-            r,
-            active,
-            z,
-            below["r"],
-        ]
-        self.launch(self.kernels.smooth, (self.model.worlds, first_group + lanes * level.groups), args)
+        args = [level.data, arrays.stored, arrays.root, self.by_row, share, lanes, first_group]
+        threads = first_group + (0 if last else lanes * level.groups)
+        self.launch(self.kernels.smooth, (self.model.worlds, threads), [*args, r, active, z, coarse])
+        if last:
+            return z
+        below = self.arrays[depth + 1].vectors
         if self.levels[depth + 1].dense:
             self._apply_dense(depth + 1, below["r"], below["x"], active)
         else:
@@ -293,6 +296,8 @@ class TwoLevel:
                 self._invert_dense(level, arrays, value, flags)
                 return
             self._invert_tiles(level, arrays, value, flags, keep=depth == 0)
+            if depth + 1 == len(self.levels):
+                return
             assert level.galerkin is not None
             free = self.all_free if depth else m.topology.free
             args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]

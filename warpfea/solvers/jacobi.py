@@ -1,0 +1,218 @@
+"""Tiled block-Jacobi descent with acceleration, a fixed number of iterations per step: options, and its loop.
+
+An iteration is one evaluation of the residual and one application of B, the tile inverses of H of the preconditioner,
+with its coarse space or without: v += p, p from z = B r, r = -g, and from the moves before. B is kept while it serves,
+by the rule of kernels/lag.py. Accelerations:
+
+- "secants": with S the last moves and Y what they did to r, p = S c + 0.7 z, where S c is the Galerkin solution on the
+  moves, (S^T Y) c = S^T r, z = B (r - Y c), and p is made conjugate to the moves. That is a block BFGS update of B
+  (Schnabel 1983), as L-BFGS serves Liu, Bouaziz, Kavan 2017, "Quasi-Newton methods for real-time simulation of
+  hyperelastic materials", and the type I form of Anderson's method (Fang and Saad 2009) made symmetric. With H constant
+  these are conjugate gradients whose step lengths come one iteration late.
+- "anderson": the same without the conjugation, one reduction less: Anderson's method of type I.
+- "chebyshev": the semi-iteration as in Wang 2015, "A Chebyshev semi-iterative approach for accelerating projective and
+  position-based dynamics", for eigenvalues of B H between LARGEST / max(4, iterations^2 / 4) and LARGEST.
+- "none": p = 0.5 z.
+
+Measured by tests/jacobi_report.py: "secants" needs the fewest iterations on solids and joints, by more the more there
+are; "anderson" is about as good up to 8 and better on a slender beam, by a factor of two; "chebyshev" serves stiff
+bodies at about 8 iterations as well, stalls at what its interval leaves out, and fails with joints. Tried and left:
+Anderson of type II in the D^-1 norm (like type I), B r in full or by half in place of 0.7 (no clear difference),
+multipliers changed in every iteration (diverges).
+
+Constraints: the multipliers stand still through a step and are changed once, by rho c, when it is accepted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from ..errors import ModelError
+from ..kernels.jacobi import PAIRS, jacobi_kernels, jacobi_struct
+from ..launch import labelled
+from .newton import NewtonLoop, NewtonPCG
+from .twolevel import TwoLevel
+
+if TYPE_CHECKING:
+    from ..launch import Launcher
+    from ..model import Model
+    from ..workspace import Workspace
+
+__all__ = ["Jacobi", "JacobiLoop"]
+
+ACCELERATIONS = ("secants", "anderson", "chebyshev", "none")
+GROWTH = 10.0
+"""Residual over that at the start of a step beyond which the step is refused."""
+GAP = 1e-3
+"""So is one that leaves a constraint open by more than this share of the model's size."""
+REBUILD_COST = 10.0
+"""Iterations that making B anew is worth: less than for Newton's method, since an old B costs accuracy here, not time
+(5, 10, 20, 40 were tried on soft bars that swing far: with 40 the error is up to 70 times as large, and a tenth of
+the time is saved)."""
+STEP = {"secants": 0.7, "anderson": 0.7, "chebyshev": 1.0, "none": 0.5}
+LARGEST = 3.5
+"""Assumed largest eigenvalue of B H, as for the coarse levels of the preconditioner."""
+
+
+@dataclass(frozen=True)
+class Jacobi:
+    """Descent with dense inverses of tiles of 48 unknowns, at a fixed cost per step: an approximation that says so.
+
+    A step is accepted after `iterations`, whatever is left of the residual. `StepReport.residual` and `residual_force`
+    tell what is; `StepReport.converged` is False where that is beyond the tolerance. Refused and halved, as with
+    Newton's method, are steps that end with ten times the residual of their start or a constraint open by a thousandth
+    of the model's size, or meet a force that is not finite or a J <= 0 that a law does not take. For soft bodies and
+    small steps: see the table of the README.
+
+    Args:
+        iterations: most per step, each one residual and one application of the tile inverses.
+        coarse: add the affine motions of groups of tiles. Without them an iteration is cheaper, and stiff or long
+            bodies move as if much softer or fall apart from their loads.
+        acceleration: "secants", "anderson", "chebyshev", or "none".
+        tol: a step ends early, and is converged, within this tolerance; as of NewtonPCG, with its defaults.
+        force_tol: as of NewtonPCG, N.
+        max_halvings: how often a refused step may be halved.
+        penalty: of a constraint over the stiffness of what it ties. Low, joints give; high, everything else converges
+            slowly.
+
+    Raises:
+        ModelError: a value out of range.
+    """
+
+    iterations: int = 8
+    coarse: bool = True
+    acceleration: str = "secants"
+    tol: float | None = None
+    force_tol: float = 0.0
+    max_halvings: int = 8
+    penalty: float = 100.0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.iterations, bool) or not (self.iterations == int(self.iterations) >= 1):
+            raise ModelError(f"Jacobi: iterations = {self.iterations!r} must be a whole number, at least 1")
+        if self.acceleration not in ACCELERATIONS:
+            names = ", ".join(repr(name) for name in ACCELERATIONS)
+            raise ModelError(f"Jacobi: acceleration = {self.acceleration!r} is none of {names}")
+        if self.tol is not None and not (math.isfinite(self.tol) and 0.0 < self.tol < 1.0):
+            raise ModelError(f"Jacobi: tol = {self.tol!r} must lie between 0 and 1")
+        if not (math.isfinite(self.force_tol) and self.force_tol >= 0.0):
+            raise ModelError(f"Jacobi: force_tol = {self.force_tol!r} must be zero or positive, N")
+        if not 0 <= self.max_halvings <= 20:
+            raise ModelError(f"Jacobi: max_halvings = {self.max_halvings!r} must lie between 0 and 20")
+        if not (math.isfinite(self.penalty) and self.penalty > 0.0):
+            raise ModelError(f"Jacobi: penalty = {self.penalty!r} must be positive")
+
+    @property
+    def newton(self) -> NewtonPCG:
+        """What of Newton's loop it uses."""
+        return NewtonPCG(
+            tol=self.tol,
+            force_tol=self.force_tol,
+            max_newton=self.iterations,
+            max_pcg=1,
+            max_halvings=self.max_halvings,
+            preconditioner="two-level" if self.coarse else "tiles",
+            operator="elements",  # H p is never asked for: no matrix of the iterate
+            multipliers="outer",
+            penalty=self.penalty,
+        )
+
+    @property
+    def max_newton(self) -> int:
+        """Iterations before a step ends."""
+        return self.iterations
+
+    def tolerance(self, dtype: str) -> float:
+        """The tolerance in one precision."""
+        return self.newton.tolerance(dtype)
+
+
+class JacobiLoop(NewtonLoop):
+    """Newton's loop with one application of the preconditioner in place of the linear solve, and no line search."""
+
+    def __init__(
+        self,
+        model: Model,
+        work: Workspace,
+        launch: Launcher,
+        options: Jacobi,
+        *,
+        inertia: bool,
+        constraint_tol: float,
+    ) -> None:
+        super().__init__(model, work, launch, options.newton, inertia=inertia, constraint_tol=constraint_tol)
+        # the multipliers are changed once, when the step is accepted: no outer loop, and constraints count
+        self.classical = False
+        work.newton.constraint_tol = constraint_tol
+        assert isinstance(self.preconditioner, TwoLevel)
+        self.preconditioner.rebuild_cost = REBUILD_COST
+        self.acceleration = options.acceleration
+        self.paired = options.acceleration in ("secants", "anderson")
+        self.own = jacobi_kernels(model.dtype, model.constraints is not None, options.acceleration)
+        B, m = model.worlds, PAIRS
+        shape = (m, B, model.slots) if self.paired else (1, 1, 1)
+        self.moves = work.array("jacobi moves", shape, model.types.vec3)
+        self.changes = work.array("jacobi changes", shape, model.types.vec3)
+        shapes: dict[str, Any] = {
+            "gram": (B, m, m),
+            "factor": (B, m, m),
+            "right": (B, m),
+            "gamma": (B, m),
+            "sums": (2 * m, B),
+        }
+        self.control = work.struct(jacobi_struct(), B, **shapes)
+        self.control.growth = GROWTH
+        self.control.gap = GAP * model.size
+        self.control.step = STEP[options.acceleration]
+        least = LARGEST / max(4.0, 0.25 * options.iterations**2)
+        self.control.centre, self.control.half = 0.5 * (LARGEST + least), 0.5 * (LARGEST - least)
+
+    def modules(self) -> set[wp.Module]:
+        """Modules that the loop launches, but those of the reductions and of the constraints."""
+        return super().modules() | {self.own.module}
+
+    def _solve(self) -> None:
+        """The iterations from the residual at hand, and what the preconditioner's rule is to know of them."""
+        w = self.work
+        self.launch(self.own.begin, self.model.worlds, [w.newton, self.control])
+        self._any(w.newton.active, self.iterating)
+        wp.capture_while(self.iterating, self._iterate)
+        self.launch(self.own.tell, self.model.worlds, [w.newton, self.control, w.pcg, w.step.running])
+        self.preconditioner.judge(w.newton.active)
+        w.newton.active.zero_()
+
+    def _iterate(self) -> None:
+        w, k, launch = self.work, self.own, self.launch
+        active = w.newton.active
+        self._find_move(active)
+        launch(k.advance, self.dim, [w.newton, w.direction, w.v])
+        self.residual.evaluate(active)
+        launch(k.judge, self.model.worlds, [w.newton, self.control])
+        self._any(active, self.iterating)
+
+    @labelled("vectors")
+    def _find_move(self, active: wp.array) -> None:
+        """Put the move into work.direction."""
+        m, w, k, launch, ctl = self.model, self.work, self.own, self.launch, self.control
+        args = [w.newton, w.gradient, m.topology.free, w.direction, w.p, w.r, self.moves, self.changes, w.rows]
+        launch(k.remember, self.dim, args)
+        if self.paired:
+            self.residual.reduce(w.rows, 2 * PAIRS, active, ctl.sums)
+            launch(k.shares, m.worlds, [w.newton, ctl])
+            launch(k.project, self.dim, [w.newton, ctl, self.changes, w.r])
+        elif self.acceleration == "chebyshev":
+            launch(k.recursion, m.worlds, [w.newton, ctl])
+        self.preconditioner.apply(w.r, w.z, active)
+        if self.acceleration == "secants":
+            launch(k.conjugate_rows, self.dim, [w.newton, self.changes, w.z, w.rows])
+            self.residual.reduce(w.rows, PAIRS, active, ctl.sums)
+            launch(k.conjugate, m.worlds, [w.newton, ctl])
+        launch(k.combine, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
+        if self.pcg.deflate:  # a loose step must not leak the momentum of free bodies
+            args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
+            launch(k.momentum_left, self.dim, args)
+            self.pcg.translate(active)
