@@ -439,5 +439,19 @@ def test_options_out_of_range_are_named(options, message):
 
 def test_an_unknown_preconditioner_lists_those_there_are():
     model = bar(300).finalize(device="cpu")
-    with pytest.raises(wf.ModelError, match="auto, two-level, block-jacobi"):
+    with pytest.raises(wf.ModelError, match="auto, two-level, deflated, block-jacobi"):
         wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(preconditioner="ilu"))
+
+
+@pytest.mark.parametrize(("links", "kind"), [(10, "two-level"), (40, "deflated")])
+def test_many_small_bodies_on_joints_take_the_deflated_blocks(links, kind):
+    from warpfea.scene import find
+
+    scene = find("chain")
+    model = scene.build(scene.resolve({"links": links})).finalize(device="cpu")
+    counts = {}
+    for name in ("auto", "two-level", "deflated", "block-jacobi"):
+        sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(preconditioner=name, max_pcg=20000), ledger=False)
+        counts[name] = sum(int(sim.step().pcg[0]) for _ in range(3))
+    assert counts["auto"] == counts[kind]
+    assert 2 * counts[kind] < counts["block-jacobi"]

@@ -13,7 +13,7 @@ from ..kernels.newton import newton_kernels
 from .alm import ConstraintSolver
 from .direct import Direct
 from .pcg import PCG
-from .preconditioner import make
+from .preconditioner import choose, make
 from .residual import Residual
 
 if TYPE_CHECKING:
@@ -43,10 +43,8 @@ class NewtonPCG:
         max_pcg: iterations per linear solve.
         max_halvings: how often a refused step may be halved.
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
-            serves), "block-jacobi" (3x3 blocks, of every iterate), or "auto", the first. All deflate the directions of
-            constraints.
-        linear: "pcg", or "direct": H is factorised (SuperLU on the host; on a GPU cuDSS where it is installed), for
-            reference and the hardest cases. PCG's iterations are then one or two, and steps are not recorded as graphs.
+            serves), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
+            "block-jacobi" (the blocks alone), or "auto": the second for many small bodies on joints, else the first.
         preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
             model's. They are made in the model's precision; float32 halves what an application reads.
         operator: H p from "elements", from the "matrix" assembled at every iterate, or "auto", by which is cheaper.
@@ -126,8 +124,9 @@ class NewtonLoop:
         self.max_outer = options.max_outer
         self.constraints: ConstraintSolver | None = None
         direct = options.linear == "direct"
+        kind = "direct" if direct else choose(options.preconditioner, model)
         if constrained:
-            deflate = options.preconditioner != "block-jacobi" and not direct
+            deflate = kind != "block-jacobi" and not direct
             self.constraints = ConstraintSolver(
                 model, work, launch, classical=self.classical, kappa=options.penalty, deflate=deflate
             )
@@ -138,11 +137,11 @@ class NewtonLoop:
             self.constraints,
             viscous=inertia,
             operator="matrix" if direct and options.operator == "auto" else options.operator,
-            assembled=options.preconditioner != "block-jacobi",
+            assembled=kind not in ("deflated", "block-jacobi"),
         )
         self.direct = Direct(model, work, launch, self.residual) if direct else None
         self.preconditioner = self.direct or make(
-            options.preconditioner, options.preconditioner_dtype, model, work, launch, self.residual
+            kind, options.preconditioner_dtype, model, work, launch, self.residual
         )
         self.pcg = PCG(
             model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
@@ -151,7 +150,7 @@ class NewtonLoop:
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv
         # a good preconditioner makes a decade of PCG cheaper than another Newton iteration
-        ctl.first_forcing = 0.1 if options.preconditioner == "block-jacobi" else 0.001
+        ctl.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") else 0.001
         if constrained:  # constraints are stiff: a loose first solve costs more iterations than it saves
             ctl.first_forcing = min(ctl.first_forcing, 0.01)
         ctl.fixed_forcing = int(options.forcing is not None)

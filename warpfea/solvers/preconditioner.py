@@ -9,6 +9,7 @@ import warp as wp
 from ..errors import ModelError
 from ..kernels.pcg import pcg_kernels
 from ..launch import labelled
+from .levels import WHOLE_SLOTS
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from ..state import State
     from ..workspace import Workspace
 
-__all__ = ["BlockJacobi", "Preconditioner", "make"]
+__all__ = ["BlockJacobi", "Preconditioner", "choose", "make"]
 
 
 class Preconditioner(Protocol):
@@ -96,14 +97,24 @@ class BlockJacobi:
             constraints.precondition(r, z, active)
 
 
+NAMES = ("two-level", "tiles", "deflated", "block-jacobi")
+SMALL_BODY = 64
+
+
+def choose(name: str, model: Model) -> str:
+    """What "auto" stands for: groups of nodes need bodies that hold several. ModelError lists the names there are."""
+    if name == "auto":
+        small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
+        return "deflated" if model.constraints and small and model.slots > WHOLE_SLOTS else "two-level"
+    if name not in NAMES:
+        raise ModelError(f"preconditioner {name!r} is unknown; there are auto, two-level, deflated, block-jacobi")
+    return name
+
+
 def make(
     name: str, storage: str | None, model: Model, work: Workspace, launch: Launcher, residual: Residual
 ) -> Preconditioner:
-    """The preconditioner `name`; "auto" is the best there is. Raises ModelError listing the names."""
-    if name in ("auto", "two-level"):
-        return TwoLevel(model, work, launch, residual, storage)
-    if name == "tiles":
-        return TwoLevel(model, work, launch, residual, storage, coarse=False)
-    if name == "block-jacobi":
-        return BlockJacobi(model, work, launch, residual)
-    raise ModelError(f"preconditioner {name!r} is unknown; there are auto, two-level, block-jacobi")
+    """The preconditioner `name` of NAMES; "tiles" is the first without its coarse part."""
+    if name in ("two-level", "tiles"):
+        return TwoLevel(model, work, launch, residual, storage, coarse=name == "two-level")
+    return BlockJacobi(model, work, launch, residual)
