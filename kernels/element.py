@@ -405,6 +405,17 @@ def element_kernels(
             low = wp.max(low, wp.abs(S[i, 0]) + wp.abs(S[i, 1]) + wp.abs(S[i, 2]) - wp.abs(S[i, i]) - S[i, i])
         return low
 
+    @wp.func
+    def stand_in(G: mat33, dG: mat33, c: coef) -> mat33:
+        """For laws whose tangent is indefinite far from rest: the stiffness at rest, turned with F and of its shape.
+
+        c = (mu10, k, mu01), with mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3.
+        """
+        F = t.identity() + G
+        F = wp.sqrt(T(3.0) / wp.ddot(F, F)) * F
+        mu = T(2.0) * (c[0] + c[2])
+        return F * t.isotropic(t.sym(wp.transpose(F) * dG), wp.max(c[1] - mu * T(2.0) / T(3.0), T(0.0)), mu)
+
     @wp.kernel(module=matrix_module)
     def prepare_matrix(
         block: Block, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)
@@ -432,8 +443,8 @@ def element_kernels(
     ):
         """K of each element as the columns of the 3x3 blocks of slots a <= b, row by row; one thread does one column.
 
-        `projected`: without what can make it indefinite at a point, compression and stress of the viscosity; `add`: to
-        what is there, of another part of the energy.
+        `projected`: without what can make it indefinite at a point, compression and stress of the viscosity, and with
+        a stand-in for laws that need J > 0; `add`: to what is there, of another part of the energy.
         """
         world, column, elem = wp.tid()
         if active[world] == 0:
@@ -463,11 +474,17 @@ def element_kernels(
             if wp.static(framed):
                 R = wp.transpose(block.frame[q, elem])
                 dP = m.increment(local, wp.outer(R * unit, R * h), c)
+            elif wp.static(needs_J):
+                if projected != 0:
+                    dP = stand_in(local, dG, c)
+                else:
+                    dP = m.increment(local, dG, c)
             else:
                 dP = m.increment(local, dG, c)
             dP = out_of_axes(block, dP, q, elem)
-            if projected != 0:
-                dP = dP + compression(local, c) * dG
+            if wp.static(not needs_J):
+                if projected != 0:
+                    dP = dP + compression(local, c) * dG
             if wp.static(damping == "incremental" or damping == "rate"):
                 F = t.identity() + G
                 dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[LAMBDA_V] / dq, c[ETA] / dq)
