@@ -150,7 +150,8 @@ class NewtonLoop:
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv
         # a good preconditioner makes a decade of PCG cheaper than another Newton iteration
-        ctl.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") else 0.001
+        # (in statics the first iterates are far off, and what they are solved to is lost)
+        ctl.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") or not inertia else 0.001
         if constrained:  # constraints are stiff: a loose first solve costs more iterations than it saves
             ctl.first_forcing = min(ctl.first_forcing, 0.01)
         ctl.fixed_forcing = int(options.forcing is not None)
