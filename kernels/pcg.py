@@ -142,7 +142,10 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         if wp.static(constrained):
             # open constraints may drive a step where the forces balance
             goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
+            # what is left of r across constraints is left of their forces, which are found by the same solve
+            least = newton.slack * least
             if newton.classical == 0:
+                goal = newton.slack * goal
                 # a loose tolerance of the forces must not leave constraints open
                 least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
         ctl.target[world] = wp.max(goal, least)
