@@ -23,6 +23,7 @@ __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
 """Slots per element up to which H p from the elements is cheaper than from their matrix."""
+SHELL_SLOTS = 16
 MANY_POINTS = 8
 """Points of an element from which lanes share them."""
 
@@ -70,6 +71,10 @@ class Residual:
         self.massive = all(block.massive for block in model.blocks)
         # elements with many points per slot cost more than the matrix that they make
         many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
+        if not model.device.is_cuda:
+            # one core assembles a matrix in the time of 24 products for 8 slots per element, 37 for 16 and 56 for 32;
+            # only shells take so many iterations per step
+            many = any(block.slots == SHELL_SLOTS for block in model.blocks)
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
