@@ -136,8 +136,8 @@ class Residual:
         if m.component_count > 1:
             args = [m.component_start, m.component_slot, w.rows, active, w.component_partial]
             launch(self.newton.component_partial, (m.worlds, m.component_count, LANES), args)
-            dim = (COMPONENT_ROWS, m.worlds, m.component_count)
-            launch(self.newton.component_sum, dim, [w.component_partial, active, w.newton.component_sums])
+            sums = (COMPONENT_ROWS, m.worlds, m.component_count)
+            launch(self.newton.component_sum, sums, [w.component_partial, active, w.newton.component_sums])
 
     def push(self, active: wp.array) -> None:
         """Forces without a potential at the iterate: fields b(r, t) and follower pressure."""
