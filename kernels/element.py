@@ -492,7 +492,15 @@ def element_kernels(
                 if projected == 0:
                     rate = strain_rate(block, G, V, history, dq, world, q, elem)
                     dP = dP + dG * t.isotropic(rate, c[LAMBDA_V], c[ETA])
-            out = scatter(block, out, dP, q, elem)
+            dP = weight_of(block, q, elem) * dP
+            if wp.static(affine):
+                dP = dP * wp.transpose(block.J0_inv[elem])
+            for a in range(NS):
+                if a <= b:
+                    if wp.static(affine):
+                        out[a] = out[a] + dP * block.gradient[q, a, 0]
+                    else:
+                        out[a] = out[a] + dP * block.gradient[q, a, elem]
         for a in range(NS):
             if a <= b:
                 pair = a * NS - (a * (a - 1)) / 2 + b - a

@@ -271,7 +271,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             da = (mu * s) * lines[world, t, elem] + (stress * block.first[t, b, elem]) * unit
             dd = (mu * s) * lines[world, NT + t, elem] + (stress * block.second[t, b, elem]) * unit
             for a in range(NS):
-                out[a] = out[a] + block.first[t, a, elem] * dd + block.second[t, a, elem] * da
+                if a <= b:
+                    out[a] = out[a] + block.first[t, a, elem] * dd + block.second[t, a, elem] * da
         for a in range(NS):
             if a <= b:
                 pair = a * NS - (a * (a - 1)) / 2 + b - a
