@@ -90,7 +90,7 @@ class Residual:
             assert self.assembled is not None
             out |= {self.gather.matrix_module} | self.assembled.modules()
         elif self.massive:
-            out |= {self.gather.massive_module} | {k.massive_product.module for k in self.block_kernels}
+            out |= {k.massive_product.module for k in self.block_kernels}
         return out
 
     @labelled("assembly")
@@ -201,9 +201,9 @@ class Residual:
             args = [m.topology, pattern.data, self.matrix, lanes, *rest, out, self.curvature_rows]
             launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:
-            kernel = self.gather.massive_product if self.massive else self.gather.product
             self.curvature_rows = w.warp_rows
-            launch(kernel, padded, [m.topology, w.contribution, *rest, out, w.warp_rows])
+            args = [m.topology, w.contribution, *rest[:-1], int(self.massive), w.warp, out, w.warp_rows]
+            launch(self.gather.product, padded, args)
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""
