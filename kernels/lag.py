@@ -1,6 +1,7 @@
-"""When a preconditioner is made anew: it is kept until what it costs in iterations exceeds what making it costs.
+"""When a preconditioner or an operator's matrix is made anew: it is kept until what it costs in iterations exceeds what
+making it costs. A preconditioner costs iterations of PCG, a matrix those of Newton's method.
 
-The rule counts iterations, never time, and its memory is part of the state, so that a resumed run does the same.
+The rules count iterations, never time, and their memory is part of the state, so that a resumed run does the same.
 """
 
 import functools
@@ -14,10 +15,15 @@ from .types import kernel_module, precision
 
 __all__ = ["lag_kernels", "lag_struct"]
 
+DECADES = 3.0
+"""What an iteration of Newton's method gains with the matrix of its iterate, for the rule."""
+SHARE = 0.3
+"""Residual of a linear solve over what the last iteration left, with a matrix that is not of the iterate."""
+
 
 @functools.cache
 def lag_struct():
-    """What the rule knows of each world."""
+    """What a rule knows of each world."""
 
     @wp.struct
     class LagControl:
@@ -28,9 +34,11 @@ def lag_struct():
         due: wp.array(dtype=wp.int32)  # make it at the next solve
         mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv it was made for; negative: never made
         dq_dv: wp.array(dtype=wp.float64)
-        rate: wp.array(dtype=wp.float64)  # iterations per decade of the first solve with it; 0: none yet
+        rate: wp.array(dtype=wp.float64)  # iterations of the first solve (per decade) or step with it; 0: none yet
         excess: wp.array(dtype=wp.float64)  # iterations beyond that rate since
-        kept: wp.array2d(dtype=wp.float64)  # of the state: due, mass_factor, dq_dv, rate, excess of accepted steps
+        made_at: wp.array(dtype=wp.int32)  # Newton iteration of this attempt that it was made at
+        pace: wp.array(dtype=wp.float64)  # reduction of the residual by a step's first iteration with a kept matrix
+        kept: wp.array2d(dtype=wp.float64)  # of the state: due, mass_factor, dq_dv, rate, excess, pace
         limit: wp.float64  # excess that pays for making it
         any_build: wp.array(dtype=wp.int32)
 
@@ -49,7 +57,11 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def decide(
-        lag: Lag, mass_factor: wp.array(dtype=f64), dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32)
+        lag: Lag,
+        newton: Newton,
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
     ):
         """Before a solve: which worlds make theirs."""
         world = wp.tid()
@@ -63,6 +75,7 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
             lag.dq_dv[world] = lag.kept[world, 2]
             lag.rate[world] = lag.kept[world, 3]
             lag.excess[world] = lag.kept[world, 4]
+            lag.pace[world] = lag.kept[world, 5]
         same = lag.mass_factor[world] == mass_factor[world] and lag.dq_dv[world] == dq_dv[world]
         if lag.due[world] != 0 or not same:
             lag.moved[world] = 1
@@ -72,9 +85,61 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
             lag.dq_dv[world] = dq_dv[world]
             lag.rate[world] = f64(0.0)
             lag.excess[world] = f64(0.0)
+            lag.pace[world] = f64(0.0)
+            lag.made_at[world] = newton.iterations[world]
         if lag.moved[world] != 0 or lag.stale[world] != 0:
             lag.build[world] = 1
             wp.atomic_max(lag.any_build, 0, 1)
+
+    @wp.kernel(module=module)
+    def judge_matrix(lag: Lag, newton: Newton, across: int):
+        """Before a solve: whether Newton's method would gain by the matrix of this iterate.
+
+        What the last iteration gained tells how many are left with the matrix at hand. `across`: it may be kept from
+        step to step.
+        """
+        world = wp.tid()
+        if newton.active[world] == 0:
+            return
+        if newton.iterations[world] == 0:
+            lag.made_at[world] = 0
+            if across == 0:
+                lag.due[world] = 1
+            return
+        need = wp.log10(wp.max(newton.excess[world], f64(1.0)))
+        gain = -wp.log10(wp.max(newton.reduction[world], f64(1.0e-30)))
+        fresh = wp.max(need / f64(DECADES), f64(1.0))
+        if newton.alpha[world] != f64(1.0) or need > gain * (fresh + lag.limit):
+            lag.due[world] = 1
+
+    @wp.kernel(module=module)
+    def loosen(lag: Lag, newton: Newton):
+        """With a matrix of an earlier iterate no solve need go further than the matrix is good for."""
+        world = wp.tid()
+        if newton.active[world] == 0 or lag.moved[world] != 0 or newton.fixed_forcing != 0:
+            return
+        if newton.iterations[world] == 1 and lag.made_at[world] == 0:
+            lag.pace[world] = newton.reduction[world]
+        pace = lag.pace[world]
+        if newton.iterations[world] > 0:
+            pace = newton.reduction[world]
+        newton.forcing[world] = wp.max(newton.forcing[world], wp.min(f64(SHARE) * pace, f64(0.1)))
+
+    @wp.kernel(module=module)
+    def count_step(lag: Lag, newton: Newton, accepted: wp.array(dtype=wp.int32)):
+        """An accepted step: what it cost in iterations beyond the first step with this matrix."""
+        world = wp.tid()
+        if accepted[world] == 0:
+            return
+        made_at = lag.made_at[world]
+        # a step that made it on its way had begun with another
+        count = f64(newton.iterations[world] - made_at + wp.min(made_at, 1))
+        if lag.rate[world] == f64(0.0):
+            lag.rate[world] = wp.max(count, f64(1.0))
+        else:
+            lag.excess[world] = lag.excess[world] + wp.max(count - lag.rate[world], f64(0.0))
+            if lag.excess[world] > lag.limit:
+                lag.due[world] = 1
 
     @wp.kernel(module=module)
     def judge(lag: Lag, newton: Newton, pcg: PCG):
@@ -104,6 +169,7 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
         lag.kept[world, 2] = lag.dq_dv[world]
         lag.kept[world, 3] = lag.rate[world]
         lag.kept[world, 4] = lag.excess[world]
+        lag.kept[world, 5] = lag.pace[world]
 
     @wp.kernel(module=module)
     def mark(flags: wp.array(dtype=wp.int32), lag: Lag):
@@ -179,6 +245,9 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
         module=module,
         decide=decide,
         judge=judge,
+        judge_matrix=judge_matrix,
+        count_step=count_step,
+        loosen=loosen,
         commit=commit,
         mark=mark,
         made=made,

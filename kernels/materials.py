@@ -9,7 +9,8 @@ subtracting nearly equal numbers, which float32 needs. A law is four functions
     block(G, a, c)          symmetric 3x3 matrix B with d.B d = d2Psi along the rank-one dF = d a^T, projected to be
                             positive semi-definite where the exact one need not be (for preconditioners)
 
-of the law's coefficients c. Kelvin-Voigt damping adds to any of them and is made of the same St. Venant-Kirchhoff form.
+of the law's coefficients c. Laws whose S is linear in E have a fifth, stiffness(E, c), that linear function.
+Kelvin-Voigt damping adds to any of them and is made of the same St. Venant-Kirchhoff form.
 """
 
 import functools
@@ -71,6 +72,10 @@ def svk(dtype: str) -> _types.SimpleNamespace:
     coef = wp.types.vector(length=NCOEF, dtype=T)
 
     @wp.func
+    def stiffness(E: mat33, c: coef) -> mat33:
+        return t.isotropic(E, c[0], c[1])
+
+    @wp.func
     def energy(G: mat33, c: coef) -> T:
         E = t.green(G)
         tr = wp.trace(E)
@@ -96,7 +101,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
         geometric = wp.max(T(0.0), wp.dot(a, S * a))
         return (c[0] + c[1]) * wp.outer(Fa, Fa) + c[1] * wp.dot(a, a) * (F * wp.transpose(F)) + geometric * t.identity()
 
-    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block)
+    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness)
 
 
 @functools.cache
@@ -279,7 +284,7 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
         M[2, 1] = M[1, 2]
         return F * M * wp.transpose(F)
 
-    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block)
+    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness)
 
 
 LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, "neo_hookean": neo_hookean}

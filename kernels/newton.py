@@ -84,8 +84,6 @@ def control_struct():
         force_tol: wp.float64  # N; accepted without regard to the size of the forces; 0: never
         first_forcing: wp.float64
         fixed_forcing: wp.int32  # all solves go as far as the first, whatever Newton's method needs
-        chord: wp.float64  # reduction of the residual by which a step's matrix is used again
-        relinearise: wp.array(dtype=wp.int32)  # the operator's matrix is to be made anew
         tol: wp.float64
         eps: wp.float64
         rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
@@ -246,17 +244,6 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             fail(ctl, world, FAIL_NAN)
         else:
             settle(ctl, world)
-
-    @wp.kernel(module=module)
-    def judge_matrix(ctl: Control, any_flag: wp.array(dtype=wp.int32)):
-        """The operator's matrix is kept within a step while the residual falls well."""
-        world = wp.tid()
-        ctl.relinearise[world] = 0
-        if ctl.active[world] == 0:
-            return
-        if ctl.iterations[world] == 0 or ctl.reduction[world] > ctl.chord or ctl.alpha[world] != f64(1.0):
-            ctl.relinearise[world] = 1
-            wp.atomic_max(any_flag, 0, 1)
 
     @wp.kernel(module=module)
     def begin_search(ctl: Control):
@@ -437,7 +424,6 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         reset_min_J=reset_min_J,
         begin=begin,
         begin_search=begin_search,
-        judge_matrix=judge_matrix,
         judge_trial=judge_trial,
         judge_outer=judge_outer,
         any_set=any_set,

@@ -195,60 +195,67 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
 
     @wp.kernel(module=matrix_module)
     def prepare_matrix(
-        block: Block, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        form: int,
+        active: wp.array(dtype=wp.int32),
+        lines: wp.array3d(dtype=vec3),
     ):
-        """x_a and x_b at the tying points, [world, tie and NT + tie, elem], for all columns of an element's matrix."""
+        """What all columns of an element's matrix need of a tie: x_a and x_b, [world, tie and NT + tie, elem], and the
+        shear, the first component of 2 NT + tie."""
         world, tie, elem = wp.tid()
         if active[world] == 0:
             return
-        a = block.X_first[tie, elem]
-        d = block.X_second[tie, elem]
+        da = vec3()
+        dd = vec3()
         first = u[world, block.conn[0, elem]]
         for i in range(NS):
             x = u[world, block.conn[i, elem]] - block.is_position[i] * first
-            a += block.first[tie, i, elem] * x
-            d += block.second[tie, i, elem] * x
+            da += block.first[tie, i, elem] * x
+            dd += block.second[tie, i, elem] * x
+        a = block.X_first[tie, elem] + da
+        d = block.X_second[tie, elem] + dd
+        shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
         lines[world, tie, elem] = a
         lines[world, NT + tie, elem] = d
+        lines[world, 2 * NT + tie, elem] = vec3(shear, T(0.0), T(0.0))
 
     @wp.kernel(module=matrix_module)
     def prepare_stress(block: Block, active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)):
-        """The stresses of the ties, at 2 NT + tie as first components."""
+        """The stresses of the ties, the first components of 3 NT + tie."""
         world, tie, elem = wp.tid()
         if active[world] == 0:
             return
         first = (tie / W) * W
         s = T(0.0)
         for k in range(W):
-            t = first + k
-            a = lines[world, t, elem]
-            d = lines[world, NT + t, elem]
-            X = block.X_first[t, elem]
-            Y = block.X_second[t, elem]
-            s += block.coupling[tie, k, elem] * (wp.dot(X, d - Y) + wp.dot(a - X, d))
+            s += block.coupling[tie, k, elem] * lines[world, 2 * NT + first + k, elem][0]
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
-        lines[world, 2 * NT + tie, elem] = vec3(mu * s, T(0.0), T(0.0))
+        lines[world, 3 * NT + tie, elem] = vec3(mu * s, T(0.0), T(0.0))
 
     @wp.kernel(module=matrix_module)
     def element_matrix(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         lines: wp.array3d(dtype=vec3),
-        projected: int,
+        form: int,
         add: int,
+        by_element: int,
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=vec3),
     ):
-        """K of each element as the columns of the 3x3 blocks of slots a <= b, row by row; one thread does one column.
-
-        `projected`: without the geometric part; `add`: to what is there, of another part of the energy.
-        """
-        world, column, elem = wp.tid()
+        """As of `element_kernels`; `form` = 1: without the geometric part."""
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        column = index / block.count
+        elem = index % block.count
+        if by_element != 0:
+            column = index % (3 * NS)
+            elem = index / (3 * NS)
         b = column / 3
         axis = column % 3
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
@@ -256,20 +263,21 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         unit[axis] = T(1.0)
         change = Ties()
         for t in range(NT):
-            x = wp.dot(unit, lines[world, t, elem])
-            y = wp.dot(unit, lines[world, NT + t, elem])
-            change[t] = block.first[t, b, elem] * y + block.second[t, b, elem] * x
+            x = lines[world, t, elem][axis]
+            y = lines[world, NT + t, elem][axis]
+            change[t] = mu * (block.first[t, b, elem] * y + block.second[t, b, elem] * x)
         out = Local()
         for t in range(NT):
             first = (t / W) * W
             s = T(0.0)
             for k in range(W):
                 s += block.coupling[t, k, elem] * change[first + k]
-            stress = T(0.0)
-            if projected == 0:
-                stress = lines[world, 2 * NT + t, elem][0]
-            da = (mu * s) * lines[world, t, elem] + (stress * block.first[t, b, elem]) * unit
-            dd = (mu * s) * lines[world, NT + t, elem] + (stress * block.second[t, b, elem]) * unit
+            da = s * lines[world, t, elem]
+            dd = s * lines[world, NT + t, elem]
+            if form != 1:
+                stress = lines[world, 3 * NT + t, elem][0]
+                da += (stress * block.first[t, b, elem]) * unit
+                dd += (stress * block.second[t, b, elem]) * unit
             for a in range(NS):
                 if a <= b:
                     out[a] = out[a] + block.first[t, a, elem] * dd + block.second[t, a, elem] * da

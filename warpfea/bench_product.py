@@ -99,8 +99,7 @@ def prepare(model: Model, operator: str) -> tuple[Simulation, Residual]:
     w.step.dq_dv.fill_(DT)
     w.step.mass_factor.fill_(1.0 / DT)
     if residual.by_matrix:
-        w.newton.relinearise.fill_(1)
-        residual._assemble()
+        residual.assemble(wp.ones(model.worlds, dtype=wp.int32, device=model.device))
     return sim, residual
 
 

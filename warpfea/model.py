@@ -115,6 +115,15 @@ class Model:
         self._memory[name] = self._memory.get(name, 0) + out.size * wp.types.type_size_in_bytes(out.dtype)
         return out
 
+    def element_array(self, values: np.ndarray, dtype: Any) -> wp.array:
+        """Upload a constant of elements, [..., element]: neighbours stand side by side on a GPU, where threads do
+        elements together, and what belongs to an element on a CPU, which does one after the other."""
+        if self.device.is_cuda:
+            return self.array("elements", values, dtype)
+        last = np.ndim(values) - (2 if dtype is self.types.mat33 else 1 if dtype is self.types.vec3 else 0) - 1
+        out = self.array("elements", np.moveaxis(values, last, 0), dtype)
+        return out.transpose((*range(1, out.ndim), 0))
+
     def _number(self) -> None:
         offset, elements_before = 0, 0
         for body in self.bodies:
@@ -233,7 +242,7 @@ class Model:
         for name, dtype in (("first", T), ("second", T), ("X_first", vec3), ("X_second", vec3), ("coupling", T)):
             table = np.concatenate([getattr(t, name) for t in tables])
             axis = 1 if dtype is vec3 else 2
-            setattr(data, name, self.array("elements", np.moveaxis(table, 0, axis), dtype))
+            setattr(data, name, self.element_array(np.moveaxis(table, 0, axis), dtype))
 
     def _point_tables(self, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
         T, vec3, mat33 = self.types.T, self.types.vec3, self.types.mat33
@@ -265,12 +274,12 @@ class Model:
             data.weight = self.array("elements", rule.weights[:, None], T)
         else:
             table = np.moveaxis(np.concatenate(h), 0, 2)
-            data.weight = self.array("elements", np.concatenate(w).T, T)
-        data.gradient = self.array("elements", table[:Q], vec3)
+            data.weight = self.element_array(np.concatenate(w).T, T)
+        data.gradient = self.element_array(table[:Q], vec3)
         if key.law not in ANY_J:
-            data.vertex_gradient = self.array("elements", table[Q:], vec3)
+            data.vertex_gradient = self.element_array(table[Q:], vec3)
         if key.framed:
-            data.frame = self.array("elements", np.moveaxis(np.concatenate(axes), 0, 1), mat33)
+            data.frame = self.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)
 
     def _build_topology(self) -> None:
         T, vec3 = self.types.T, self.types.vec3

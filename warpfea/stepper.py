@@ -74,7 +74,7 @@ class Stepper:
         self.newton = make_loop(
             model, self.work, self.launch, solver, inertia=not integrator.static, constraint_tol=constraint_tol
         )
-        self.newton.preconditioner.register(state)
+        self.newton.register(state)
         self.dim = (model.worlds, model.slots)
         self.running = self.work.any_flag[2:3]
         self._bind()
@@ -140,7 +140,7 @@ class Stepper:
         """The state of the chosen worlds was set from elsewhere: what follows it on the device is made anew."""
         m = self.model
         flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
-        self.newton.preconditioner.forget(wp.array(flags, dtype=wp.int32, device=m.device))
+        self.newton.forget(wp.array(flags, dtype=wp.int32, device=m.device))
 
     def _record(self) -> wp.Graph:
         with wp.ScopedCapture(device=self.model.device) as capture:
@@ -222,7 +222,7 @@ class Stepper:
         if self.backup is not None:
             launch(self.kernels.failed_now, m.worlds, [w.step, w.newton.active])
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
-            self.newton.preconditioner.forget(w.newton.active)
+            self.newton.forget(w.newton.active)
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
             self._probe()
@@ -267,7 +267,7 @@ class Stepper:
         launch(self.kernels.commit, self.dim, args)
         if self.newton.constraints:
             self.newton.constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
-        self.newton.preconditioner.commit(w.step.accepted)
+        self.newton.commit(w.step.accepted)
 
     @labelled("loads")
     def _loads(self, active: wp.array) -> None:

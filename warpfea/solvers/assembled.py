@@ -85,7 +85,7 @@ class Assembled:
         self.runs = self._runs()
         self.common = block_kernels(model.dtype)
         S = max(3 * block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
-        points = max(3 * block.points * block.count for block in model.blocks)
+        points = max(5 * block.points * block.count for block in model.blocks)
         self.lines = work.array("element gradients", (model.worlds, points), model.types.vec3)
         self.scratch = work.array("element matrices", (model.worlds, S), model.types.vec3)
 
@@ -181,27 +181,38 @@ class Assembled:
         return self.work.array(name, (self.model.worlds, self.pattern.entries), self.model.types.mat33)
 
     def assemble(
-        self, u: wp.array, factors: tuple[wp.array, wp.array], active: wp.array, out: wp.array, *, projected: bool
-    ) -> None:
+        self, u: wp.array, factors: tuple[wp.array, wp.array], active: wp.array, out: wp.array, *, projected: bool,
+        lasting: bool = False,
+    ) -> None:  # fmt: skip
         """out = c_M M + (dq/dv) K at u; `factors` are c_M and dq/dv per world.
 
-        `projected`: K without what can make it indefinite at a point, and a function of u and the factors alone.
+        `projected`: K without what can make it indefinite at a point; `lasting`: K without the stress of the viscosity.
+        Either is a function of u and the factors alone.
         """
+        form = 1 if projected else 2 if lasting else 0
         m, w, launch = self.model, self.work, self.launch
         mass_factor, dq_dv = factors
         for first, parts in enumerate(self.runs):
             for k, (block, elements) in enumerate(parts):
-                matrix = shaped(self.scratch, (m.worlds, 3 * block.slots * (block.slots + 1) // 2, block.count))
-                lines = shaped(self.lines, (m.worlds, 3 * block.points, block.count))
+                matrix = self._by_element(self.scratch, 3 * block.slots * (block.slots + 1) // 2, block.count)
+                lines = self._by_element(self.lines, 5 * block.points, block.count)
                 points = (m.worlds, block.points, block.count)
-                launch(elements.prepare_matrix, points, [block.data, u, active, lines])
+                args = [block.data, u, w.v, w.history, dq_dv, form, active, lines]
+                launch(elements.prepare_matrix, points, args)
                 if block.key.tying and not projected:
                     launch(elements.prepare_stress, points, [block.data, active, lines])
-                args = [block.data, u, w.v, w.history, dq_dv, lines, int(projected), int(k > 0), active, matrix]
-                launch(elements.element_matrix, (m.worlds, 3 * block.slots, block.count), args)
+                args = [block.data, dq_dv, lines, form, int(k > 0), int(not m.device.is_cuda), active, matrix]
+                launch(elements.element_matrix, (m.worlds, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count, matrix]
             args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]
             launch(assembly_kernels(m.dtype, block.slots).add_elements, (m.worlds, len(self.pattern.upper)), args)
+
+    def _by_element(self, scratch: wp.array, items: int, elements: int) -> wp.array:
+        """Scratch as [world, item, element], in the order of Model.element_array."""
+        B = self.model.worlds
+        if self.model.device.is_cuda:
+            return shaped(scratch, (B, items, elements))
+        return shaped(scratch, (B, elements, items)).transpose((0, 2, 1))
 
     def add_constraints(
         self, gradient: wp.array, stiffness: wp.array, dq_dv: wp.array, active: wp.array, out: wp.array

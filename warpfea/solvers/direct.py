@@ -90,9 +90,9 @@ class Direct:
     @labelled("build")
     def prepare(self, active: wp.array) -> None:
         """Factorise H of the active worlds."""
-        w, residual = self.work, self.residual
+        residual = self.residual
         keeps = self.alone and residual.by_matrix
-        worlds = np.flatnonzero((w.newton.relinearise if keeps else active).numpy())
+        worlds = np.flatnonzero((residual.lag.control.build if keeps else active).numpy())
         if not len(worlds):
             return
         if keeps:

@@ -19,12 +19,11 @@ from .residual import Residual
 if TYPE_CHECKING:
     from ..launch import Launcher
     from ..model import Model
+    from ..state import State
     from ..workspace import Workspace
 
 __all__ = ["NewtonLoop", "NewtonPCG"]
 
-CHORD = 0.02
-CHORD_SLOTS = 16384
 EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
 
 
@@ -130,13 +129,16 @@ class NewtonLoop:
             self.constraints = ConstraintSolver(
                 model, work, launch, classical=self.classical, kappa=options.penalty, deflate=deflate
             )
+        operator = options.operator
+        if direct and operator == "auto":  # factors are kept as long as the matrix, where nothing is added to it
+            operator = "elements" if constrained or model.loads.followers else "matrix"
         self.residual = Residual(
             model,
             work,
             launch,
             self.constraints,
             viscous=inertia,
-            operator="matrix" if direct and options.operator == "auto" else options.operator,
+            operator=operator,
             assembled=kind not in ("deflated", "block-jacobi"),
         )
         self.direct = Direct(model, work, launch, self.residual) if direct else None
@@ -157,8 +159,6 @@ class NewtonLoop:
         ctl.fixed_forcing = int(options.forcing is not None)
         if options.forcing is not None:
             ctl.first_forcing = options.forcing
-        # a large matrix costs more than another iteration with that of the step's first; to one core all are large
-        ctl.chord = CHORD if model.slots > CHORD_SLOTS or not model.device.is_cuda else 0.0
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
@@ -170,6 +170,21 @@ class NewtonLoop:
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves are for g alone
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
+
+    def register(self, state: State) -> None:
+        """Put into the state what solvers remember from step to step."""
+        self.preconditioner.register(state)
+        self.residual.register(state)
+
+    def forget(self, flags: wp.array) -> None:
+        """The state of flagged worlds was set from elsewhere."""
+        self.preconditioner.forget(flags)
+        self.residual.forget(flags)
+
+    def commit(self, accepted: wp.array) -> None:
+        """The attempt was accepted: the state hears what was done."""
+        self.preconditioner.commit(accepted)
+        self.residual.commit(accepted)
 
     def modules(self) -> set[wp.Module]:
         """Modules that the loop launches, but those of the reductions and of the constraints."""

@@ -12,18 +12,21 @@ from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
 from ..launch import labelled
 from .assembled import Assembled, shaped
+from .lag import Lag
 
 if TYPE_CHECKING:
     from ..launch import Launcher
     from ..model import Model
+    from ..state import State
     from ..workspace import Workspace
     from .alm import ConstraintSolver
 
 __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
-"""Slots per element up to which H p from the elements is cheaper than from their matrix."""
-SHELL_SLOTS = 16
+"""Slots per element up to which H p from the elements is cheaper than from their matrix, on a GPU."""
+MATRIX_COST = {False: 2.0, True: 0.5}
+"""Iterations of Newton's method that the matrix costs, on the CPU and on CUDA."""
 MANY_POINTS = 8
 """Points of an element from which lanes share them."""
 
@@ -69,12 +72,11 @@ class Residual:
         self.con = model.constraints.data if model.constraints else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.massive = all(block.massive for block in model.blocks)
-        # elements with many points per slot cost more than the matrix that they make
+        # on a GPU elements with many points per slot cost more than the matrix that they make; on a CPU, which keeps a
+        # matrix for several steps, all do
         many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
         if not model.device.is_cuda:
-            # one core assembles a matrix in the time of 24 products for 8 slots per element, 37 for 16 and 56 for 32;
-            # only shells take so many iterations per step
-            many = any(block.slots == SHELL_SLOTS for block in model.blocks)
+            many = assembled
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
@@ -82,34 +84,66 @@ class Residual:
         if self.by_matrix:
             assert self.assembled is not None
             self.matrix = self.assembled.values("operator matrix")
+            # statics goes too far in a step for the matrix of the one before
+            self.across = viscous
+            self.lag = Lag(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
 
     def modules(self) -> set[wp.Module]:
         """Modules of the elements, the gather, and the matrix where there is one."""
         out = {k.module for k in self.block_kernels} | {self.gather.module}
         if self.by_matrix:
             assert self.assembled is not None
-            out |= {self.gather.matrix_module} | self.assembled.modules()
+            out |= {self.gather.matrix_module, self.lag.kernels.module} | self.assembled.modules()
         elif self.massive:
             out |= {k.massive_product.module for k in self.block_kernels}
         return out
+
+    def register(self, state: State) -> None:
+        """Put into the state what a run that goes on from it must know of the operator's matrix."""
+        if self.by_matrix:
+            self.lag.register(state)
+
+    def forget(self, flags: wp.array) -> None:
+        """The state of flagged worlds was set from elsewhere."""
+        if self.by_matrix:
+            self.lag.forget(flags)
+
+    def commit(self, accepted: wp.array) -> None:
+        """The step was accepted: tell the state."""
+        if self.by_matrix:
+            args = [self.lag.control, self.work.newton, accepted]
+            self.launch(self.lag.kernels.count_step, self.model.worlds, args)
+            self.lag.carry(accepted)
+            self.lag.commit(accepted)
 
     @labelled("assembly")
     def linearise(self, active: wp.array) -> None:
         """Make the operator's matrix at the iterate, where it is to be made anew."""
         if not self.by_matrix:
             return
-        w = self.work
-        flag = w.any_flag[3:4]
-        flag.zero_()
-        self.launch(self.newton.judge_matrix, self.model.worlds, [w.newton, flag])
-        wp.capture_if(flag, self._assemble)
+        control = self.lag.control
+        args = [control, self.work.newton, int(self.across)]
+        self.launch(self.lag.kernels.judge_matrix, self.model.worlds, args)
+        self.lag.decide(active)
+        self.launch(self.lag.kernels.loosen, self.model.worlds, [control, self.work.newton])
+        wp.capture_if(control.any_build, self._assemble)
 
     @labelled("assembly")
     def _assemble(self) -> None:
         assert self.assembled is not None
+        control = self.lag.control
+        self.lag.carry()
+        factors = (control.mass_factor, control.dq_dv)
+        self.assembled.assemble(
+            self.lag.place, factors, control.build, self.matrix, projected=False, lasting=self.across
+        )
+        self.lag.made()
+
+    def assemble(self, active: wp.array) -> None:
+        """Make the operator's matrix at the iterate whatever its rule says."""
+        assert self.assembled is not None
         w = self.work
-        factors = (w.step.mass_factor, w.step.dq_dv)
-        self.assembled.assemble(w.u, factors, w.newton.relinearise, self.matrix, projected=False)
+        self.assembled.assemble(w.u, (w.step.mass_factor, w.step.dq_dv), active, self.matrix, projected=False)
 
     @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:

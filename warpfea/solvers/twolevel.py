@@ -21,11 +21,11 @@ import numpy as np
 import warp as wp
 
 from ..kernels.blocks import block_kernels
-from ..kernels.lag import lag_kernels, lag_struct
 from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels
 from ..kernels.pcg import pcg_kernels
 from ..kernels.types import precision
 from ..launch import labelled
+from .lag import Lag
 from .levels import GROUP_SLOTS, Level, make_levels
 
 if TYPE_CHECKING:
@@ -100,7 +100,6 @@ class TwoLevel:
         self.assembled = residual.assembled
         self.kernels = level_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
-        self.lag_kernels = lag_kernels(model.dtype)
         self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
         self.newton = residual.newton
         self.dim = (model.worlds, model.slots)
@@ -114,7 +113,7 @@ class TwoLevel:
         self.by_row = 0 if model.device.is_cuda else 1
         constraints = residual.constraints
         self.tied = constraints is not None and not self.levels[0].dense
-        self.lag: Any = None
+        self.lag = Lag(model, work, launch, "preconditioner", REBUILD_COST)
         self.rebuild_cost = REBUILD_COST
         most = max([level.slots for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
@@ -122,19 +121,8 @@ class TwoLevel:
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
         m = self.model
-        lag = lag_struct()()
-        for name, var in lag_struct().vars.items():
-            if isinstance(var.type, wp.array) and name != "kept":
-                size = 1 if name == "any_build" else m.worlds
-                setattr(lag, name, self.work.array(f"LagControl.{name}", (size,), var.type.dtype))
-        lag.kept = state.register("preconditioner", wp.float64, (5,), (0.0, -1.0, -1.0, 0.0, 0.0))
-        lag.limit = self.rebuild_cost
-        lag.stale.fill_(1)
-        lag.mass_factor.fill_(-1.0)
-        self.lag = lag
-        self.place = self.work.array("preconditioner place", self.dim, m.types.vec3)
-        self.kept = state.register("preconditioner_displacement", m.types.vec3, (m.slots,))
-        self.none = wp.zeros(0, dtype=wp.int32, device=m.device)
+        self.lag.control.limit = self.rebuild_cost
+        self.lag.register(state)
         if m.constraints:
             rows = m.constraints.count
             self.place_rows = (
@@ -146,18 +134,20 @@ class TwoLevel:
                 state.register("preconditioner_stiffness", wp.float64, (rows,)),
             )
 
-    def _carry(self, accepted: wp.array) -> None:
-        m, w, k = self.model, self.work, self.lag_kernels
-        self.launch(k.carry_places, self.dim, [self.lag, accepted, w.u, self.kept, self.place])
+    def _carry(self, accepted: wp.array | None = None) -> None:
+        m, lag = self.model, self.lag
+        lag.carry(accepted)
         if m.constraints:
-            mul = w.multipliers
-            args = [self.lag, accepted, mul.gradient, mul.stiffness, *self.kept_rows, *self.place_rows]
-            self.launch(k.carry_rows, (m.worlds, m.constraints.count), args)
+            mul = self.work.multipliers
+            args = [lag.control, lag.none if accepted is None else accepted, mul.gradient, mul.stiffness]
+            self.launch(
+                lag.kernels.carry_rows, (m.worlds, m.constraints.count), [*args, *self.kept_rows, *self.place_rows]
+            )
 
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
         k = self.kernels
-        return {k.module, k.build_module, self.lag_kernels.module, self.blocks.module} | self.assembled.modules()
+        return {k.module, k.build_module, self.lag.kernels.module, self.blocks.module} | self.assembled.modules()
 
     # the seam
 
@@ -167,35 +157,30 @@ class TwoLevel:
     @labelled("build")
     def forget(self, flags: wp.array) -> None:
         """The state of flagged worlds was set from elsewhere."""
-        self.launch(self.lag_kernels.mark, self.model.worlds, [flags, self.lag])
+        self.lag.forget(flags)
 
     def commit(self, accepted: wp.array) -> None:
         """The step was accepted: tell the state."""
         self._carry(accepted)
-        self.launch(self.lag_kernels.commit, self.model.worlds, [self.lag, accepted])
+        self.lag.commit(accepted)
 
     @labelled("build")
     def start(self, active: wp.array) -> None:
         """Make it anew where it is due, and D with it; penalties follow from D here."""
-        self._decide(active)
-        wp.capture_if(self.lag.any_build, self._build_first)
+        self.lag.decide(active)
+        wp.capture_if(self.lag.control.any_build, self._build_first)
 
     @labelled("build")
     def prepare(self, active: wp.array) -> None:
         """Make it anew where it is due. The penalties of constraints stay those of the step."""
-        self._decide(active)
-        wp.capture_if(self.lag.any_build, self._build)
-
-    def _decide(self, active: wp.array) -> None:
-        w = self.work
-        self.lag.any_build.zero_()
-        args = [self.lag, w.step.mass_factor, w.step.dq_dv, active]
-        self.launch(self.lag_kernels.decide, self.model.worlds, args)
+        self.lag.decide(active)
+        wp.capture_if(self.lag.control.any_build, self._build)
 
     @labelled("build")
     def judge(self, active: wp.array) -> None:
         """Count what the solve cost."""
-        self.launch(self.lag_kernels.judge, self.model.worlds, [self.lag, self.work.newton, self.work.pcg])
+        args = [self.lag.control, self.work.newton, self.work.pcg]
+        self.launch(self.lag.kernels.judge, self.model.worlds, args)
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
@@ -275,11 +260,11 @@ class TwoLevel:
         self._build(penalty=True)
 
     def _build(self, *, penalty: bool = False) -> None:
-        m, w, launch, lag = self.model, self.work, self.launch, self.lag
+        m, w, launch, lag = self.model, self.work, self.launch, self.lag.control
         flags, factors = lag.build, (lag.mass_factor, lag.dq_dv)
         # the rows follow once the penalties are known
-        launch(self.lag_kernels.carry_places, self.dim, [lag, self.none, w.u, self.kept, self.place])
-        self.assembled.assemble(self.place, factors, flags, self.value, projected=True)
+        self.lag.carry()
+        self.assembled.assemble(self.lag.place, factors, flags, self.value, projected=True)
         args = [m.topology, self.assembled.pattern.data, self.value, flags, w.diagonal, w.inverse]
         launch(self.blocks.take_diagonal, self.dim, args)
         if m.constraints:
@@ -287,9 +272,9 @@ class TwoLevel:
             assert constraints is not None
             if penalty:
                 constraints.build(flags, penalty=True)
-            self._carry(self.none)
+            self._carry()
             self.assembled.add_constraints(*self.place_rows, lag.dq_dv, flags, self.value)
-        launch(self.lag_kernels.made, m.worlds, [lag])
+        self.lag.made()
         for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
             value = arrays.value if depth else self.value
             if level.dense:
