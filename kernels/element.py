@@ -13,6 +13,7 @@ import warp as wp
 from . import materials
 from .lanes import lane_functions
 from .types import kernel_module, precision
+from .vertex import vertex_product
 
 __all__ = ["block_struct", "element_kernels"]
 
@@ -50,7 +51,14 @@ def block_struct(dtype: str):
 
 @functools.cache
 def element_kernels(
-    dtype: str, law: str, slots: int, points: int, affine: bool, damping: str | None, framed: bool = False
+    dtype: str,
+    law: str,
+    slots: int,
+    points: int,
+    affine: bool,
+    damping: str | None,
+    framed: bool = False,
+    vertex: bool = False,
 ) -> _types.SimpleNamespace:
     """Kernels of one kind of element block.
 
@@ -61,6 +69,7 @@ def element_kernels(
         affine: parent gradients and one J0 per element, or a table of h.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         framed: the law has axes of its own at each point.
+        vertex: straight 10-node tetrahedra with a rule for the product of kernels/vertex.py.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
@@ -75,7 +84,7 @@ def element_kernels(
     NS, NQ = slots, points
     needs_J = law not in materials.ANY_J
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
-    form = "affine" if affine else "framed" if framed else "table"
+    form = "vertex" if vertex else "affine" if affine else "framed" if framed else "table"
     name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
     module = kernel_module(name)
     # what only some scenes or only outputs launch is compiled apart
@@ -176,15 +185,22 @@ def element_kernels(
         return block.history_offset + point * block.count + elem
 
     @wp.func
+    def velocity_gradient(block: Block, V: Local, point: int, elem: int) -> mat33:
+        """Fdot where the form of damping needs it."""
+        if wp.static(damping == "rate"):
+            return gradient_of(block, V, point, elem)
+        else:
+            return mat33()
+
+    @wp.func
     def strain_rate(
-        block: Block, G: mat33, V: Local, history: wp.array2d(dtype=sym6), dq: T, world: int, point: int, elem: int
+        block: Block, G: mat33, Fdot: mat33, history: wp.array2d(dtype=sym6), dq: T, world: int, point: int, elem: int
     ) -> mat33:
         """Edot at a point: (E - history)/dq (incremental), or Eq. (58) with F and Fdot at the new state (rate)."""
         if wp.static(damping == "incremental"):
             past = unpack(history[world, history_index(block, point, elem)])
             return (T(1.0) / dq) * (t.green(G) - past)
         else:
-            Fdot = gradient_of(block, V, point, elem)
             return t.sym(wp.transpose(t.identity() + G) * Fdot)
 
     @wp.func
@@ -246,7 +262,7 @@ def element_kernels(
             P = out_of_axes(block, m.stress(local, c), q, elem)
             psi += w * m.energy(local, c)
             if wp.static(damping == "incremental" or damping == "rate"):
-                rate = strain_rate(block, G, V, history, dq, world, q, elem)
+                rate = strain_rate(block, G, velocity_gradient(block, V, q, elem), history, dq, world, q, elem)
                 S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
                 P = P + S + G * S
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
@@ -268,6 +284,29 @@ def element_kernels(
             energy[1, world, block.element_offset + elem] = lost
 
     @wp.func
+    def point_increment(
+        block: Block,
+        G: mat33,
+        dG: mat33,
+        Fdot: mat33,
+        history: wp.array2d(dtype=sym6),
+        c: coef,
+        dq: T,
+        world: int,
+        point: int,
+        elem: int,
+    ) -> mat33:
+        """dP at a point, with damping."""
+        dP = m.increment(into_axes(block, G, point, elem), into_axes(block, dG, point, elem), c)
+        dP = out_of_axes(block, dP, point, elem)
+        if wp.static(damping == "incremental" or damping == "rate"):
+            F = t.identity() + G
+            S = t.isotropic(strain_rate(block, G, Fdot, history, dq, world, point, elem), c[LAMBDA_V], c[ETA])
+            dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[LAMBDA_V] / dq, c[ETA] / dq)
+            dP = dP + dG * S + F * dS
+        return dP
+
+    @wp.func
     def tangent_force(
         block: Block,
         U: Local,
@@ -284,52 +323,52 @@ def element_kernels(
         for q in range(block.gradient.shape[0]):
             G = gradient_of(block, U, q, elem)
             dG = gradient_of(block, dU, q, elem)
-            dP = m.increment(into_axes(block, G, q, elem), into_axes(block, dG, q, elem), c)
-            dP = out_of_axes(block, dP, q, elem)
-            if wp.static(damping == "incremental" or damping == "rate"):
-                F = t.identity() + G
-                S = t.isotropic(strain_rate(block, G, V, history, dq, world, q, elem), c[LAMBDA_V], c[ETA])
-                dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[LAMBDA_V] / dq, c[ETA] / dq)
-                dP = dP + dG * S + F * dS
+            Fdot = velocity_gradient(block, V, q, elem)
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, q, elem)
             f = scatter(block, f, dP, q, elem)
         return f
 
-    @wp.kernel(module=massive_module)
-    def massive_product(
-        block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        history: wp.array2d(dtype=sym6),
-        mass_factor: wp.array(dtype=wp.float64),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
-    ):
-        """c_M M p + (dq/dv) K p of straight elements, whose mass is one table times a number each.
+    if vertex:
+        shared = _types.SimpleNamespace(Block=Block, coefficients=coefficients, point_increment=point_increment)
+        massive_product = vertex_product(dtype, massive_module, points, damping == "rate", shared)
+    else:
 
-        One thread does an element: four that share its points were half as fast, even where most of a device idles.
-        """
-        world, elem = wp.tid()
-        if active[world] == 0:
-            return
-        U = load(block, u, world, elem)
-        dU = load(block, direction, world, elem)
-        V = Local()
-        if wp.static(damping == "rate"):
-            V = load(block, v, world, elem)
-        dq = T(dq_dv[world])
-        f = tangent_force(block, U, dU, V, history, dq, world, elem)
-        scale = T(mass_factor[world]) * block.density[elem]
-        first = direction[world, block.conn[0, elem]]
-        for i in range(NS):
-            a = vec3()
-            total = T(0.0)
-            for j in range(NS):
-                a += block.mass[i, j] * dU[j]
-                total += block.mass[i, j]
-            a += total * first
-            contribution[world, block.contribution_offset + i * block.count + elem] = dq * f[i] + scale * a
+        @wp.kernel(module=massive_module)
+        def massive_product(
+            block: Block,
+            u: wp.array2d(dtype=vec3),
+            v: wp.array2d(dtype=vec3),
+            history: wp.array2d(dtype=sym6),
+            mass_factor: wp.array(dtype=wp.float64),
+            dq_dv: wp.array(dtype=wp.float64),
+            active: wp.array(dtype=wp.int32),
+            direction: wp.array2d(dtype=vec3),
+            contribution: wp.array2d(dtype=vec3),
+        ):
+            """c_M M p + (dq/dv) K p of straight elements, whose mass is one table times a number each.
+
+            One thread does an element: four that share its points were half as fast, even where most of a device idles.
+            """
+            world, elem = wp.tid()
+            if active[world] == 0:
+                return
+            U = load(block, u, world, elem)
+            dU = load(block, direction, world, elem)
+            V = Local()
+            if wp.static(damping == "rate"):
+                V = load(block, v, world, elem)
+            dq = T(dq_dv[world])
+            f = tangent_force(block, U, dU, V, history, dq, world, elem)
+            scale = T(mass_factor[world]) * block.density[elem]
+            first = direction[world, block.conn[0, elem]]
+            for i in range(NS):
+                a = vec3()
+                total = T(0.0)
+                for j in range(NS):
+                    a += block.mass[i, j] * dU[j]
+                    total += block.mass[i, j]
+                a += total * first
+                contribution[world, block.contribution_offset + i * block.count + elem] = dq * f[i] + scale * a
 
     @wp.kernel(module=module)
     def tangent_product(
@@ -444,7 +483,8 @@ def element_kernels(
                 V = Local()
                 if wp.static(damping == "rate"):
                     V = load(block, v, world, elem)
-                rate = strain_rate(block, G, V, history, T(dq_dv[world]), world, q, elem)
+                Fdot = velocity_gradient(block, V, q, elem)
+                rate = strain_rate(block, G, Fdot, history, T(dq_dv[world]), world, q, elem)
                 S += into_axes(block, t.isotropic(rate, c[LAMBDA_V], c[ETA]), q, elem)
         if wp.static(framed):
             F = F * block.frame[q, elem]

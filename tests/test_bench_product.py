@@ -49,7 +49,7 @@ def test_bytes_and_operations_of_straight_tetrahedra():
     tables = w * (3 * S * Q + Q + S * S + S + 11)  # gradients, weights, mass, kinds of slots, coefficients
     counted = cost(residual)
     assert counted.bytes == elements + slots + tables
-    assert counted.flops == E * (Q * (54 * S + 305 + 136) + 7 * S * S + 24 * S) + 3 * C + 10 * n
+    assert counted.flops == E * (Q * (96 + 305 + 136) + 480) + 3 * C + 10 * n
 
 
 def test_bytes_of_the_matrix():

@@ -1,4 +1,4 @@
-"""The tangent against differences of the force, and Kelvin-Voigt damping under finite rotations."""
+"""The tangent against differences of the force, its product, and Kelvin-Voigt damping under finite rotations."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import math
 import numpy as np
 import pytest
 import warp as wp
+from warpfea.kernels.element import element_kernels
 
 import warpfea as wf
+from warpfea.mesh.cells import TET_EDGES
 
 RHO = 1000.0
 LAWS = {
@@ -99,6 +101,94 @@ def test_tangent_of_each_world_is_its_own():
         assert abs(K - expected).max() == 0
         force = alone.internal_force(state_of(alone, u[world]))[0]
         np.testing.assert_array_equal(model.internal_force(state)[world], force)
+
+
+# the product of straight T10: from differences of slots at the vertices, or from all slots at each point
+
+
+def straight_and_distorted():
+    """T10 of many shapes with straight sides."""
+    mesh = wf.mesh.box((1, 1, 1), cells=(2, 2, 1))
+    points, corners = mesh.points.copy(), np.unique(mesh.cells[:, :4])
+    points[corners] += np.random.default_rng(7).uniform(-0.1, 0.1, (len(corners), 3))
+    a, b = TET_EDGES.T
+    points[mesh.cells[:, 4:]] = (points[mesh.cells[:, a]] + points[mesh.cells[:, b]]) / 2
+    return wf.mesh.Mesh(points, mesh.cells, "tetra10")
+
+
+def massive_model(material, form, dtype, rule):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    damping = wf.KelvinVoigt(2e4, 3e4, form=form) if form else None
+    body = b.add_solid(straight_and_distorted(), material=law(material, damping=damping), quadrature=rule)
+    return body, b.finalize(device="cpu", dtype=dtype, worlds=2)
+
+
+def massive_product(model, kernels, u, v, p, mass_factor=1e3):
+    """Contributions [world, local, elem] of fields [world, slot] in both worlds."""
+    (block,) = model.blocks
+    rng = np.random.default_rng(3)
+    vec3, sym6, n = model.types.vec3, model.types.sym, max(1, model.history_count)
+    u, v, p = (wp.array(x.astype(model.dtype), dtype=vec3, device="cpu") for x in (u, v, p))
+    history = wp.array(0.1 * rng.uniform(-1, 1, (2, n, 6)).astype(model.dtype), dtype=sym6, device="cpu")
+    mass, dq = (wp.array([x, 2 * x], dtype=wp.float64, device="cpu") for x in (mass_factor, 1e-3))
+    on = wp.ones(2, dtype=wp.int32, device="cpu")
+    out = wp.zeros((2, model.contributions), dtype=vec3, device="cpu")
+    args = [block.data, u, v, history, mass, dq, on, p, out]
+    wp.launch(kernels.massive_product, dim=(2, block.count), inputs=args, device="cpu")
+    return out.numpy().astype(float).reshape(2, 10, block.count, 3)
+
+
+@pytest.mark.parametrize(
+    ("material", "form", "dtype", "rule"),
+    [
+        ("svk", None, "float64", "tet4"),
+        ("svk", None, "float32", "tet4"),
+        ("svk", "incremental", "float64", "tet5_paper"),
+        ("svk", "rate", "float64", "tet4"),
+        ("mooney_rivlin", None, "float64", "tet5_paper"),
+        ("mooney_rivlin", "rate", "float32", "tet5_paper"),
+        ("neo_hookean", "incremental", "float64", "tet4"),
+        ("neo_hookean", None, "float32", "tet4"),
+    ],
+)
+def test_both_forms_of_the_product_agree(material, form, dtype, rule, data):
+    body, model = massive_model(material, form, dtype, rule)
+    (block,) = model.blocks
+    assert block.key.vertex
+    general = element_kernels(dtype, material, 10, block.points, True, form)
+    u = np.stack([deformed(body), deformed(body, seed=1)])
+    v, p = np.random.default_rng(2).uniform(-1, 1, (2, *u.shape))
+    for mass_factor in (0.0, 1e3):  # 1e3: mass and stiffness are of one size
+        expected = massive_product(model, general, u, v, p, mass_factor)
+        got = massive_product(model, block.kernels, u, v, p, mass_factor)
+        for world in range(2):
+            assert data.error(got[world], expected[world]) < (1e-13 if dtype == "float64" else 1e-5)
+
+
+def test_a_translation_strains_no_straight_element():
+    body, model = massive_model("svk", None, "float64", "tet4")
+    (block,) = model.blocks
+    shape = (2, *body.reference.shape)
+    u, far = np.zeros(shape), np.broadcast_to([1e6 / 3, -1e5 / 7, 1e3 / 11], shape)
+    p = np.random.default_rng(2).uniform(-1, 1, shape)
+    assert np.all(massive_product(model, block.kernels, p, u, far, 0.0) == 0.0)
+    at_rest = massive_product(model, block.kernels, u, u, p)
+    np.testing.assert_array_equal(massive_product(model, block.kernels, far, u, p), at_rest)
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"), [("tet4", True), ("tet5_paper", True), ("tet8", False), ("tet14", False)]
+)
+def test_which_straight_elements_take_the_form_of_vertices(rule, expected):
+    _, model = massive_model("svk", None, "float64", rule)
+    assert model.blocks[0].key.affine
+    assert model.blocks[0].key.vertex == expected
+
+
+def test_other_elements_keep_the_general_product():
+    for name in ("T4", "sphere"):
+        for block in make(name, law("svk"))[2].blocks:
+            assert not block.key.vertex
 
 
 # damping

@@ -71,6 +71,13 @@ class BlockKey:
         return self.integral.rule
 
     @property
+    def vertex(self) -> bool:
+        """Whether kernels/vertex.py does the product: straight 10-node tetrahedra with points towards the vertices."""
+        family = families.get(self.family)
+        quadratic = family.cell_type == "tetra10" and family.slots == 10
+        return self.affine and quadratic and not self.framed and self.rule.radial
+
+    @property
     def tying(self) -> Tying | None:
         """Assumed shear, of tied parts."""
         return self.integral.tying

@@ -56,7 +56,7 @@ class Block:
         k = self.key
         if k.tying:
             return self.kernels
-        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
+        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed, k.vertex)
 
 
 class Model:
@@ -208,7 +208,8 @@ class Model:
         else:
             self._point_tables(data, key, parts)
             points = len(key.rule.weights)
-            kernels = element_kernels(self.dtype, key.law, family.slots, points, key.affine, key.damping, key.framed)
+            kind = (key.law, family.slots, points, key.affine, key.damping, key.framed, key.vertex)
+            kernels = element_kernels(self.dtype, *kind)
         return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element)
 
     def shear_block(self, block: Block) -> Block:

@@ -39,6 +39,16 @@ class Rule:
     degree: int
     counts: tuple[int, ...] = ()
 
+    @property
+    def radial(self) -> bool:
+        """Of a tetrahedron: one point on each line from the centroid to vertices 0-3, after at most the centroid."""
+        if self.points.shape not in ((4, 3), (5, 3)):
+            return False
+        own = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
+        near = own[-4, 0] - own[-4, 1]
+        towards = 0.25 + near * (np.eye(4) - 0.25)
+        return bool(near != 0.0 and np.allclose(own[-4:], towards, 0, 1e-14) and np.allclose(own[:-4], 0.25, 0, 1e-14))
+
 
 def _barycentric(name: str, degree: int, orbits: list[tuple[float, np.ndarray]]) -> Rule:
     """Rule from (weight in units of the volume, barycentric points (n, 4))."""
