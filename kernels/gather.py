@@ -10,6 +10,7 @@ import warp as wp
 
 from .constraints import constraint_struct, multiplier_struct
 from .lanes import lane_functions
+from .packed import packed_kernels
 from .types import SMALL, kernel_module, precision
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels", "inverse_function", "pattern_struct", "topology_struct"]
@@ -109,6 +110,8 @@ def gather_kernels(
     name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
     module = kernel_module(f"gather_{name}", max_unroll=SMALL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
+    packed_module = kernel_module(f"packed_product_{name}", max_unroll=SMALL)
+    packed = packed_kernels(dtype)
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -280,15 +283,11 @@ def gather_kernels(
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
-        massive: int,
         warp: int,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots.
-
-        `massive`: the contributions hold mass and factors.
-        """
+        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -298,12 +297,44 @@ def gather_kernels(
             for k in range(topo.start[slot], topo.start[slot + 1]):
                 f += contribution[world, topo.entry[k]]
             dq = T(dq_dv[world])
-            h = f
-            if massive == 0:
-                a = vec3()
-                for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-                    a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
-                h = T(mass_factor[world]) * a + dq * f
+            a = vec3()
+            for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+                a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
+            h = T(mass_factor[world]) * a + dq * f
+            h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
+            out[world, slot] = h
+            share = f64(wp.dot(h, p_in[world, slot]))
+        share = row_sum(share, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = share
+
+    @wp.kernel(module=packed_module)
+    def packed_product(
+        topo: Topology,
+        contribution: wp.array2d(dtype=packed.vec4),
+        pushed_start: wp.array(dtype=wp.int32),
+        pushed_entry: wp.array(dtype=wp.int32),
+        pushed_contribution: wp.array2d(dtype=vec3),
+        p_in: wp.array2d(dtype=vec3),
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
+        warp: int,
+        out: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """The same from padded contributions that hold mass and factors."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        share = f64(0.0)
+        if slot < out.shape[1]:
+            h = vec3()
+            for k in range(topo.start[slot], topo.start[slot + 1]):
+                h += packed.read(contribution, world, topo.entry[k])
+            dq = T(dq_dv[world])
             h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
             out[world, slot] = h
             share = f64(wp.dot(h, p_in[world, slot]))
@@ -398,7 +429,9 @@ def gather_kernels(
     return _types.SimpleNamespace(
         module=module,
         matrix_module=matrix_module,
+        packed_module=packed_module,
         matrix_product=matrix_product,
+        packed_product=packed_product,
         gather_force=gather_force,
         residual=residual,
         product=product,

@@ -30,8 +30,7 @@ def on(sim):
 def product(sim, p):
     work, residual = sim.stepper.work, sim.stepper.newton.residual
     work.p.assign(p.reshape(work.p.numpy().shape))
-    if residual.by_matrix:
-        residual.assemble(on(sim))
+    residual.take(on(sim))
     residual.product(work.p, work.Hp, on(sim))
     return work.Hp.numpy()[0].ravel().astype(float)
 

@@ -98,8 +98,7 @@ def prepare(model: Model, operator: str) -> tuple[Simulation, Residual]:
     _assign(model, w.u, scale[:, None] * _random(model, 1))
     w.step.dq_dv.fill_(DT)
     w.step.mass_factor.fill_(1.0 / DT)
-    if residual.by_matrix:
-        residual.assemble(wp.ones(model.worlds, dtype=wp.int32, device=model.device))
+    residual.take(wp.ones(model.worlds, dtype=wp.int32, device=model.device))
     return sim, residual
 
 
