@@ -40,7 +40,7 @@ SPOKES = tuple(
     """
 )
 def forget():
-    """Values in memory are read anew: the compiler would keep them all in registers to read each once."""
+    """Values in memory are read anew after this: compilers keep all of them in registers, to read each once."""
     ...
 
 
@@ -133,7 +133,7 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _t
         direction: wp.array2d(dtype=vec4),
         contribution: wp.array2d(dtype=vec4),
     ):
-        """c_M M p + (dq/dv) K p; slots are read anew at each vertex, which costs less than to keep them."""
+        """c_M M p + (dq/dv) K p; slots are read anew at each vertex, to hold fewer registers."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
