@@ -92,30 +92,32 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
             wp.atomic_max(lag.any_build, 0, 1)
 
     @wp.kernel(module=module)
-    def judge_matrix(lag: Lag, newton: Newton, across: int):
+    def judge_matrix(lag: Lag, newton: Newton, keep: int):
         """Before a solve: whether Newton's method would gain by the matrix of this iterate.
 
-        What the last iteration gained tells how many are left with the matrix at hand. `across`: it may be kept from
-        step to step.
+        What the last iteration gained tells how many are left with the matrix at hand. `keep`: 0: each iterate has its
+        own; 1: it may be kept within a step; 2: from step to step.
         """
         world = wp.tid()
         if newton.active[world] == 0:
             return
         if newton.iterations[world] == 0:
             lag.made_at[world] = 0
-            if across == 0:
+            if keep < 2:
                 lag.due[world] = 1
+                lag.stale[world] = 0  # whatever the state was, it holds none
             return
         need = wp.log10(wp.max(newton.excess[world], f64(1.0)))
         gain = -wp.log10(wp.max(newton.reduction[world], f64(1.0e-30)))
         fresh = wp.max(need / f64(DECADES), f64(1.0))
-        if newton.alpha[world] != f64(1.0) or need > gain * (fresh + lag.limit):
+        if keep == 0 or newton.alpha[world] != f64(1.0) or need > gain * (fresh + lag.limit):
             lag.due[world] = 1
 
     @wp.kernel(module=module)
     def loosen(lag: Lag, newton: Newton):
         """With a matrix of an earlier iterate no solve need go further than the matrix is good for."""
         world = wp.tid()
+        newton.lagging[world] = 1 - lag.moved[world]
         if newton.active[world] == 0 or lag.moved[world] != 0 or newton.fixed_forcing != 0:
             return
         if newton.iterations[world] == 1 and lag.made_at[world] == 0:

@@ -36,6 +36,7 @@ LANES = 32
 NOISE = 100.0  # Phi is blind below this many roundings of its parts
 FLOOR = 16.0
 MAX_SEARCH = 20
+LAGGING_SEARCH = 2
 
 
 @functools.cache
@@ -64,6 +65,7 @@ def control_struct():
         quiet: wp.array2d(dtype=wp.int32)  # [world, component] converged
         reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
         forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
+        lagging: wp.array(dtype=wp.int32)  # the operator is of an earlier iterate
         min_J: wp.array(dtype=wp.float64)
         domain_J: wp.array(dtype=wp.float64)  # smallest J of the laws that need J > 0
         history: wp.array2d(dtype=wp.float64)  # [world, iteration] norm / scale
@@ -264,7 +266,10 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         if not wp.isfinite(slope):
             fail(ctl, world, FAIL_NAN)
         elif slope >= f64(0.0):
-            fail(ctl, world, FAIL_CURVATURE)
+            if ctl.lagging[world] != 0:
+                ctl.alpha[world] = f64(0.0)
+            else:
+                fail(ctl, world, FAIL_CURVATURE)
 
     @wp.kernel(module=module)
     def judge_trial(ctl: Control):
@@ -290,6 +295,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
                 good = True
         if ctl.domain_J[world] <= f64(0.0):
             good = False
+        if alpha == f64(0.0):
+            good = True
         if good:
             ctl.searching[world] = 0
             measure(ctl, world)
@@ -313,6 +320,10 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         else:
             ctl.searches[world] = ctl.searches[world] + 1
             ctl.alpha[world] = f64(0.5) * alpha
+            if ctl.lagging[world] != 0:
+                # not the iterate is to blame: stand still, and go on with an operator of its own
+                if ctl.searches[world] > LAGGING_SEARCH:
+                    ctl.alpha[world] = f64(0.0)
             if ctl.searches[world] > MAX_SEARCH:
                 why = FAIL_LINE_SEARCH
                 if ctl.domain_J[world] <= f64(0.0):

@@ -39,6 +39,8 @@ class Lag:
         self.control.stale.fill_(1)
         self.control.mass_factor.fill_(-1.0)
         self.place = work.array(f"{name} place", self.dim, model.types.vec3)
+        # without a state that remembers it
+        self.control.kept, self.kept = wp.zeros((0, 0), dtype=wp.float64, device=model.device), self.place
 
     def register(self, state: State) -> None:
         """Put into the state where it was made, and the rule's counts."""

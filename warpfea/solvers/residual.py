@@ -81,6 +81,7 @@ class Residual:
         if not model.device.is_cuda:
             many = assembled
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
+        self.lasting = False
         self.pack_kernels = packed_kernels(model.dtype)
         if self.massive and not self.by_matrix:
             # the rate form of damping needs the velocity's gradient too
@@ -95,8 +96,10 @@ class Residual:
         if self.by_matrix:
             assert self.assembled is not None
             self.matrix = self.assembled.values("operator matrix")
-            # statics goes too far in a step for the matrix of the one before
-            self.across = viscous
+            # statics goes too far in a step for the matrix of the one before; the forces of constraints are only as good
+            # as the solve
+            self.keep = 0 if constraints else 2 if viscous else 1
+            self.lasting = self.keep == 2
             self.lag = Lag(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
 
     def modules(self) -> set[wp.Module]:
@@ -112,17 +115,17 @@ class Residual:
 
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know of the operator's matrix."""
-        if self.by_matrix:
+        if self.lasting:
             self.lag.register(state)
 
     def forget(self, flags: wp.array) -> None:
         """The state of flagged worlds was set from elsewhere."""
-        if self.by_matrix:
+        if self.lasting:
             self.lag.forget(flags)
 
     def commit(self, accepted: wp.array) -> None:
         """The step was accepted: tell the state."""
-        if self.by_matrix:
+        if self.lasting:
             args = [self.lag.control, self.work.newton, accepted]
             self.launch(self.lag.kernels.count_step, self.model.worlds, args)
             self.lag.carry(accepted)
@@ -135,7 +138,7 @@ class Residual:
             self.take(active)
             return
         control = self.lag.control
-        args = [control, self.work.newton, int(self.across)]
+        args = [control, self.work.newton, self.keep]
         self.launch(self.lag.kernels.judge_matrix, self.model.worlds, args)
         self.lag.decide(active)
         self.launch(self.lag.kernels.loosen, self.model.worlds, [control, self.work.newton])
@@ -148,7 +151,7 @@ class Residual:
         self.lag.carry()
         factors = (control.mass_factor, control.dq_dv)
         self.assembled.assemble(
-            self.lag.place, factors, control.build, self.matrix, projected=False, lasting=self.across
+            self.lag.place, factors, control.build, self.matrix, projected=False, lasting=self.lasting
         )
         self.lag.made()
 
