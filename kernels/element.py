@@ -12,7 +12,6 @@ import warp as wp
 
 from . import materials
 from .lanes import lane_functions
-from .packed import packed_kernels
 from .types import kernel_module, precision
 from .vertex import vertex_product
 
@@ -82,8 +81,6 @@ def element_kernels(
     viscous = materials.svk(dtype)
     Block = block_struct(dtype)
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
-    packed = packed_kernels(dtype)
-    vec4 = packed.vec4
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
     Local = wp.types.matrix(shape=(slots, 3), dtype=T)
@@ -124,15 +121,6 @@ def element_kernels(
         first = field[world, block.conn[0, elem]]
         for i in range(NS):
             U[i] = field[world, block.conn[i, elem]] - block.is_position[i] * first
-        return U
-
-    @wp.func
-    def load_packed(block: Block, field: wp.array2d(dtype=vec4), world: int, elem: int) -> Local:
-        """The same of a padded field."""
-        U = Local()
-        first = packed.read(field, world, block.conn[0, elem])
-        for i in range(NS):
-            U[i] = packed.read(field, world, block.conn[i, elem]) - block.is_position[i] * first
         return U
 
     @wp.func
@@ -344,23 +332,21 @@ def element_kernels(
         return f
 
     if vertex:
-        shared = _types.SimpleNamespace(
-            Block=Block, coefficients=coefficients, point_increment=point_increment, packed=packed
-        )
+        shared = _types.SimpleNamespace(Block=Block, coefficients=coefficients, point_increment=point_increment)
         massive_product = vertex_product(dtype, massive_module, points, damping == "rate", shared)
     else:
 
         @wp.kernel(module=massive_module)
         def massive_product(
             block: Block,
-            u: wp.array2d(dtype=vec4),
-            v: wp.array2d(dtype=vec4),
+            u: wp.array2d(dtype=vec3),
+            v: wp.array2d(dtype=vec3),
             history: wp.array2d(dtype=sym6),
             mass_factor: wp.array(dtype=wp.float64),
             dq_dv: wp.array(dtype=wp.float64),
             active: wp.array(dtype=wp.int32),
-            direction: wp.array2d(dtype=vec4),
-            contribution: wp.array2d(dtype=vec4),
+            direction: wp.array2d(dtype=vec3),
+            contribution: wp.array2d(dtype=vec3),
         ):
             """c_M M p + (dq/dv) K p of straight elements, whose mass is one table times a number each.
 
@@ -369,15 +355,15 @@ def element_kernels(
             world, elem = wp.tid()
             if active[world] == 0:
                 return
-            U = load_packed(block, u, world, elem)
-            dU = load_packed(block, direction, world, elem)
+            U = load(block, u, world, elem)
+            dU = load(block, direction, world, elem)
             V = Local()
             if wp.static(damping == "rate"):
-                V = load_packed(block, v, world, elem)
+                V = load(block, v, world, elem)
             dq = T(dq_dv[world])
             f = tangent_force(block, U, dU, V, history, dq, world, elem)
             scale = T(mass_factor[world]) * block.density[elem]
-            first = packed.read(direction, world, block.conn[0, elem])
+            first = direction[world, block.conn[0, elem]]
             for i in range(NS):
                 a = vec3()
                 total = T(0.0)
@@ -386,7 +372,7 @@ def element_kernels(
                     total += block.mass[i, j]
                 a += total * first
                 entry = block.contribution_offset + i * block.count + elem
-                packed.write(contribution, world, entry, dq * f[i] + scale * a)
+                contribution[world, entry] = dq * f[i] + scale * a
 
     @wp.kernel(module=module)
     def tangent_product(

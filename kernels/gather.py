@@ -10,7 +10,6 @@ import warp as wp
 
 from .constraints import constraint_struct, multiplier_struct
 from .lanes import lane_functions
-from .packed import packed_kernels
 from .types import SMALL, kernel_module, precision
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels", "inverse_function", "pattern_struct", "topology_struct"]
@@ -110,8 +109,7 @@ def gather_kernels(
     name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
     module = kernel_module(f"gather_{name}", max_unroll=SMALL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
-    packed_module = kernel_module(f"packed_product_{name}", max_unroll=SMALL)
-    packed = packed_kernels(dtype)
+    massive_module = kernel_module(f"massive_product_{name}", max_unroll=SMALL)
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -308,10 +306,10 @@ def gather_kernels(
         if slot % warp == 0:
             rows[0, world, slot / warp] = share
 
-    @wp.kernel(module=packed_module)
-    def packed_product(
+    @wp.kernel(module=massive_module)
+    def massive_product(
         topo: Topology,
-        contribution: wp.array2d(dtype=packed.vec4),
+        contribution: wp.array2d(dtype=vec3),
         pushed_start: wp.array(dtype=wp.int32),
         pushed_entry: wp.array(dtype=wp.int32),
         pushed_contribution: wp.array2d(dtype=vec3),
@@ -325,7 +323,7 @@ def gather_kernels(
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """The same from padded contributions that hold mass and factors."""
+        """The same from contributions that hold mass and factors."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -333,7 +331,7 @@ def gather_kernels(
         if slot < out.shape[1]:
             h = vec3()
             for k in range(topo.start[slot], topo.start[slot + 1]):
-                h += packed.read(contribution, world, topo.entry[k])
+                h += contribution[world, topo.entry[k]]
             dq = T(dq_dv[world])
             h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
             out[world, slot] = h
@@ -429,9 +427,9 @@ def gather_kernels(
     return _types.SimpleNamespace(
         module=module,
         matrix_module=matrix_module,
-        packed_module=packed_module,
+        massive_module=massive_module,
         matrix_product=matrix_product,
-        packed_product=packed_product,
+        massive_product=massive_product,
         gather_force=gather_force,
         residual=residual,
         product=product,

@@ -32,18 +32,6 @@ SPOKES = tuple(
 """e(v, b)."""
 
 
-@wp.func_native(
-    snippet="""
-    #if defined(__CUDA_ARCH__)
-    asm volatile("" ::: "memory");
-    #endif
-    """
-)
-def forget():
-    """Values in memory are read anew after this: compilers keep all of them in registers, to read each once."""
-    ...
-
-
 def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _types.SimpleNamespace) -> wp.Kernel:
     """The kernel `massive_product` in this form.
 
@@ -52,35 +40,34 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _t
         module: for the kernel; its short loops must be unrolled, that slots are registers.
         points: 4, one for each vertex, or 5, the centroid before them.
         rate: increments need the velocity gradient.
-        f: of the element kernels, `Block`, `coefficients` and `point_increment`, and `packed`, of packed_kernels.
+        f: of the element kernels, `Block`, `coefficients` and `point_increment`.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Block, coefficients, point_increment = f.Block, f.coefficients, f.point_increment
-    vec4, read, write = f.packed.vec4, f.packed.read, f.packed.write
     Local = wp.types.matrix(shape=(10, 3), dtype=T)
     FIRST = points - 4
 
     @wp.func
-    def spokes(block: Block, field: wp.array2d(dtype=vec4), world: int, elem: int, e: wp.vec4i) -> mat33:
+    def spokes(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int, e: wp.vec4i) -> mat33:
         """sum_b u_e(b) dL_b^T."""
-        o = read(field, world, block.conn[e[0], elem])
+        o = field[world, block.conn[e[0], elem]]
         return wp.matrix_from_cols(
-            read(field, world, block.conn[e[1], elem]) - o,
-            read(field, world, block.conn[e[2], elem]) - o,
-            read(field, world, block.conn[e[3], elem]) - o,
+            field[world, block.conn[e[1], elem]] - o,
+            field[world, block.conn[e[2], elem]] - o,
+            field[world, block.conn[e[3], elem]] - o,
         )
 
     @wp.func
-    def central(block: Block, field: wp.array2d(dtype=vec4), world: int, elem: int) -> mat33:
+    def central(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> mat33:
         """S, where opposite edges have opposite signs."""
-        a = read(field, world, block.conn[5, elem]) - read(field, world, block.conn[7, elem])
-        b = read(field, world, block.conn[8, elem]) - read(field, world, block.conn[6, elem])
-        c = read(field, world, block.conn[9, elem]) - read(field, world, block.conn[4, elem])
+        a = field[world, block.conn[5, elem]] - field[world, block.conn[7, elem]]
+        b = field[world, block.conn[8, elem]] - field[world, block.conn[6, elem]]
+        c = field[world, block.conn[9, elem]] - field[world, block.conn[4, elem]]
         return wp.matrix_from_cols(a + b, a + c, b + c)
 
     @wp.func
-    def shared(block: Block, field: wp.array2d(dtype=vec4), world: int, elem: int, s: T) -> mat33:
+    def shared(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int, s: T) -> mat33:
         """H."""
         S = central(block, field, world, elem)
         return S - s * (S + spokes(block, field, world, elem, wp.vec4i(0, 1, 2, 3)))
@@ -93,11 +80,11 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _t
         return vec3(Q[0, b - 1], Q[1, b - 1], Q[2, b - 1])
 
     @wp.func
-    def inertia(block: Block, field: wp.array2d(dtype=vec4), world: int, elem: int, scale: T, force: Local) -> Local:
+    def inertia(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int, scale: T, force: Local) -> Local:
         """Adds scale M u, where M has one number for each way that two slots can lie to each other."""
         u = Local()
         for i in range(10):
-            u[i] = read(field, world, block.conn[i, elem])
+            u[i] = field[world, block.conn[i, elem]]
         beside = scale * block.mass[0, 1]
         near = scale * block.mass[0, 4]
         far = scale * block.mass[0, 5]
@@ -124,14 +111,14 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _t
     @wp.kernel(module=module)
     def massive_product(
         block: Block,
-        u: wp.array2d(dtype=vec4),
-        v: wp.array2d(dtype=vec4),
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
         history: wp.array2d(dtype=sym6),
         mass_factor: wp.array(dtype=wp.float64),
         dq_dv: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec4),
-        contribution: wp.array2d(dtype=vec4),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
     ):
         """c_M M p + (dq/dv) K p; slots are read anew at each vertex, to hold fewer registers."""
         world, elem = wp.tid()
@@ -149,7 +136,6 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _t
         f = Local()
         B = mat33()
         for k in range(4):
-            forget()
             J0_inv = block.J0_inv[elem]
             G = (H + T(4.0) * s * spokes(block, u, world, elem, wp.static(SPOKES[k]))) * J0_inv
             dG = (dH + T(4.0) * s * spokes(block, direction, world, elem, wp.static(SPOKES[k]))) * J0_inv
@@ -163,7 +149,6 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _t
             for b in range(4):
                 slot = wp.static(SPOKES[k][b])
                 f[slot] = f[slot] + T(4.0) * column(Q, b)
-        forget()
         R = (T(1.0) / s - T(1.0)) * B
         if wp.static(FIRST == 1):
             G = central(block, u, world, elem) * block.J0_inv[elem]
@@ -179,6 +164,6 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _t
             f[4 + k] = f[4 + k] + column(R, wp.static(EDGES[k][0])) + column(R, wp.static(EDGES[k][1]))
         f = inertia(block, direction, world, elem, T(mass_factor[world]) * block.density[elem], f)
         for i in range(10):
-            write(contribution, world, block.contribution_offset + i * block.count + elem, f[i])
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
 
     return massive_product

@@ -10,7 +10,6 @@ import warp as wp
 from warpfea.kernels.element import element_kernels
 
 import warpfea as wf
-from warpfea.kernels.packed import packed_type
 from warpfea.mesh.cells import TET_EDGES
 
 RHO = 1000.0
@@ -128,17 +127,15 @@ def massive_product(model, kernels, u, v, p, mass_factor=1e3):
     """Contributions [world, local, elem] of fields [world, slot] in both worlds."""
     (block,) = model.blocks
     rng = np.random.default_rng(3)
-    sym6, n, vec4 = model.types.sym, max(1, model.history_count), packed_type(model.dtype)
-    u, v, p = (
-        wp.array(np.pad(x.astype(model.dtype), ((0, 0), (0, 0), (0, 1))), dtype=vec4, device="cpu") for x in (u, v, p)
-    )
+    vec3, sym6, n = model.types.vec3, model.types.sym, max(1, model.history_count)
+    u, v, p = (wp.array(x.astype(model.dtype), dtype=vec3, device="cpu") for x in (u, v, p))
     history = wp.array(0.1 * rng.uniform(-1, 1, (2, n, 6)).astype(model.dtype), dtype=sym6, device="cpu")
     mass, dq = (wp.array([x, 2 * x], dtype=wp.float64, device="cpu") for x in (mass_factor, 1e-3))
     on = wp.ones(2, dtype=wp.int32, device="cpu")
-    out = wp.zeros((2, model.contributions), dtype=vec4, device="cpu")
+    out = wp.zeros((2, model.contributions), dtype=vec3, device="cpu")
     args = [block.data, u, v, history, mass, dq, on, p, out]
     wp.launch(kernels.massive_product, dim=(2, block.count), inputs=args, device="cpu")
-    return out.numpy().astype(float).reshape(2, 10, block.count, 4)[..., :3]
+    return out.numpy().astype(float).reshape(2, 10, block.count, 3)
 
 
 @pytest.mark.parametrize(

@@ -60,11 +60,9 @@ def cost(residual: Residual) -> Cost:
         pattern = residual.assembled.pattern
         moved += _sizes(pattern.data, ("start", "column")) + _size(residual.matrix) // model.worlds
         return Cost(moved, 18 * pattern.entries + 10 * n)
-    moved += _sizes(topo, ("start", "entry")) + (vector * 4 // 3 if residual.massive else vector) * model.contributions
+    moved += _sizes(topo, ("start", "entry")) + vector * model.contributions
     flops = 3 * model.contributions + 10 * n
-    if residual.massive:
-        moved += vector * n * 7 // 3  # p, and its padded copy
-    else:
+    if not residual.massive:
         moved += _sizes(topo, ("mass_start", "mass_column", "mass_value"))
         flops += 6 * topo.mass_value.size
     for block in model.blocks:
@@ -89,9 +87,8 @@ def _block_bytes(block: Any, massive: bool, vector: int, slots: int) -> int:
         touched[part.conn + part.body.slot_offset] = True
     fields = 3 if key.damping == "rate" else 2
     past = 2 * vector * block.points * block.count if key.damping == "incremental" else 0
-    width = vector * 4 // 3 if massive else vector  # padded
-    written = width * block.slots * block.count
-    return _sizes(block.data, names) + fields * width * int(touched.sum()) + past + written
+    written = vector * block.slots * block.count
+    return _sizes(block.data, names) + fields * vector * int(touched.sum()) + past + written
 
 
 def _element_flops(block: Any, massive: bool) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import warp as wp
@@ -11,7 +10,6 @@ from ..kernels.constraints import SUM_ROWS, constraint_struct
 from ..kernels.element import MASSIVE_BLOCK
 from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
-from ..kernels.packed import packed_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
 from ..launch import labelled
 from .assembled import Assembled, shaped
@@ -82,21 +80,13 @@ class Residual:
             many = assembled
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
         self.lasting = False
-        self.pack_kernels = packed_kernels(model.dtype)
-        if self.massive and not self.by_matrix:
-            # the rate form of damping needs the velocity's gradient too
-            self.rated = any(block.key.damping == "rate" for block in model.blocks) and viscous
-            shapes = {"u": self.dim, "direction": self.dim, "contribution": (model.worlds, model.contributions)}
-            shapes["v"] = self.dim if self.rated else (1, 1)
-            make = {name: work.array(f"packed {name}", shape, self.pack_kernels.vec4) for name, shape in shapes.items()}
-            self.packed = SimpleNamespace(**make)
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
             self.assembled = Assembled(model, work, launch, self.block_kernels)
         if self.by_matrix:
             assert self.assembled is not None
             self.matrix = self.assembled.values("operator matrix")
-            # statics goes too far in a step for the matrix of the one before; the forces of constraints are only as good
+            # statics goes too far in a step for the last one's matrix, and forces of constraints are only as good
             # as the solve
             self.keep = 0 if constraints else 2 if viscous else 1
             self.lasting = self.keep == 2
@@ -109,7 +99,7 @@ class Residual:
             assert self.assembled is not None
             out |= {self.gather.matrix_module, self.lag.kernels.module} | self.assembled.modules()
         elif self.massive:
-            out |= {self.gather.packed_module, self.pack_kernels.module}
+            out.add(self.gather.massive_module)
             out |= {k.massive_product.module for k in self.block_kernels}
         return out
 
@@ -135,7 +125,6 @@ class Residual:
     def linearise(self, active: wp.array) -> None:
         """Make the operator's matrix at the iterate, where it is to be made anew."""
         if not self.by_matrix:
-            self.take(active)
             return
         control = self.lag.control
         args = [control, self.work.newton, self.keep]
@@ -162,10 +151,6 @@ class Residual:
             assert self.assembled is not None
             factors = (w.step.mass_factor, w.step.dq_dv)
             self.assembled.assemble(w.u, factors, active, self.matrix, projected=False)
-        elif self.massive:
-            self.launch(self.pack_kernels.pack, self.dim, [w.u, active, self.packed.u])
-            if self.rated:
-                self.launch(self.pack_kernels.pack, self.dim, [w.v, active, self.packed.v])
 
     @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
@@ -232,11 +217,8 @@ class Residual:
         """out = H p at the iterate, and p.Hp in parts in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
         if self.massive and not self.by_matrix:
-            pack, packed = self.pack_kernels.pack, self.packed
-            launch(pack, self.dim, [p, active, packed.direction])
             for block, kernels in zip(m.blocks, self.block_kernels):
-                args = [block.data, packed.u, packed.v, w.history, w.step.mass_factor, w.step.dq_dv, active]
-                args += [packed.direction, packed.contribution]
+                args = [block.data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p, w.contribution]
                 launch(kernels.massive_product, (m.worlds, block.count), args, block_dim=MASSIVE_BLOCK)
         elif not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
@@ -261,10 +243,8 @@ class Residual:
             launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:
             self.curvature_rows = w.warp_rows
-            kernel, contribution = self.gather.product, w.contribution
-            if self.massive:
-                kernel, contribution = self.gather.packed_product, self.packed.contribution
-            launch(kernel, padded, [m.topology, contribution, *rest, out, w.warp_rows])
+            kernel = self.gather.massive_product if self.massive else self.gather.product
+            launch(kernel, padded, [m.topology, w.contribution, *rest, out, w.warp_rows])
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""
