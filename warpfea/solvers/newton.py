@@ -44,9 +44,11 @@ class NewtonPCG:
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
             serves), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
             "block-jacobi" (the blocks alone), or "auto": the second for many small bodies on joints, else the first.
+        linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS where that is installed.
         preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
             model's. They are made in the model's precision; float32 halves what an application reads.
-        operator: H p from "elements", from the "matrix" assembled at every iterate, or "auto", by which is cheaper.
+        operator: H p from the "elements", from the "matrix" of 3x3 blocks, or "auto", by which is cheaper. In dynamics
+            without constraints the matrix of an earlier iterate serves while Newton's method does not suffer.
         multipliers: how constraint forces are found: "newton", with every Newton step, or "outer", the classical
             augmented Lagrangian, in a loop around the Newton solves.
         penalty: kappa, the penalty of a constraint over the stiffness of what it ties.
