@@ -512,7 +512,7 @@ def element_kernels(
 
         Args:
             form: 0: K; 1: without what can make it indefinite at a point, compression and stress of the viscosity, and
-                with a stand-in for laws that need J > 0; 2: without the stress of the viscosity, a function of u.
+                with a stand-in for laws that need J > 0, a function of u.
             add: to what is there, of another part of the energy.
             by_element: consecutive threads do the columns of an element, else the elements' columns of one number.
         """

@@ -17,6 +17,8 @@ __all__ = ["lag_kernels", "lag_struct"]
 
 DECADES = 3.0
 """What an iteration of Newton's method gains with the matrix of its iterate, for the rule."""
+FADE = 0.8
+"""A kept matrix that served badly at the start of a step is tried again after some steps."""
 SHARE = 0.3
 """Residual of a linear solve over what the last iteration left, with a matrix that is not of the iterate."""
 
@@ -36,7 +38,7 @@ def lag_struct():
         dq_dv: wp.array(dtype=wp.float64)
         rate: wp.array(dtype=wp.float64)  # iterations of the first solve (per decade) or step with it; 0: none yet
         excess: wp.array(dtype=wp.float64)  # iterations beyond that rate since
-        made_at: wp.array(dtype=wp.int32)  # Newton iteration of this attempt that it was made at
+        made_at: wp.array(dtype=wp.int32)  # of a matrix: iteration of this attempt that it was made at; -1: kept
         pace: wp.array(dtype=wp.float64)  # reduction of the residual by a step's first iteration with a kept matrix
         kept: wp.array2d(dtype=wp.float64)  # of the state: due, mass_factor, dq_dv, rate, excess, pace
         limit: wp.float64  # excess that pays for making it
@@ -54,6 +56,11 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
     Lag = lag_struct()
     Newton, PCG = control_struct(), pcg_struct()
     module = kernel_module(f"lag_{dtype}")
+
+    @wp.func
+    def gain(reduction: f64) -> f64:
+        """Decades."""
+        return -wp.log10(wp.max(reduction, f64(1.0e-30)))
 
     @wp.kernel(module=module)
     def decide(
@@ -85,7 +92,6 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
             lag.dq_dv[world] = dq_dv[world]
             lag.rate[world] = f64(0.0)
             lag.excess[world] = f64(0.0)
-            lag.pace[world] = f64(0.0)
             lag.made_at[world] = newton.iterations[world]
         if lag.moved[world] != 0 or lag.stale[world] != 0:
             lag.build[world] = 1
@@ -95,22 +101,33 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
     def judge_matrix(lag: Lag, newton: Newton, keep: int):
         """Before a solve: whether Newton's method would gain by the matrix of this iterate.
 
-        What the last iteration gained tells how many are left with the matrix at hand. `keep`: 0: each iterate has its
-        own; 1: it may be kept within a step; 2: from step to step.
+        What an iteration gained tells how many are left with the matrix at hand: the last one or, at the start of a
+        step, the first of the last step that began with a kept matrix, whose memory fades. `keep`: 0: each iterate has
+        its own; 1: it may be kept within a step; 2: from step to step.
         """
         world = wp.tid()
         if newton.active[world] == 0:
             return
-        if newton.iterations[world] == 0:
-            lag.made_at[world] = 0
+        k = newton.iterations[world]
+        need = wp.log10(wp.max(newton.excess[world], f64(1.0)))
+        fresh = wp.max(need / f64(DECADES), f64(1.0))
+        if newton.lagging[world] == 2:
+            lag.due[world] = 1
+            if k == 0:
+                lag.pace[world] = f64(1.0)
+            return
+        if k == 0:
+            lag.made_at[world] = -1
             if keep < 2:
                 lag.due[world] = 1
                 lag.stale[world] = 0  # whatever the state was, it holds none
+            elif lag.stale[world] == 0 and need > gain(lag.pace[world]) * (fresh + lag.limit):
+                lag.due[world] = 1
+                lag.pace[world] = f64(FADE) * lag.pace[world]
             return
-        need = wp.log10(wp.max(newton.excess[world], f64(1.0)))
-        gain = -wp.log10(wp.max(newton.reduction[world], f64(1.0e-30)))
-        fresh = wp.max(need / f64(DECADES), f64(1.0))
-        if keep == 0 or newton.alpha[world] != f64(1.0) or need > gain * (fresh + lag.limit):
+        slow = need > gain(newton.reduction[world]) * (fresh + lag.limit)
+        late = 3 * k >= newton.max_iterations
+        if keep == 0 or newton.alpha[world] != f64(1.0) or slow or late:
             lag.due[world] = 1
 
     @wp.kernel(module=module)
@@ -118,22 +135,23 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
         """With a matrix of an earlier iterate no solve need go further than the matrix is good for."""
         world = wp.tid()
         newton.lagging[world] = 1 - lag.moved[world]
-        if newton.active[world] == 0 or lag.moved[world] != 0 or newton.fixed_forcing != 0:
+        if newton.active[world] == 0:
             return
-        if newton.iterations[world] == 1 and lag.made_at[world] == 0:
-            lag.pace[world] = newton.reduction[world]
         pace = lag.pace[world]
         if newton.iterations[world] > 0:
             pace = newton.reduction[world]
-        newton.forcing[world] = wp.max(newton.forcing[world], wp.min(f64(SHARE) * pace, f64(0.1)))
+            if newton.iterations[world] == 1 and lag.made_at[world] == -1:
+                lag.pace[world] = pace
+        if lag.moved[world] == 0 and newton.fixed_forcing == 0:
+            newton.forcing[world] = wp.max(newton.forcing[world], wp.min(f64(SHARE) * pace, f64(0.1)))
 
     @wp.kernel(module=module)
     def count_step(lag: Lag, newton: Newton, accepted: wp.array(dtype=wp.int32)):
         """An accepted step: what it cost in iterations beyond the first step with this matrix."""
         world = wp.tid()
-        if accepted[world] == 0:
+        if accepted[world] == 0 or lag.stale[world] != 0:
             return
-        made_at = lag.made_at[world]
+        made_at = wp.max(lag.made_at[world], 0)
         # a step that made it on its way had begun with another
         count = f64(newton.iterations[world] - made_at + wp.min(made_at, 1))
         if lag.rate[world] == f64(0.0):
@@ -161,9 +179,9 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def commit(lag: Lag, accepted: wp.array(dtype=wp.int32)):
-        """An accepted step: the state hears what was done."""
+        """An accepted step: the state hears what was done; of a step without a solve that is nothing."""
         world = wp.tid()
-        if accepted[world] == 0:
+        if accepted[world] == 0 or lag.stale[world] != 0:
             return
         lag.changed[world] = 0
         lag.kept[world, 0] = f64(lag.due[world])
@@ -184,7 +202,7 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
     def which(lag: Lag, accepted: wp.array(dtype=wp.int32), world: int) -> int:
         """1: the iterate is where it is made; 2: what was kept is; 3: the state hears. 0: nothing to do."""
         if accepted.shape[0] > 0:
-            return wp.where(accepted[world] != 0 and lag.changed[world] != 0, 3, 0)
+            return wp.where(accepted[world] != 0 and lag.changed[world] != 0 and lag.stale[world] == 0, 3, 0)
         if lag.moved[world] != 0:
             return 1
         return wp.where(lag.stale[world] != 0, 2, 0)

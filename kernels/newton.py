@@ -65,7 +65,7 @@ def control_struct():
         quiet: wp.array2d(dtype=wp.int32)  # [world, component] converged
         reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
         forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
-        lagging: wp.array(dtype=wp.int32)  # the operator is of an earlier iterate
+        lagging: wp.array(dtype=wp.int32)  # the operator is of an earlier iterate; 2: and led nowhere
         min_J: wp.array(dtype=wp.float64)
         domain_J: wp.array(dtype=wp.float64)  # smallest J of the laws that need J > 0
         history: wp.array2d(dtype=wp.float64)  # [world, iteration] norm / scale
@@ -199,7 +199,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
     def settle(ctl: Control, world: int):
         """End the iteration where it has converged, stands still within rounding, or used up its iterations."""
         record(ctl, world)
-        stalled = ctl.iterations[world] > 0 and ctl.reduction[world] > f64(0.5)
+        stalled = ctl.iterations[world] > 0 and ctl.reduction[world] > f64(0.5) and ctl.lagging[world] == 0
         if ctl.excess[world] <= f64(1.0) or (stalled and ctl.floor_excess[world] <= f64(1.0)):
             ctl.active[world] = 0
         elif ctl.iterations[world] >= ctl.max_iterations:
@@ -240,6 +240,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = magnitude(ctl, world)
         ctl.forcing[world] = ctl.first_forcing
+        ctl.lagging[world] = 0
         if ctl.domain_J[world] <= f64(0.0):
             fail(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
@@ -295,9 +296,11 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
                 good = True
         if ctl.domain_J[world] <= f64(0.0):
             good = False
-        if alpha == f64(0.0):
-            good = True
-        if good:
+        if ctl.lagging[world] != 0 and ctl.iterations[world] == 0 and not norm <= f64(0.5) * old_norm:
+            good = False  # a step must not begin worse than with an operator of its own
+            ctl.searches[world] = LAGGING_SEARCH
+        stands = alpha == f64(0.0)
+        if good or stands:
             ctl.searching[world] = 0
             measure(ctl, world)
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
@@ -306,7 +309,10 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
                 more = ctl.constraint_sums[1, world] - ctl.constraint_sums[0, world]
                 ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
             ctl.phi_magnitude[world] = magnitude(ctl, world)
-            ctl.iterations[world] = ctl.iterations[world] + 1
+            if stands:
+                ctl.lagging[world] = 2
+            else:
+                ctl.iterations[world] = ctl.iterations[world] + 1
             ctl.total_iterations[world] = ctl.total_iterations[world] + 1
             ratio = norm / wp.max(old_norm, f64(1.0e-300))
             ctl.reduction[world] = ratio
@@ -314,16 +320,15 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
             if guard > f64(0.1):
                 eta = wp.max(eta, guard)
-            if ctl.fixed_forcing == 0:
+            if ctl.fixed_forcing == 0 and not stands:
                 ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
             settle(ctl, world)
         else:
             ctl.searches[world] = ctl.searches[world] + 1
             ctl.alpha[world] = f64(0.5) * alpha
-            if ctl.lagging[world] != 0:
+            if ctl.lagging[world] != 0 and ctl.searches[world] > LAGGING_SEARCH:
                 # not the iterate is to blame: stand still, and go on with an operator of its own
-                if ctl.searches[world] > LAGGING_SEARCH:
-                    ctl.alpha[world] = f64(0.0)
+                ctl.alpha[world] = f64(0.0)
             if ctl.searches[world] > MAX_SEARCH:
                 why = FAIL_LINE_SEARCH
                 if ctl.domain_J[world] <= f64(0.0):

@@ -158,8 +158,8 @@ CASES = {
 
 
 SAME_WAY = {"mechanism": {"preconditioner": "deflated", "operator": "elements"}}
-"""Rows of a weld are almost dependent: what an iteration leaves of them at 1e-12 depends on its way there (two-level and
-direct solver of the CPU end 1.6e-8 of the travel apart), so both devices go the same way."""
+"""Rows of a weld are almost dependent: what an iteration leaves of them at 1e-12 depends on its way there (the CPU's
+two-level and direct solvers end 1.6e-8 of the travel apart), so both devices go the same way."""
 
 
 def run(case, device, dtype="float64", steps=100, integrator="backward_euler", tol=None, worlds=1, dt=1e-3):

@@ -58,12 +58,12 @@ def test_a_feature_comes_and_goes_without_trace(feature):
     with_it = cost(feature)
     again = cost()
     assert again[:4] == bare[:4]
-    assert with_it[3] > bare[3] or feature in ("gravity", "rate")
+    # with damping and with constraints no matrix is kept from step to step
+    assert with_it[3] > bare[3] or feature in ("gravity", "rate", "incremental")
     if feature not in ("rate", "second body"):
-        assert with_it[0] > bare[0]
-        # with constraints no matrix is kept from step to step
-        usual = bare[1] - {"count_step"} if feature == "joint" else bare[1]
-        assert with_it[1] > usual or feature in ("incremental", "explicit", "second law")
+        assert with_it[0] > bare[0] or feature == "incremental"
+        usual = bare[1] - {"count_step"} if feature in ("joint", "incremental") else bare[1]
+        assert with_it[1] > usual or feature in ("explicit", "second law")
     assert with_it[4].info()["left_out"] != bare[4].info()["left_out"] or feature in ("probe", "second law")
 
 

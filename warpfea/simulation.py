@@ -220,7 +220,10 @@ class Simulation(Results):
         Raises:
             ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
             ConstraintError: the same, and it is the constraints that can't be satisfied; it names them.
+            ModelError: `count` is not a positive whole number.
         """
+        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+            raise ModelError(f"step({count!r}): the number of steps must be a whole number, at least 1")
         for _ in range(count):
             self.stepper.run()
             report = self.stepper.work.report.numpy()

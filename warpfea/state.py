@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 __all__ = ["ArraySpec", "State"]
 
+MEMORY = ("preconditioner", "operator")
+"""What names of arrays begin with that solvers remember; a state can do without."""
+
 
 @dataclass(frozen=True)
 class ArraySpec:
@@ -119,13 +122,26 @@ class State:
         return {name: array.numpy().copy() for name, array in self._arrays.items()}
 
     def load(self, values: dict[str, np.ndarray]) -> None:
-        """Set all arrays from the host. CheckpointError on a missing name or another shape; nothing is set then."""
-        missing = sorted(set(self._arrays) - set(values))
-        extra = sorted(set(values) - set(self._arrays))
-        if missing or extra:
-            raise CheckpointError(f"state arrays differ: missing {missing}, unknown {extra}")
-        for name, array in self._arrays.items():
-            expected = array.numpy()
+        """Set all arrays from the host. What solvers remember begins anew where `values` are of another solver.
+
+        Raises:
+            CheckpointError: a missing name or another shape; nothing is set then.
+        """
+        own, given = ({name for name in names if not remembered(name)} for names in (self._arrays, values))
+        if own != given:
+            raise CheckpointError(
+                f"state arrays differ: missing {sorted(own - given)}, unknown {sorted(given - own)}; a state goes on "
+                "with the integrator, the ledger and the constraints that it was made with"
+            )
+        host = {name: array.numpy() for name, array in self._arrays.items()}
+        memory = [name for name in host if remembered(name)]
+        if any(name not in values or values[name].shape != host[name].shape for name in memory):
+            values = {name: value for name, value in values.items() if name not in memory}
+            for name in memory:
+                values[name] = np.zeros_like(host[name])
+                values[name][...] = self.specs[name].initial
+        for name in self._arrays:
+            expected = host[name]
             if values[name].shape != expected.shape or values[name].dtype != expected.dtype:
                 raise CheckpointError(
                     f"state array {name!r} is {values[name].dtype}{values[name].shape}, expected "
@@ -133,6 +149,11 @@ class State:
                 )
         for name, array in self._arrays.items():
             array.assign(values[name])
+
+
+def remembered(name: str) -> bool:
+    """Whether an array is a solver's memory."""
+    return name.partition("_")[0] in MEMORY
 
 
 def _words(array: wp.array) -> wp.array:

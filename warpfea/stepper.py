@@ -219,10 +219,10 @@ class Stepper:
     def _report(self) -> None:
         """Undo a failed step, and tell of the step."""
         m, w, launch = self.model, self.work, self.launch
+        launch(self.kernels.failed_now, m.worlds, [w.step, w.newton.active])
         if self.backup is not None:
-            launch(self.kernels.failed_now, m.worlds, [w.step, w.newton.active])
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
-            self.newton.forget(w.newton.active)
+        self.newton.forget(w.newton.active)
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
             self._probe()

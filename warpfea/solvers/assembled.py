@@ -181,15 +181,12 @@ class Assembled:
         return self.work.array(name, (self.model.worlds, self.pattern.entries), self.model.types.mat33)
 
     def assemble(
-        self, u: wp.array, factors: tuple[wp.array, wp.array], active: wp.array, out: wp.array, *, projected: bool,
-        lasting: bool = False,
-    ) -> None:  # fmt: skip
+        self, u: wp.array, factors: tuple[wp.array, wp.array], active: wp.array, out: wp.array, *, projected: bool
+    ) -> None:
         """out = c_M M + (dq/dv) K at u; `factors` are c_M and dq/dv per world.
 
-        `projected`: K without what can make it indefinite at a point; `lasting`: K without the stress of the viscosity.
-        Either is a function of u and the factors alone.
+        `projected`: K without what can make it indefinite at a point, and a function of u and the factors alone.
         """
-        form = 1 if projected else 2 if lasting else 0
         m, w, launch = self.model, self.work, self.launch
         mass_factor, dq_dv = factors
         for first, parts in enumerate(self.runs):
@@ -197,11 +194,11 @@ class Assembled:
                 matrix = self._by_element(self.scratch, 3 * block.slots * (block.slots + 1) // 2, block.count)
                 lines = self._by_element(self.lines, 5 * block.points, block.count)
                 points = (m.worlds, block.points, block.count)
-                args = [block.data, u, w.v, w.history, dq_dv, form, active, lines]
+                args = [block.data, u, w.v, w.history, dq_dv, int(projected), active, lines]
                 launch(elements.prepare_matrix, points, args)
                 if block.key.tying and not projected:
                     launch(elements.prepare_stress, points, [block.data, active, lines])
-                args = [block.data, dq_dv, lines, form, int(k > 0), int(not m.device.is_cuda), active, matrix]
+                args = [block.data, dq_dv, lines, int(projected), int(k > 0), int(not m.device.is_cuda), active, matrix]
                 launch(elements.element_matrix, (m.worlds, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count, matrix]
             args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]

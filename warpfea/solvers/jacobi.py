@@ -25,7 +25,6 @@ Constraints: the multipliers stand still through a step and are changed once, by
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +33,7 @@ import warp as wp
 from ..errors import ModelError
 from ..kernels.jacobi import PAIRS, jacobi_kernels, jacobi_struct
 from ..launch import labelled
+from .checks import is_count, is_number
 from .newton import NewtonLoop, NewtonPCG
 from .twolevel import TwoLevel
 
@@ -92,18 +92,20 @@ class Jacobi:
     penalty: float = 100.0
 
     def __post_init__(self) -> None:
-        if isinstance(self.iterations, bool) or not (self.iterations == int(self.iterations) >= 1):
+        if not (is_count(self.iterations) and self.iterations >= 1):
             raise ModelError(f"Jacobi: iterations = {self.iterations!r} must be a whole number, at least 1")
         if self.acceleration not in ACCELERATIONS:
             names = ", ".join(repr(name) for name in ACCELERATIONS)
             raise ModelError(f"Jacobi: acceleration = {self.acceleration!r} is none of {names}")
-        if self.tol is not None and not (math.isfinite(self.tol) and 0.0 < self.tol < 1.0):
+        if self.tol is not None and not (is_number(self.tol) and 0.0 < self.tol < 1.0):
             raise ModelError(f"Jacobi: tol = {self.tol!r} must lie between 0 and 1")
-        if not (math.isfinite(self.force_tol) and self.force_tol >= 0.0):
+        if not (is_number(self.force_tol) and self.force_tol >= 0.0):
             raise ModelError(f"Jacobi: force_tol = {self.force_tol!r} must be zero or positive, N")
-        if not 0 <= self.max_halvings <= 20:
-            raise ModelError(f"Jacobi: max_halvings = {self.max_halvings!r} must lie between 0 and 20")
-        if not (math.isfinite(self.penalty) and self.penalty > 0.0):
+        if not (is_count(self.max_halvings) and 0 <= self.max_halvings <= 20):
+            raise ModelError(f"Jacobi: max_halvings = {self.max_halvings!r} must be a whole number from 0 to 20")
+        if not isinstance(self.coarse, bool):
+            raise ModelError(f"Jacobi: coarse = {self.coarse!r} must be True or False")
+        if not (is_number(self.penalty) and self.penalty > 0.0):
             raise ModelError(f"Jacobi: penalty = {self.penalty!r} must be positive")
 
     @property

@@ -11,9 +11,10 @@ import warp as wp
 from ..errors import ModelError
 from ..kernels.newton import newton_kernels
 from .alm import ConstraintSolver
+from .checks import is_count, is_number
 from .direct import Direct
 from .pcg import PCG
-from .preconditioner import choose, make
+from .preconditioner import NAMES, choose, make
 from .residual import Residual
 
 if TYPE_CHECKING:
@@ -73,31 +74,35 @@ class NewtonPCG:
     max_outer: int = 100
 
     def __post_init__(self) -> None:
-        if self.tol is not None and not (math.isfinite(self.tol) and 0.0 < self.tol < 1.0):
+        if self.tol is not None and not (is_number(self.tol) and 0.0 < self.tol < 1.0):
             raise ModelError(f"NewtonPCG: tol = {self.tol!r} must lie between 0 and 1")
-        if not (math.isfinite(self.force_tol) and self.force_tol >= 0.0):
+        if not (is_number(self.force_tol) and self.force_tol >= 0.0):
             raise ModelError(f"NewtonPCG: force_tol = {self.force_tol!r} must be zero or positive, N")
         if self.linear not in ("pcg", "direct"):
             raise ModelError(f"NewtonPCG: linear = {self.linear!r} is neither 'pcg' nor 'direct'")
         if self.linear == "direct" and self.preconditioner != "auto":
             raise ModelError(f"NewtonPCG: preconditioner = {self.preconditioner!r} is not for linear = 'direct'")
+        if self.preconditioner not in ("auto", *NAMES):
+            raise ModelError(
+                f"preconditioner {self.preconditioner!r} is unknown; there are auto, two-level, deflated, block-jacobi"
+            )
         if self.preconditioner_dtype not in (None, "float32", "float64"):
             raise ModelError(
                 f"NewtonPCG: preconditioner_dtype = {self.preconditioner_dtype!r} is none of 'float32', 'float64', None"
             )
-        if self.forcing is not None and not (math.isfinite(self.forcing) and 0.0 < self.forcing < 1.0):
+        if self.forcing is not None and not (is_number(self.forcing) and 0.0 < self.forcing < 1.0):
             raise ModelError(f"NewtonPCG: forcing = {self.forcing!r} must lie between 0 and 1")
         if self.operator not in ("auto", "elements", "matrix"):
             raise ModelError(f"NewtonPCG: operator = {self.operator!r} is none of 'auto', 'elements', 'matrix'")
         for name in ("max_newton", "max_pcg", "max_outer"):
-            if not getattr(self, name) >= 1:
-                raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be at least 1")
+            if not (is_count(getattr(self, name)) and getattr(self, name) >= 1):
+                raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be a whole number, at least 1")
         if self.multipliers not in ("newton", "outer"):
             raise ModelError(f"NewtonPCG: multipliers = {self.multipliers!r} is neither 'newton' nor 'outer'")
-        if not (math.isfinite(self.penalty) and self.penalty > 0.0):
+        if not (is_number(self.penalty) and self.penalty > 0.0):
             raise ModelError(f"NewtonPCG: penalty = {self.penalty!r} must be positive")
-        if not 0 <= self.max_halvings <= 20:
-            raise ModelError(f"NewtonPCG: max_halvings = {self.max_halvings!r} must lie between 0 and 20")
+        if not (is_count(self.max_halvings) and 0 <= self.max_halvings <= 20):
+            raise ModelError(f"NewtonPCG: max_halvings = {self.max_halvings!r} must be a whole number from 0 to 20")
 
     def tolerance(self, dtype: str) -> float:
         """The tolerance in one precision."""
