@@ -109,7 +109,6 @@ def gather_kernels(
     name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
     module = kernel_module(f"gather_{name}", max_unroll=SMALL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
-    massive_module = kernel_module(f"massive_product_{name}", max_unroll=SMALL)
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -306,7 +305,7 @@ def gather_kernels(
         if slot % warp == 0:
             rows[0, world, slot / warp] = share
 
-    @wp.kernel(module=massive_module)
+    @wp.kernel(module=module)
     def massive_product(
         topo: Topology,
         contribution: wp.array2d(dtype=vec3),
@@ -427,7 +426,6 @@ def gather_kernels(
     return _types.SimpleNamespace(
         module=module,
         matrix_module=matrix_module,
-        massive_module=massive_module,
         matrix_product=matrix_product,
         massive_product=massive_product,
         gather_force=gather_force,

@@ -73,8 +73,8 @@ class Residual:
         self.con = model.constraints.data if model.constraints else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.massive = all(block.massive for block in model.blocks)
-        # elements with many points per slot cost more than the matrix that they make. One core assembles a matrix in the
-        # time of 8 to 15 products of ANCF elements and of 65 of straight tetrahedra
+        # elements with many points per slot cost more than the matrix that they make. One core assembles a matrix in
+        # the time of 8 to 15 products of ANCF elements and of 65 of straight tetrahedra
         many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
         if not model.device.is_cuda:
             many = assembled and not self.massive
@@ -100,7 +100,6 @@ class Residual:
             assert self.assembled is not None
             out |= {self.gather.matrix_module, self.lag.kernels.module} | self.assembled.modules()
         elif self.massive:
-            out.add(self.gather.massive_module)
             out |= {k.massive_product.module for k in self.block_kernels}
         return out
 
