@@ -28,6 +28,7 @@ MATRIX_SLOTS = 10
 """Slots per element up to which H p from the elements is cheaper than from their matrix, on a GPU."""
 MATRIX_COST = {False: 2.0, True: 0.5}
 """Iterations of Newton's method that the matrix costs, on the CPU and on CUDA."""
+SMALL_SLOTS = 16384
 MANY_POINTS = 8
 """Points of an element from which lanes share them."""
 
@@ -86,10 +87,14 @@ class Residual:
         if self.by_matrix:
             assert self.assembled is not None
             self.matrix = self.assembled.values("operator matrix")
-            # forces of constraints are only as good as the solve; statics goes too far in a step for the last one's
-            # matrix, and the stress of the viscosity is no function of the state that a resumed run has
+            # statics goes too far in a step for the last one's matrix, and the stress of the viscosity is no function of
+            # the state that a resumed run has; forces of constraints are only as good as the solve, and a GPU makes a
+            # small matrix in no time
             damped = any(block.key.damping in ("incremental", "rate") for block in model.blocks)
-            self.keep = 0 if constraints else 2 if viscous and not damped else 1
+            small = model.device.is_cuda and model.slots <= SMALL_SLOTS
+            self.keep = 2 if viscous and not damped else 0 if small else 1
+            if constraints:
+                self.keep = 0
             self.lasting = self.keep == 2
             self.lag = Lag(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
 
