@@ -29,6 +29,7 @@ MATRIX_SLOTS = 10
 MATRIX_COST = {False: 2.0, True: 0.5}
 """Iterations of Newton's method that the matrix costs, on the CPU and on CUDA."""
 SMALL_SLOTS = 16384
+"""Slots up to which a GPU makes a matrix faster than it solves with one."""
 MANY_POINTS = 8
 """Points of an element from which lanes share them."""
 
@@ -87,9 +88,9 @@ class Residual:
         if self.by_matrix:
             assert self.assembled is not None
             self.matrix = self.assembled.values("operator matrix")
-            # statics goes too far in a step for the last one's matrix, and the stress of the viscosity is no function of
-            # the state that a resumed run has; forces of constraints are only as good as the solve, and a GPU makes a
-            # small matrix in no time
+            # statics goes too far in a step for the last one's matrix, and the stress of the viscosity is no function
+            # of the state that a resumed run has; forces of constraints are only as good as the solve, and a GPU makes
+            # a small matrix in no time
             damped = any(block.key.damping in ("incremental", "rate") for block in model.blocks)
             small = model.device.is_cuda and model.slots <= SMALL_SLOTS
             self.keep = 2 if viscous and not damped else 0 if small else 1
