@@ -102,8 +102,8 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
         """Before a solve: whether Newton's method would gain by the matrix of this iterate.
 
         What an iteration gained tells how many are left with the matrix at hand: the last one or, at the start of a
-        step, the first of the last step that began with a kept matrix, whose memory fades. `keep`: 0: each iterate has
-        its own; 1: it may be kept within a step; 2: from step to step.
+        step, the first of the last step that began with a kept matrix, whose memory fades. `keep`: 1: it may be kept
+        within a step; 2: from step to step.
         """
         world = wp.tid()
         if newton.active[world] == 0:
@@ -127,7 +127,7 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         slow = need > gain(newton.reduction[world]) * (fresh + lag.limit)
         late = 3 * k >= newton.max_iterations
-        if keep == 0 or newton.alpha[world] != f64(1.0) or slow or late:
+        if newton.alpha[world] != f64(1.0) or slow or late:
             lag.due[world] = 1
 
     @wp.kernel(module=module)

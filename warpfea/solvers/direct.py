@@ -91,11 +91,11 @@ class Direct:
     def prepare(self, active: wp.array) -> None:
         """Factorise H of the active worlds."""
         residual = self.residual
-        keeps = self.alone and residual.by_matrix
-        worlds = np.flatnonzero((residual.lag.control.build if keeps else active).numpy())
+        own = self.alone and residual.by_matrix
+        worlds = np.flatnonzero((residual.lag.control.build if own and residual.keep else active).numpy())
         if not len(worlds):
             return
-        if keeps:
+        if own:
             value = residual.matrix
         else:
             value = self.value

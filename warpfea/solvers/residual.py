@@ -132,6 +132,9 @@ class Residual:
         """Make the operator's matrix at the iterate, where it is to be made anew."""
         if not self.by_matrix:
             return
+        if self.keep == 0:
+            self.take(active)
+            return
         control = self.lag.control
         args = [control, self.work.newton, self.keep]
         self.launch(self.lag.kernels.judge_matrix, self.model.worlds, args)
