@@ -167,7 +167,7 @@ def test_meta_says_what_the_file_holds(small):
         ({"dtype": "float32"}, "backward_euler", ["precision", "float64", "float32"]),
         ({"worlds": 2}, "backward_euler", ["number of worlds", "1", "2"]),
         ({}, "bdf2", ["integrator", "backward_euler", "bdf2"]),
-        ({"cells": 3}, "backward_euler", ["number of unknown slots"]),
+        ({"cells": 3}, "backward_euler", ["number of slots"]),
         ({"probe": "end"}, "backward_euler", ["probes", "tip", "end"]),
         ({"E": 2e7}, "backward_euler", ["another model"]),
         ({"pull": 201}, "backward_euler", ["another model"]),

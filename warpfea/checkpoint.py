@@ -142,7 +142,7 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Simulation) -> None:
         "dtype": ("precision", sim.model.dtype),
         "worlds": ("number of worlds", sim.model.worlds),
         "integrator": ("integrator", sim.integrator.name),
-        "slots": ("number of unknown slots", sim.model.slots),
+        "slots": ("number of slots", sim.model.slots),
         "probes": ("probes", [probe.name for probe in sim.model.probes]),
         "fingerprint": ("model", sim.model.fingerprint()),
         "gravity": ("gravity", sim.model.loads.gravity_host.tolist()),
@@ -154,7 +154,10 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Simulation) -> None:
             raise CheckpointError(
                 f"{file}: the checkpoint is of another model: mesh, materials, supports or loads differ"
             )
-        raise CheckpointError(f"{file}: {what} of the checkpoint is {meta.get(key)!r}, of the simulation {value!r}")
+        hint = "; the model or its parameters differ" if key == "slots" else ""
+        raise CheckpointError(
+            f"{file}: {what} of the checkpoint is {meta.get(key)!r}, of the simulation {value!r}{hint}"
+        )
 
 
 def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -165,8 +168,10 @@ def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             arrays = {name: data[name] for name in data.files}
         meta = json.loads(arrays.pop("meta").tobytes())
         schema = meta["schema"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise CheckpointError(f"{file}: not a readable checkpoint ({type(error).__name__}: {error})") from error
+    except OSError as error:
+        raise CheckpointError(f"{file}: not a readable checkpoint ({error.strerror or error})") from error
+    except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{file}: not a readable checkpoint, such as wf.Checkpoint writes") from error
     if schema != SCHEMA:
         raise CheckpointError(f"{file}: schema {schema!r} of the checkpoint is unknown, this version reads {SCHEMA}")
     return meta, arrays

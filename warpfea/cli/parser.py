@@ -21,7 +21,7 @@ examples:
   warpfea scenes hook                                   what can be set in a scene
   warpfea info hook                                     what a scene costs, before running it
 
-exit codes: 0 done, 2 bad input or usage, 3 not converged, 4 output failed, 130 interrupted (files are valid)
+exit codes: 0 done, 2 bad input or usage, 3 a step was refused, 4 output failed, 130 interrupted (files are valid)
 """
 
 RUN_EXAMPLES = """\
@@ -267,7 +267,11 @@ def _add_run(commands: Any) -> None:
     out.add_argument("--json", metavar="FILE", help="summary of the run; - for stdout")
     out.add_argument("--checkpoint", metavar="FILE", help="state (.npz), written every --every steps and at the end")
     out.add_argument("--every", type=count, default=100, metavar="N", help="steps between checkpoints (default 100)")
-    out.add_argument("--resume", metavar="FILE", help="go on from a checkpoint, with its dt, integrator and precision")
+    out.add_argument(
+        "--resume",
+        metavar="FILE",
+        help="go on from a checkpoint, with its integrator and precision, and without --dt its dt",
+    )
     _add_general(to)
     to.set_defaults(command=_call("run", "run"))
 
