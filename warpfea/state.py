@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ArraySpec", "State"]
 
-MEMORY = ("preconditioner", "operator")
+MEMORY = ("preconditioner", "operator", "guess")
 """What names of arrays begin with that solvers remember; a state can do without."""
 
 

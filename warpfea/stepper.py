@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from .errors import ModelError
+from .guess import Guess
 from .integrators import Integrator
 from .kernels.step import LEDGER, LEDGER_ROWS, REPORT, step_kernels
 from .launch import Launcher, labelled
@@ -75,6 +76,9 @@ class Stepper:
             model, self.work, self.launch, solver, inertia=not integrator.static, constraint_tol=constraint_tol
         )
         self.newton.register(state)
+        self.guess: Guess | None = None
+        if not integrator.static:
+            self.guess = Guess(model, self.work, self.launch, self.newton.residual.reduce, state)
         self.dim = (model.worlds, model.slots)
         self.running = self.work.any_flag[2:3]
         self._bind()
@@ -158,6 +162,8 @@ class Stepper:
         out |= {kernel.module for kernel in m.loads.used_kernels()}
         if self.backup is not None:
             out.add(state_kernels().module)
+        if self.guess:
+            out.add(self.guess.kernels.module)
         if not self.integrator.static:
             out |= {b.kernels.viscous_force.module for b in m.blocks if b.key.damping == "explicit"}
             out |= {b.kernels.strain_history.module for b in m.blocks if b.key.damping == "incremental"}
@@ -245,6 +251,8 @@ class Stepper:
             self.v_before,
         ]
         launch(self.kernels.predict, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
+        if self.guess:
+            self.guess.begin()
         self._loads(running)
         self._damping(running)
         constraints = self.newton.constraints
@@ -263,6 +271,8 @@ class Stepper:
             self.backup.copy_rows(launch, w.step.first_refusal, state)
         if self.ledger:
             self._book()
+        if self.guess:
+            self.guess.commit()
         args = [w.step, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
         launch(self.kernels.commit, self.dim, args)
         if self.newton.constraints:

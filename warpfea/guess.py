@@ -1,0 +1,51 @@
+"""The first iterate of a step, see kernels/guess.py."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from .kernels.guess import GUESS_ROWS, guess_kernels, guess_struct
+
+if TYPE_CHECKING:
+    from .launch import Launcher
+    from .model import Model
+    from .solvers.residual import Reducer
+    from .state import State
+    from .workspace import Workspace
+
+__all__ = ["Guess"]
+
+
+class Guess:
+    """Extrapolation of velocities, of the order that served the last step best; its past is part of the state."""
+
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State) -> None:
+        self.model, self.work, self.launch, self.reduce, self.state = model, work, launch, reduce, state
+        self.kernels = guess_kernels(model.dtype)
+        self.dim = (model.worlds, model.slots)
+        self.control: Any = guess_struct()()
+        for name in ("order", "count"):
+            setattr(self.control, name, work.array(f"guess {name}", (model.worlds,), wp.int32))
+        self.control.sums = work.array("guess sums", (GUESS_ROWS, model.worlds), wp.float64)
+        self.control.kept = state.register("guess", wp.float64, (4,))
+        self.past = tuple(
+            state.register(f"guess_{name}", model.types.vec3, (model.slots,)) for name in ("before", "first")
+        )
+
+    def begin(self) -> None:
+        """Put the iterate into work.v, where predict has put v_n."""
+        m, w, step = self.model, self.work, self.work.step
+        self.launch(self.kernels.begin, m.worlds, [self.control, step])
+        args = [self.control, step, m.topology.free, self.state.velocity, *self.past, w.v]
+        self.launch(self.kernels.extrapolate, self.dim, args)
+
+    def commit(self) -> None:
+        """The attempt was accepted, and is not yet the state."""
+        m, w, step = self.model, self.work, self.work.step
+        args = [self.control, step, m.topology.free, m.is_position, w.diagonal, w.v, self.state.velocity, *self.past]
+        self.launch(self.kernels.compare, self.dim, [*args, w.rows])
+        self.reduce(w.rows, GUESS_ROWS, step.accepted, self.control.sums)
+        self.launch(self.kernels.shift, self.dim, [step, self.state.velocity, *self.past])
+        self.launch(self.kernels.learn, m.worlds, [self.control, step])
