@@ -9,12 +9,17 @@ import types as _types
 
 import warp as wp
 
+from .newton import control_struct
 from .step import step_struct
 from .types import kernel_module, precision
 
 __all__ = ["GUESS_ROWS", "guess_kernels", "guess_struct"]
 
-GUESS_ROWS = 3
+GUESS_ROWS = 4
+BETTER = 0.05
+"""Share of the squared error that a higher order must come below."""
+ROUNDINGS = 1.0e3
+"""Errors of so many roundings of the velocity are none."""
 
 
 @functools.cache
@@ -26,7 +31,7 @@ def guess_struct():
         order: wp.array(dtype=wp.int32)  # to begin the next step of the same size with
         count: wp.array(dtype=wp.int32)  # velocities that are known of steps of that size, at most 2
         kept: wp.array2d(dtype=wp.float64)  # of the state: order, count, size of the step, its end
-        sums: wp.array2d(dtype=wp.float64)  # squared errors that orders 0, 1, 2 would have had
+        sums: wp.array2d(dtype=wp.float64)  # squared errors that orders 0, 1, 2 would have had; the velocity's square
 
     return GuessControl
 
@@ -37,7 +42,8 @@ def guess_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
-    Guess, Step = guess_struct(), step_struct()
+    Guess, Step, Newton = guess_struct(), step_struct(), control_struct()
+    NOISE = (ROUNDINGS * {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]) ** 2
     module = kernel_module(f"guess_{dtype}")
 
     @wp.func
@@ -47,16 +53,18 @@ def guess_kernels(dtype: str) -> _types.SimpleNamespace:
         return T(2.0) * v - before
 
     @wp.kernel(module=module)
-    def begin(guess: Guess, step: Step):
+    def begin(guess: Guess, step: Step, newton: Newton):
         """What of the past counts for this attempt: only steps of its size, up to its start."""
         world = wp.tid()
         guess.order[world] = 0
         guess.count[world] = 0
+        newton.guessed[world] = 0
         if step.running[world] == 0:
             return
         if guess.kept[world, 2] == step.h[world] and guess.kept[world, 3] == step.time[world]:
             guess.order[world] = int(guess.kept[world, 0])
             guess.count[world] = int(guess.kept[world, 1])
+        newton.guessed[world] = wp.min(guess.order[world], 1)
 
     @wp.kernel(module=module)
     def extrapolate(
@@ -107,6 +115,7 @@ def guess_kernels(dtype: str) -> _types.SimpleNamespace:
         for order in range(1, 3):
             e = w - continued(order, a, before[world, slot], first[world, slot])
             rows[order, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
+        rows[3, world, slot] = f64(wp.dot(D, wp.cw_mul(w, w)))
 
     @wp.kernel(module=module)
     def shift(
@@ -129,11 +138,13 @@ def guess_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         count = guess.count[world]
         best = int(0)  # noqa: RUF046 - a variable of the loop
-        least = guess.sums[0, world]
+        least = f64(BETTER) * guess.sums[0, world]
+        if guess.sums[0, world] <= f64(NOISE) * guess.sums[3, world]:
+            least = f64(0.0)  # an extrapolated rounding would grow from step to step
         for order in range(1, 3):
             if order <= count and guess.sums[order, world] < least:
                 best = order
-                least = guess.sums[order, world]
+                least = f64(BETTER) * guess.sums[order, world]
         guess.kept[world, 0] = f64(best)
         guess.kept[world, 1] = f64(wp.min(count + 1, 2))
         guess.kept[world, 2] = step.h[world]

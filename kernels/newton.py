@@ -37,6 +37,7 @@ NOISE = 100.0  # Phi is blind below this many roundings of its parts
 FLOOR = 16.0
 MAX_SEARCH = 20
 LAGGING_SEARCH = 2
+GUESSED = 1.0e-3
 
 
 @functools.cache
@@ -65,6 +66,7 @@ def control_struct():
         quiet: wp.array2d(dtype=wp.int32)  # [world, component] converged
         reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
         forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
+        guessed: wp.array(dtype=wp.int32)  # the first iterate is extrapolated
         lagging: wp.array(dtype=wp.int32)  # the operator is of an earlier iterate; 2: and led nowhere
         min_J: wp.array(dtype=wp.float64)
         domain_J: wp.array(dtype=wp.float64)  # smallest J of the laws that need J > 0
@@ -156,6 +158,8 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             if force > f64(0.0):
                 # the force's tolerance in this norm, as they compare at this iterate
                 accept = wp.max(accept, norm * (ctl.force_tol / force))
+            if ctl.guessed[world] != 0:
+                accept = f64(GUESSED) * accept  # what is left would add up over steps that none solves for
             loud = norm > accept
             if wp.static(constrained):
                 if ctl.violation[world, c] > ctl.constraint_tol:
@@ -260,6 +264,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         ctl.alpha[world] = f64(1.0)
         ctl.searches[world] = 0
         ctl.searching[world] = 1
+        ctl.guessed[world] = 0
         if wp.static(constrained):
             ctl.stepped[world] = 0
             if ctl.classical == 0:

@@ -37,7 +37,7 @@ class Guess:
     def begin(self) -> None:
         """Put the iterate into work.v, where predict has put v_n."""
         m, w, step = self.model, self.work, self.work.step
-        self.launch(self.kernels.begin, m.worlds, [self.control, step])
+        self.launch(self.kernels.begin, m.worlds, [self.control, step, w.newton])
         args = [self.control, step, m.topology.free, self.state.velocity, *self.past, w.v]
         self.launch(self.kernels.extrapolate, self.dim, args)
 
