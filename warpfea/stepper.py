@@ -77,7 +77,8 @@ class Stepper:
         )
         self.newton.register(state)
         self.guess: Guess | None = None
-        if not integrator.static and model.dtype == "float64":  # single roundings would grow from step to step
+        # single roundings would grow from step to step, and so would what Jacobi's steps leave
+        if not integrator.static and model.dtype == "float64" and isinstance(solver, NewtonPCG):
             self.guess = Guess(model, self.work, self.launch, self.newton.residual.reduce, state)
         self.dim = (model.worlds, model.slots)
         self.running = self.work.any_flag[2:3]
