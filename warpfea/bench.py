@@ -8,6 +8,7 @@ mesh and steps with a tolerance 100 times tighter in float64, over the largest t
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import math
 import os
@@ -287,8 +288,12 @@ def _cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
+@functools.cache
 def _commit() -> str | None:
-    """Commit of the checkout that this runs from, with + if files differ; None without git or outside a checkout."""
+    """Commit of the checkout that this runs from, with + if files differ; None without git or outside a checkout.
+
+    Asked once, before results are written into the checkout.
+    """
     root = pathlib.Path(__file__).resolve().parent.parent
 
     def ask(*words: str) -> str:
