@@ -280,11 +280,15 @@ def gather_kernels(
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
+        massive: int,
         warp: int,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
+        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots.
+
+        `massive`: the contributions hold mass and factors.
+        """
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -294,44 +298,12 @@ def gather_kernels(
             for k in range(topo.start[slot], topo.start[slot + 1]):
                 f += contribution[world, topo.entry[k]]
             dq = T(dq_dv[world])
-            a = vec3()
-            for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-                a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
-            h = T(mass_factor[world]) * a + dq * f
-            h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
-            out[world, slot] = h
-            share = f64(wp.dot(h, p_in[world, slot]))
-        share = row_sum(share, warp)
-        if slot % warp == 0:
-            rows[0, world, slot / warp] = share
-
-    @wp.kernel(module=module)
-    def massive_product(
-        topo: Topology,
-        contribution: wp.array2d(dtype=vec3),
-        pushed_start: wp.array(dtype=wp.int32),
-        pushed_entry: wp.array(dtype=wp.int32),
-        pushed_contribution: wp.array2d(dtype=vec3),
-        p_in: wp.array2d(dtype=vec3),
-        mass_factor: wp.array(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        con: Constraints,
-        mul: Multipliers,
-        warp: int,
-        out: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
-    ):
-        """The same from contributions that hold mass and factors."""
-        world, slot = wp.tid()
-        if active[world] == 0:
-            return
-        share = f64(0.0)
-        if slot < out.shape[1]:
-            h = vec3()
-            for k in range(topo.start[slot], topo.start[slot + 1]):
-                h += contribution[world, topo.entry[k]]
-            dq = T(dq_dv[world])
+            h = f
+            if massive == 0:
+                a = vec3()
+                for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+                    a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
+                h = T(mass_factor[world]) * a + dq * f
             h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
             out[world, slot] = h
             share = f64(wp.dot(h, p_in[world, slot]))
@@ -427,7 +399,6 @@ def gather_kernels(
         module=module,
         matrix_module=matrix_module,
         matrix_product=matrix_product,
-        massive_product=massive_product,
         gather_force=gather_force,
         residual=residual,
         product=product,

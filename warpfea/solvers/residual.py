@@ -250,8 +250,8 @@ class Residual:
             launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:
             self.curvature_rows = w.warp_rows
-            kernel = self.gather.massive_product if self.massive else self.gather.product
-            launch(kernel, padded, [m.topology, w.contribution, *rest, out, w.warp_rows])
+            args = [m.topology, w.contribution, *rest[:-1], int(self.massive), w.warp, out, w.warp_rows]
+            launch(self.gather.product, padded, args)
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""
