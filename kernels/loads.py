@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from .element import block_struct
+from .points import block_struct
 from .types import kernel_module, precision
 
 __all__ = ["body_force_kernel", "law_function_kernel", "law_struct", "load_kernels"]

@@ -32,7 +32,7 @@ SPOKES = tuple(
 """e(v, b)."""
 
 
-def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _types.SimpleNamespace) -> wp.Kernel:
+def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, fn: _types.SimpleNamespace) -> wp.Kernel:
     """The kernel `massive_product` in this form.
 
     Args:
@@ -40,11 +40,11 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, f: _t
         module: for the kernel; its short loops must be unrolled, that slots are registers.
         points: 4, one for each vertex, or 5, the centroid before them.
         rate: increments need the velocity gradient.
-        f: of the element kernels, `Block`, `coefficients` and `point_increment`.
+        fn: functions of points.py.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
-    Block, coefficients, point_increment = f.Block, f.coefficients, f.point_increment
+    Block, coefficients, point_increment = fn.Block, fn.coefficients, fn.point_increment
     Local = wp.types.matrix(shape=(10, 3), dtype=T)
     FIRST = points - 4
 
