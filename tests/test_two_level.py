@@ -265,7 +265,8 @@ def test_it_is_symmetric_and_positive_through_all_levels(name, size, options):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_functions_that_depend_on_each_other_are_dropped(dtype):
     """A tile inverse of a singular matrix: positive semi-definite, exact on what is left, and finite."""
-    from warpfea.kernels.levels import LANES, TILE, level_kernels
+    from warpfea.kernels.levels import LANES, TILE
+    from warpfea.kernels.levels_build import build_kernels
 
     rng = np.random.default_rng(0)
     half = rng.standard_normal((TILE, TILE - 5))
@@ -277,7 +278,7 @@ def test_functions_that_depend_on_each_other_are_dropped(dtype):
     column = wp.zeros((1, 1, TILE), dtype=T, device="cpu")
     active = wp.ones(1, dtype=wp.int32, device="cpu")
     args = [1, 1, 0, active, diagonal, column, matrix]
-    wp.launch(level_kernels(dtype).invert_tiles, dim=1, inputs=args, device="cpu", block_dim=LANES)
+    wp.launch(build_kernels(dtype).invert_tiles, dim=1, inputs=args, device="cpu", block_dim=LANES)
     B = matrix.numpy()[0, 0].astype(float)
     kept = np.diag(B) != 0.0
     assert 0 < np.sum(~kept) <= 6
@@ -290,7 +291,8 @@ def test_functions_that_depend_on_each_other_are_dropped(dtype):
 
 
 def test_a_negative_row_gets_its_diagonal():
-    from warpfea.kernels.levels import LANES, TILE, level_kernels
+    from warpfea.kernels.levels import LANES, TILE
+    from warpfea.kernels.levels_build import build_kernels
 
     A = np.eye(TILE)
     A[3, 3] = -2.0
@@ -299,7 +301,7 @@ def test_a_negative_row_gets_its_diagonal():
     column = wp.zeros((1, 1, TILE), dtype=wp.float64, device="cpu")
     active = wp.ones(1, dtype=wp.int32, device="cpu")
     args = [1, 1, 1, active, diagonal, column, matrix]
-    wp.launch(level_kernels("float64").invert_tiles, dim=1, inputs=args, device="cpu", block_dim=LANES)
+    wp.launch(build_kernels("float64").invert_tiles, dim=1, inputs=args, device="cpu", block_dim=LANES)
     B = matrix.numpy()[0, 0]
     expected = np.ones(TILE)
     expected[3] = 0.5

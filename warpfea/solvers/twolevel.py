@@ -21,6 +21,7 @@ import warp as wp
 
 from ..kernels.blocks import block_kernels
 from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels
+from ..kernels.levels_build import build_kernels
 from ..kernels.pcg import pcg_kernels
 from ..kernels.types import precision
 from ..launch import labelled
@@ -98,6 +99,7 @@ class TwoLevel:
         assert residual.assembled is not None
         self.assembled = residual.assembled
         self.kernels = level_kernels(model.dtype, self.storage)
+        self.making = build_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
         self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
         self.newton = residual.newton
@@ -146,7 +148,7 @@ class TwoLevel:
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
         k = self.kernels
-        return {k.module, k.build_module, self.lag.kernels.module, self.blocks.module} | self.assembled.modules()
+        return {k.module, self.making.module, self.lag.kernels.module, self.blocks.module} | self.assembled.modules()
 
     # the seam
 
@@ -288,7 +290,7 @@ class TwoLevel:
             launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array, *, keep: bool) -> None:
-        B, k = self.model.worlds, self.kernels
+        B, k = self.model.worlds, self.making
         args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
         self.launch(k.fill_tiles, (B, level.tiles, TILE_SLOTS), args)
         self._gauss_jordan(level.tiles, arrays.matrix, arrays, flags, keep=keep)
@@ -298,11 +300,11 @@ class TwoLevel:
 
     def _gauss_jordan(self, tiles: int, matrix: wp.array, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
         args = [self.lanes, tiles, int(keep), flags, arrays.diagonal, arrays.column, matrix]
-        self.launch(self.kernels.invert_tiles, self.model.worlds * tiles * self.lanes, args, block_dim=LANES)
+        self.launch(self.making.invert_tiles, self.model.worlds * tiles * self.lanes, args, block_dim=LANES)
 
     def _invert_dense(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array) -> None:
         """Gauss-Jordan by blocks of a tile's size."""
-        B, N, k, launch = self.model.worlds, arrays.size, self.kernels, self.launch
+        B, N, k, launch = self.model.worlds, arrays.size, self.making, self.launch
         keep = level is self.levels[0]
         args = [level.pattern.data, value, level.slots, flags, arrays.scale, arrays.matrix]
         launch(k.fill_dense, (B, N // 3), args)
