@@ -8,7 +8,8 @@ import types as _types
 
 import warp as wp
 
-from .gather import inverse_function, pattern_struct, topology_struct
+from .gather import inverse_function
+from .structs import pattern_struct, topology_struct
 from .types import SMALL, kernel_module, precision
 
 __all__ = ["assembly_kernels", "block_kernels", "coupling_struct"]

@@ -7,8 +7,8 @@ import warp as wp
 
 from .blocks import coupling_struct
 from .constraints import DISTANCE, TURN, constraint_struct, multiplier_struct
-from .gather import pattern_struct, topology_struct
 from .lanes import lane_functions
+from .structs import pattern_struct, topology_struct
 from .types import kernel_module, precision
 
 __all__ = ["direct_kernels", "followed_struct"]

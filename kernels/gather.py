@@ -10,9 +10,14 @@ import warp as wp
 
 from .constraints import constraint_struct, multiplier_struct
 from .lanes import lane_functions
+from .structs import additions_struct, balance_struct, pattern_struct, topology_struct
 from .types import SMALL, kernel_module, precision
 
-__all__ = ["RESIDUAL_ROWS", "gather_kernels", "inverse_function", "pattern_struct", "topology_struct"]
+__all__ = [
+    "RESIDUAL_ROWS",
+    "gather_kernels",
+    "inverse_function",
+]
 
 RESIDUAL_ROWS = 10
 """Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
@@ -22,37 +27,6 @@ squared norm of the rounding of the positions; |g|^2."""
 
 REACTION = wp.constant(wp.float64(1.0e-6))
 """Share of the squared reactions in the squared scale of the residual."""
-
-
-@functools.cache
-def pattern_struct():
-    """Rows of a matrix of 3x3 blocks."""
-
-    @wp.struct
-    class Pattern:
-        start: wp.array(dtype=wp.int32)  # [slot + 1]
-        column: wp.array(dtype=wp.int32)  # [entry] slot
-        upper: wp.array(dtype=wp.vec4i)  # entry, its mirror, row, column; of the diagonal and above
-
-    return Pattern
-
-
-@functools.cache
-def topology_struct(dtype: str):
-    """Who contributes to a slot, the scalar mass matrix in CSR, and which components are free."""
-    p = precision(dtype)
-    T, vec3 = p.T, p.vec3
-
-    @wp.struct
-    class Topology:
-        start: wp.array(dtype=wp.int32)  # [slot + 1]
-        entry: wp.array(dtype=wp.int32)  # indices into the contributions
-        mass_start: wp.array(dtype=wp.int32)  # [slot + 1]
-        mass_column: wp.array(dtype=wp.int32)
-        mass_value: wp.array(dtype=T)  # kg
-        free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
-
-    return Topology
 
 
 @functools.cache
@@ -101,6 +75,7 @@ def gather_kernels(
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
+    Balance, Additions = balance_struct(dtype), additions_struct(dtype)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     f64 = wp.float64
     Pattern = pattern_struct()
@@ -163,25 +138,10 @@ def gather_kernels(
     def residual(
         topo: Topology,
         contribution: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        v_tilde: wp.array2d(dtype=vec3),
-        dead: wp.array2d(dtype=vec3),
-        dead_magnitude: wp.array2d(dtype=vec3),
-        pushed: wp.array2d(dtype=vec3),
-        pushed_held: wp.array2d(dtype=vec3),
-        direction: wp.array2d(dtype=vec3),
-        diagonal: wp.array2d(dtype=vec3),
-        u: wp.array2d(dtype=vec3),
-        mass_factor: wp.array(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
+        balance: Balance,
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
-        inertia: wp.array2d(dtype=vec3),
-        internal: wp.array2d(dtype=vec3),
-        g: wp.array2d(dtype=vec3),
-        gradient: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
     ):
         """Eq. (17): g = M (v - v~) c_M + f_int - f_dead - f_pushed + J^T lambda, and the rows of `RESIDUAL_ROWS`.
 
@@ -196,14 +156,14 @@ def gather_kernels(
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             j = topo.mass_column[k]
-            a += topo.mass_value[k] * (v[world, j] - v_tilde[world, j])
-        a = T(mass_factor[world]) * a
-        load = dead[world, slot]
-        magnitude = dead_magnitude[world, slot]
+            a += topo.mass_value[k] * (balance.v[world, j] - balance.v_tilde[world, j])
+        a = T(balance.mass_factor[world]) * a
+        load = balance.dead[world, slot]
+        magnitude = balance.dead_magnitude[world, slot]
         held = load
         if wp.static(nonpotential):
-            new = pushed[world, slot]
-            held = load + pushed_held[world, slot]
+            new = balance.pushed[world, slot]
+            held = load + balance.pushed_held[world, slot]
             load = load + new
             for k in range(3):
                 magnitude[k] = magnitude[k] + wp.abs(new[k])
@@ -212,41 +172,41 @@ def gather_kernels(
         if wp.static(constrained):
             tie = constraint_forces(con, mul, world, slot)
             residual_force += vec3(tie[0])
-            gradient[world, slot] = residual_force + vec3(tie[1])
+            balance.gradient[world, slot] = residual_force + vec3(tie[1])
             descent += vec3(tie[2])
             for k in range(3):
                 magnitude[k] = magnitude[k] + T(wp.abs(tie[0][k]))
-        inertia[world, slot] = a
-        internal[world, slot] = f
-        g[world, slot] = residual_force
+        balance.inertia[world, slot] = a
+        balance.internal[world, slot] = f
+        balance.g[world, slot] = residual_force
         free = topo.free[slot]
-        D = diagonal[world, slot]
-        vs = v[world, slot]
-        kinetic = T(0.5) * wp.dot(vs - v_tilde[world, slot], a)
+        D = balance.diagonal[world, slot]
+        vs = balance.v[world, slot]
+        kinetic = T(0.5) * wp.dot(vs - balance.v_tilde[world, slot], a)
         work = wp.dot(held, vs)
-        rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
+        balance.rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
         # a held, stressed body without loads has no other force than its reactions: a small part of them is its scale
         reaction = f - wp.cw_mul(f, free)
-        rows[1, world, slot] = weighted(wp.cw_mul(f, free), D) + REACTION * weighted(reaction, D)
-        rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
-        rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
-        rows[4, world, slot] = f64(kinetic - work)
-        rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
-        rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), direction[world, slot]))
-        rows[7, world, slot] = f64(0.0)
+        balance.rows[1, world, slot] = weighted(wp.cw_mul(f, free), D) + REACTION * weighted(reaction, D)
+        balance.rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
+        balance.rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
+        balance.rows[4, world, slot] = f64(kinetic - work)
+        balance.rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
+        balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
+        balance.rows[7, world, slot] = f64(0.0)
         if wp.static(nonpotential):
-            rows[7, world, slot] = f64(wp.dot(pushed_held[world, slot] - pushed[world, slot], vs))
-        rows[8, world, slot] = spread(u[world, slot], free, D, dq_dv[world])
+            balance.rows[7, world, slot] = f64(
+                wp.dot(balance.pushed_held[world, slot] - balance.pushed[world, slot], vs)
+            )
+        balance.rows[8, world, slot] = spread(balance.u[world, slot], free, D, balance.dq_dv[world])
         plain = wp.cw_mul(residual_force, free)
-        rows[9, world, slot] = f64(wp.dot(plain, plain))
+        balance.rows[9, world, slot] = f64(wp.dot(plain, plain))
 
     @wp.func
     def finish(
         topo: Topology,
         h: vec3,
-        pushed_start: wp.array(dtype=wp.int32),
-        pushed_entry: wp.array(dtype=wp.int32),
-        pushed_contribution: wp.array2d(dtype=vec3),
+        more: Additions,
         dq: T,
         con: Constraints,
         mul: Multipliers,
@@ -257,8 +217,8 @@ def gather_kernels(
         out = h
         if wp.static(pressure):
             f = vec3()
-            for k in range(pushed_start[slot], pushed_start[slot + 1]):
-                f += pushed_contribution[world, pushed_entry[k]]
+            for k in range(more.start[slot], more.start[slot + 1]):
+                f += more.contribution[world, more.entry[k]]
             out -= dq * f
         if wp.static(constrained):
             tie = wp.vec3d()
@@ -271,17 +231,12 @@ def gather_kernels(
     def product(
         topo: Topology,
         contribution: wp.array2d(dtype=vec3),
-        pushed_start: wp.array(dtype=wp.int32),
-        pushed_entry: wp.array(dtype=wp.int32),
-        pushed_contribution: wp.array2d(dtype=vec3),
+        more: Additions,
         p_in: wp.array2d(dtype=vec3),
-        mass_factor: wp.array(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
         massive: int,
-        warp: int,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
@@ -297,19 +252,19 @@ def gather_kernels(
             f = vec3()
             for k in range(topo.start[slot], topo.start[slot + 1]):
                 f += contribution[world, topo.entry[k]]
-            dq = T(dq_dv[world])
+            dq = T(more.dq_dv[world])
             h = f
             if massive == 0:
                 a = vec3()
                 for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
                     a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
-                h = T(mass_factor[world]) * a + dq * f
-            h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
+                h = T(more.mass_factor[world]) * a + dq * f
+            h = finish(topo, h, more, dq, con, mul, world, slot)
             out[world, slot] = h
             share = f64(wp.dot(h, p_in[world, slot]))
-        share = row_sum(share, warp)
-        if slot % warp == 0:
-            rows[0, world, slot / warp] = share
+        share = row_sum(share, more.warp)
+        if slot % more.warp == 0:
+            rows[0, world, slot / more.warp] = share
 
     @wp.kernel(module=matrix_module)
     def matrix_product(
@@ -317,16 +272,11 @@ def gather_kernels(
         pattern: Pattern,
         value: wp.array2d(dtype=mat33),
         lanes: int,
-        pushed_start: wp.array(dtype=wp.int32),
-        pushed_entry: wp.array(dtype=wp.int32),
-        pushed_contribution: wp.array2d(dtype=vec3),
+        more: Additions,
         p_in: wp.array2d(dtype=vec3),
-        mass_factor: wp.array(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
-        warp: int,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
@@ -343,13 +293,13 @@ def gather_kernels(
         h = lane_sum(h, lanes)
         share = f64(0.0)
         if lane == 0 and slot < out.shape[1]:
-            dq = T(dq_dv[world])
-            h = finish(topo, h, pushed_start, pushed_entry, pushed_contribution, dq, con, mul, world, slot)
+            dq = T(more.dq_dv[world])
+            h = finish(topo, h, more, dq, con, mul, world, slot)
             out[world, slot] = h
             share = f64(wp.dot(h, p_in[world, slot]))
-        share = row_sum(share, warp)
-        if index % warp == 0:
-            rows[0, world, index / warp] = share
+        share = row_sum(share, more.warp)
+        if index % more.warp == 0:
+            rows[0, world, index / more.warp] = share
 
     @wp.kernel(module=module)
     def gather_blocks(

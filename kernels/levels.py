@@ -9,8 +9,8 @@ import types as _types
 
 import warp as wp
 
-from .gather import pattern_struct
 from .lanes import lane_functions
+from .structs import pattern_struct
 from .types import SMALL, kernel_module, precision
 
 __all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]

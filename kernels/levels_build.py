@@ -8,9 +8,9 @@ import types as _types
 
 import warp as wp
 
-from .gather import pattern_struct
 from .lanes import lane_functions
 from .levels import TILE, level_struct
+from .structs import pattern_struct
 from .types import SMALL, kernel_module, precision
 
 __all__ = ["build_kernels"]

@@ -11,6 +11,7 @@ import warp as wp
 
 from .newton import control_struct
 from .pcg import pcg_struct
+from .structs import balance_struct, topology_struct
 from .types import kernel_module, precision
 
 __all__ = ["LEDGER", "LEDGER_ROWS", "REPORT", "STATUS", "step_kernels", "step_struct"]
@@ -106,6 +107,7 @@ def step_kernels(
     f64 = wp.float64
     Step = step_struct()
     Newton = control_struct()
+    Topology, Balance = topology_struct(dtype), balance_struct(dtype)
     PCG = pcg_struct()
     tied = "_constrained" if constrained else ""
     module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}_{nonpotential}{tied}")
@@ -282,21 +284,11 @@ def step_kernels(
     @wp.kernel(module=module)
     def ledger_rows(
         step: Step,
-        mass_start: wp.array(dtype=wp.int32),
-        mass_column: wp.array(dtype=wp.int32),
-        mass_value: wp.array(dtype=T),
-        free: wp.array(dtype=vec3),
+        topo: Topology,
+        balance: Balance,
         lumped: wp.array(dtype=T),
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
         u_n: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3),
-        inertia: wp.array2d(dtype=vec3),
-        internal: wp.array2d(dtype=vec3),
-        dead: wp.array2d(dtype=vec3),
-        pushed: wp.array2d(dtype=vec3),
-        g: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
     ):
         """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq,
         pushed.dq, inertia.dq, gravity.u."""
@@ -304,27 +296,27 @@ def step_kernels(
         if step.accepted[world] == 0:
             return
         Mv = vec3()
-        for k in range(mass_start[slot], mass_start[slot + 1]):
-            Mv += mass_value[k] * v[world, mass_column[k]]
-        dq = u[world, slot] - u_n[world, slot]
-        a = inertia[world, slot]
-        dv = v[world, slot] - v_n[world, slot]
-        f = free[slot]
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            Mv += topo.mass_value[k] * balance.v[world, topo.mass_column[k]]
+        dq = balance.u[world, slot] - u_n[world, slot]
+        a = balance.inertia[world, slot]
+        dv = balance.v[world, slot] - v_n[world, slot]
+        f = topo.free[slot]
         held = vec3(T(1.0) - f[0], T(1.0) - f[1], T(1.0) - f[2])
         weight = lumped[slot] * vec3(step.gravity[world])
-        loads = dead[world, slot]
-        rows[0, world, slot] = f64(0.5) * step.dq_dv[world] * f64(wp.dot(dv, a))
-        rows[1, world, slot] = f64(wp.dot(internal[world, slot], dq))
-        rows[2, world, slot] = f64(wp.dot(loads, dq))
-        rows[3, world, slot] = f64(wp.dot(weight, dq))
-        rows[4, world, slot] = f64(wp.dot(wp.cw_mul(g[world, slot], held), dq))
-        rows[5, world, slot] = f64(0.5) * f64(wp.dot(v[world, slot], Mv))
-        rows[6, world, slot] = f64(wp.dot(wp.cw_mul(g[world, slot], f), dq))
-        rows[7, world, slot] = f64(0.0)
+        loads = balance.dead[world, slot]
+        balance.rows[0, world, slot] = f64(0.5) * step.dq_dv[world] * f64(wp.dot(dv, a))
+        balance.rows[1, world, slot] = f64(wp.dot(balance.internal[world, slot], dq))
+        balance.rows[2, world, slot] = f64(wp.dot(loads, dq))
+        balance.rows[3, world, slot] = f64(wp.dot(weight, dq))
+        balance.rows[4, world, slot] = f64(wp.dot(wp.cw_mul(balance.g[world, slot], held), dq))
+        balance.rows[5, world, slot] = f64(0.5) * f64(wp.dot(balance.v[world, slot], Mv))
+        balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(balance.g[world, slot], f), dq))
+        balance.rows[7, world, slot] = f64(0.0)
         if wp.static(nonpotential):
-            rows[7, world, slot] = f64(wp.dot(pushed[world, slot], dq))
-        rows[8, world, slot] = f64(wp.dot(a, dq))
-        rows[9, world, slot] = f64(wp.dot(weight, u[world, slot]))
+            balance.rows[7, world, slot] = f64(wp.dot(balance.pushed[world, slot], dq))
+        balance.rows[8, world, slot] = f64(wp.dot(a, dq))
+        balance.rows[9, world, slot] = f64(wp.dot(weight, balance.u[world, slot]))
 
     @wp.kernel(module=module)
     def ledger_update(

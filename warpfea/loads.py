@@ -13,8 +13,9 @@ from . import elements as families
 from .elements import Rule
 from .errors import ModelError
 from .kernels.follower import follower_struct, moment_kernels, pressure_kernels
-from .kernels.gather import gather_kernels, topology_struct
+from .kernels.gather import gather_kernels
 from .kernels.loads import body_force_kernel, law_function_kernel, law_struct, load_kernels
+from .kernels.structs import topology_struct
 from .laws import TimeLaw
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ from .constraints import Constraints
 from .errors import ModelError
 from .evaluation import Evaluation
 from .kernels.element import element_kernels
-from .kernels.gather import topology_struct
 from .kernels.materials import ANY_J, NCOEF
 from .kernels.pcg import groups_struct
 from .kernels.points import block_struct
+from .kernels.structs import topology_struct
 from .kernels.tied import tied_kernels, tied_struct
 from .kernels.types import precision
 from .loads import Loads

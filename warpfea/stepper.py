@@ -336,8 +336,7 @@ class Stepper:
         accepted = w.step.accepted
         reduce = self.newton.residual.reduce
         topo = m.topology
-        args = [w.step, topo.mass_start, topo.mass_column, topo.mass_value, topo.free, m.lumped, w.u, w.v]
-        args += [state.displacement, state.velocity, w.inertia, w.internal, w.dead, w.pushed, w.g, w.rows]
+        args = [w.step, topo, w.balance, m.lumped, state.displacement, state.velocity]
         launch(self.kernels.ledger_rows, self.dim, args)
         reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
         if any(b.key.damping == "explicit" for b in m.blocks):

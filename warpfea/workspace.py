@@ -16,6 +16,7 @@ from .kernels.pcg import LANES as GROUP_LANES
 from .kernels.pcg import pcg_struct
 from .kernels.reduce import CHUNK
 from .kernels.step import LEDGER_ROWS, REPORT, step_struct
+from .kernels.structs import balance_struct
 from .solvers.alm import allocate
 
 if TYPE_CHECKING:
@@ -103,6 +104,10 @@ class Workspace:
             self.newton.violation = self.multipliers.violation
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.step = self.struct(step_struct(), B)
+        self.balance = balance_struct(model.dtype)()
+        for name in balance_struct(model.dtype).vars:
+            of_step = name in ("mass_factor", "dq_dv")
+            setattr(self.balance, name, getattr(self.step if of_step else self, name))
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Zeroed array; its bytes are counted."""

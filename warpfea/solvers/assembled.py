@@ -14,7 +14,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..kernels.blocks import assembly_kernels, block_kernels, coupling_struct
-from ..kernels.gather import pattern_struct
+from ..kernels.structs import pattern_struct
 
 if TYPE_CHECKING:
     from ..launch import Launcher

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
@@ -11,6 +11,7 @@ from ..kernels.element import MASSIVE_BLOCK
 from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
+from ..kernels.structs import additions_struct
 from ..launch import labelled
 from .assembled import Assembled, shaped
 from .lag import Lag
@@ -74,6 +75,7 @@ class Residual:
         self.newton = newton_kernels(model.dtype, constraints is not None)
         self.con = model.constraints.data if model.constraints else constraint_struct()()
         self.dim = (model.worlds, model.slots)
+        self.additions = self._additions()
         self.massive = all(block.massive for block in model.blocks)
         # elements with many points per slot cost more than the matrix that they make. One core assembles a matrix in
         # the time of 8 to 15 products of ANCF elements and of 65 of straight tetrahedra
@@ -98,6 +100,15 @@ class Residual:
                 self.keep = 0
             self.lasting = self.keep == 2
             self.lag = Lag(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
+
+    def _additions(self) -> Any:
+        """What products need besides the elements' part."""
+        m, w = self.model, self.work
+        out = additions_struct(m.dtype)()
+        of = m.loads.pushed_topology if m.loads.followers else m.topology
+        out.start, out.entry, out.contribution = of.start, of.entry, w.pushed_tangent
+        out.mass_factor, out.dq_dv, out.warp = w.step.mass_factor, w.step.dq_dv, w.warp
+        return out
 
     def modules(self) -> set[wp.Module]:
         """Modules of the elements, the gather, and the matrix where there is one."""
@@ -173,12 +184,11 @@ class Residual:
         self.push(active)
         if hold:
             self.hold_pushed(active)
-        args = [m.topology, w.contribution, w.v, w.v_tilde, w.dead, w.dead_magnitude, w.pushed, w.pushed_held]
-        args += [w.direction, w.diagonal, w.u, w.step.mass_factor, w.step.dq_dv, active, self.con, w.multipliers]
         if self.constraints:
             self.constraints.evaluate(active)
             self.reduce(w.multipliers.rows, SUM_ROWS, active, w.newton.constraint_sums)
-        launch(self.gather.residual, self.dim, [*args, w.inertia, w.internal, w.g, w.gradient, w.rows])
+        args = [m.topology, w.contribution, w.balance, active, self.con, w.multipliers]
+        launch(self.gather.residual, self.dim, args)
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         if m.component_count > 1:
@@ -231,15 +241,11 @@ class Residual:
             for block, kernels in zip(m.blocks, self.block_kernels):
                 args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
                 launch(kernels.tangent_product, (m.worlds, block.count), args)
-        start, entry = m.topology.start, m.topology.entry
         if m.loads.followers:
-            start, entry = m.loads.pushed_topology.start, m.loads.pushed_topology.entry
             self._push_product(p, active)
         if self.constraints:
             self.constraints.product(p, active)
-        rest = [start, entry, w.pushed_tangent, p, w.step.mass_factor, w.step.dq_dv, active, self.con, w.multipliers]
-        rest.append(w.warp)
-        padded = (m.worlds, launch.padded(m.slots))
+        rest = [self.additions, p, active, self.con, w.multipliers]
         if self.by_matrix:
             assert self.assembled is not None
             pattern = self.assembled.pattern
@@ -250,8 +256,8 @@ class Residual:
             launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:
             self.curvature_rows = w.warp_rows
-            args = [m.topology, w.contribution, *rest[:-1], int(self.massive), w.warp, out, w.warp_rows]
-            launch(self.gather.product, padded, args)
+            args = [m.topology, w.contribution, *rest, int(self.massive), out, w.warp_rows]
+            launch(self.gather.product, (m.worlds, launch.padded(m.slots)), args)
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""
