@@ -11,7 +11,7 @@ import warp as wp
 
 from .newton import control_struct
 from .step import step_struct
-from .types import kernel_module, precision
+from .types import precision
 
 __all__ = ["GUESS_ROWS", "guess_kernels", "guess_struct"]
 
@@ -37,14 +37,13 @@ def guess_struct():
 
 
 @functools.cache
-def guess_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels in one precision."""
+def guess_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
+    """Kernels in one precision, in the module of the step that they belong to."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Guess, Step, Newton = guess_struct(), step_struct(), control_struct()
     NOISE = (ROUNDINGS * {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]) ** 2
-    module = kernel_module(f"guess_{dtype}")
 
     @wp.func
     def continued(order: int, v: vec3, before: vec3, first: vec3) -> vec3:
@@ -111,6 +110,8 @@ def guess_kernels(dtype: str) -> _types.SimpleNamespace:
         a = v_n[world, slot]
         fall = (T(step.dq_dv[world]) * is_position[slot]) * vec3(step.gravity[world])
         e = w - a - fall
+        if step.a1[world] > f64(0.0):  # a multistep scheme goes on as it went anyway
+            e = w - continued(1, a, before[world, slot], first[world, slot])
         rows[0, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
         for order in range(1, 3):
             e = w - continued(order, a, before[world, slot], first[world, slot])
@@ -120,15 +121,17 @@ def guess_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def shift(
         step: Step,
+        own: int,
         v_n: wp.array2d(dtype=vec3),
         before: wp.array2d(dtype=vec3),
         first: wp.array2d(dtype=vec3),
     ):
-        """The past moves on."""
+        """The past moves on; `own`: v_{n-1} too, which multistep schemes keep themselves."""
         world, slot = wp.tid()
         if step.accepted[world] != 0:
             first[world, slot] = before[world, slot]
-            before[world, slot] = v_n[world, slot]
+            if own != 0:
+                before[world, slot] = v_n[world, slot]
 
     @wp.kernel(module=module)
     def learn(guess: Guess, step: Step):
@@ -150,6 +153,4 @@ def guess_kernels(dtype: str) -> _types.SimpleNamespace:
         guess.kept[world, 2] = step.h[world]
         guess.kept[world, 3] = step.new_time[world]
 
-    return _types.SimpleNamespace(
-        module=module, begin=begin, extrapolate=extrapolate, compare=compare, shift=shift, learn=learn
-    )
+    return _types.SimpleNamespace(begin=begin, extrapolate=extrapolate, compare=compare, shift=shift, learn=learn)

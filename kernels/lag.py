@@ -9,9 +9,10 @@ import types as _types
 
 import warp as wp
 
+from .blocks import block_kernels
 from .newton import control_struct
 from .pcg import pcg_struct
-from .types import kernel_module, precision
+from .types import precision
 
 __all__ = ["lag_kernels", "lag_struct"]
 
@@ -55,7 +56,7 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
     f64 = wp.float64
     Lag = lag_struct()
     Newton, PCG = control_struct(), pcg_struct()
-    module = kernel_module(f"lag_{dtype}")
+    module = block_kernels(dtype).module  # one with the matrices that it keeps
 
     @wp.func
     def gain(reduction: f64) -> f64:

@@ -58,12 +58,10 @@ def test_a_feature_comes_and_goes_without_trace(feature):
     with_it = cost(feature)
     again = cost()
     assert again[:4] == bare[:4]
-    # with damping and with constraints no matrix is kept from step to step
-    assert with_it[3] > bare[3] or feature in ("gravity", "rate", "incremental")
+    assert with_it[3] > bare[3] or feature in ("gravity", "rate")
     if feature not in ("rate", "second body"):
-        assert with_it[0] > bare[0] or feature == "incremental"
-        usual = bare[1] - {"count_step"} if feature in ("joint", "incremental") else bare[1]
-        assert with_it[1] > usual or feature in ("explicit", "second law")
+        assert with_it[0] > bare[0]
+        assert with_it[1] > bare[1] or feature in ("incremental", "explicit", "second law")
     assert with_it[4].info()["left_out"] != bare[4].info()["left_out"] or feature in ("probe", "second law")
 
 
@@ -82,7 +80,7 @@ def test_options_of_the_simulation_come_and_go():
 
 def test_bare_step_uses_few_modules():
     _, kernels, modules, _, model = cost(ledger=False)
-    assert len(modules) <= 15
+    assert len(modules) <= 13
     assert not any("follower" in k or "drive" in k or "evaluate_laws" in k or "dead_load" in k for k in kernels)
     assert not any("constraint" in name for name in modules)
     assert {"constraints", "gravity", "body forces", "follower pressure", "driven nodes"} <= set(

@@ -21,18 +21,23 @@ __all__ = ["Guess"]
 class Guess:
     """Extrapolation of velocities, of the order that served the last step best; its past is part of the state."""
 
-    def __init__(self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State) -> None:
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State, module: wp.Module,
+        *, multistep: bool,
+    ) -> None:  # fmt: skip
         self.model, self.work, self.launch, self.reduce, self.state = model, work, launch, reduce, state
-        self.kernels = guess_kernels(model.dtype)
+        self.kernels = guess_kernels(model.dtype, module)
         self.dim = (model.worlds, model.slots)
         self.control: Any = guess_struct()()
         for name in ("order", "count"):
             setattr(self.control, name, work.array(f"guess {name}", (model.worlds,), wp.int32))
         self.control.sums = work.array("guess sums", (GUESS_ROWS, model.worlds), wp.float64)
         self.control.kept = state.register("guess", wp.float64, (4,))
-        self.past = tuple(
-            state.register(f"guess_{name}", model.types.vec3, (model.slots,)) for name in ("before", "first")
-        )
+        # multistep schemes keep v_{n-1} themselves
+        self.own = not multistep
+        field = model.types.vec3, (model.slots,)
+        before = state.register("guess_before", *field) if self.own else state.previous_velocity
+        self.past = before, state.register("guess_first", *field)
 
     def begin(self) -> None:
         """Put the iterate into work.v, where predict has put v_n."""
@@ -47,5 +52,5 @@ class Guess:
         args = [self.control, step, m.topology.free, m.is_position, w.diagonal, w.v, self.state.velocity, *self.past]
         self.launch(self.kernels.compare, self.dim, [*args, w.rows])
         self.reduce(w.rows, GUESS_ROWS, step.accepted, self.control.sums)
-        self.launch(self.kernels.shift, self.dim, [step, self.state.velocity, *self.past])
+        self.launch(self.kernels.shift, self.dim, [step, int(self.own), self.state.velocity, *self.past])
         self.launch(self.kernels.learn, m.worlds, [self.control, step])

@@ -79,7 +79,8 @@ class Stepper:
         self.guess: Guess | None = None
         # single roundings would grow from step to step, and so would what Jacobi's steps leave
         if not integrator.static and model.dtype == "float64" and isinstance(solver, NewtonPCG):
-            self.guess = Guess(model, self.work, self.launch, self.newton.residual.reduce, state)
+            more = (self.newton.residual.reduce, state, self.kernels.module)
+            self.guess = Guess(model, self.work, self.launch, *more, multistep=integrator.multistep)
         self.dim = (model.worlds, model.slots)
         self.running = self.work.any_flag[2:3]
         self._bind()
@@ -163,8 +164,6 @@ class Stepper:
         out |= {kernel.module for kernel in m.loads.used_kernels()}
         if self.backup is not None:
             out.add(state_kernels().module)
-        if self.guess:
-            out.add(self.guess.kernels.module)
         if not self.integrator.static:
             out |= {b.kernels.viscous_force.module for b in m.blocks if b.key.damping == "explicit"}
             out |= {b.kernels.strain_history.module for b in m.blocks if b.key.damping == "incremental"}
