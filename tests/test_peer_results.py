@@ -9,8 +9,13 @@ from warpfea.bench_peer import LARGE, PEER, required
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 
-MISSED = ("beam-300",)
-"""Rows that lie at their bar, above it in some runs and below it in others."""
+MISSED = {"beam-300": "2.98 times the peer's speed in this run, not 3"}
+"""Rows below their bar; when one is measured above it, it must be taken out here."""
+
+
+def cased(case):
+    marks = [pytest.mark.xfail(strict=True, reason=MISSED[case.label])] if case.label in MISSED else []
+    return pytest.param(case, id=case.label, marks=marks)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +37,7 @@ def test_peer_table_is_whole_and_follows_the_protocol(peer):
     assert [row["label"] for row in rows] == [case.label for case in (*PEER, LARGE)]
 
 
-@pytest.mark.parametrize("case", PEER, ids=lambda case: case.label)
+@pytest.mark.parametrize("case", [cased(case) for case in PEER])
 def test_faster_than_the_peer_at_the_stated_residual(peer, case):
     (row,) = (r for r in peer["rows"] if r["label"] == case.label and r["dtype"] == "float64")
     assert row["peer_ms"] == case.peer_ms
@@ -40,8 +45,6 @@ def test_faster_than_the_peer_at_the_stated_residual(peer, case):
     assert row["residual_force"] <= 5e-4
     assert row["tip_difference"] <= 1e-6
     assert row["speedup"] == pytest.approx(case.peer_ms / row["ms_per_step"])
-    if row["speedup"] < required(case) and case.label in MISSED:
-        pytest.xfail(f"{row['speedup']:.2f} times the peer's speed, not {required(case)}")
     assert row["speedup"] >= required(case)
 
 
