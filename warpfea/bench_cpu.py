@@ -99,7 +99,7 @@ def measure(case: CpuCase, model: Model, name: str, *, steps: int, limit: float)
     run = run_once(model, dt=DT, steps=steps, solver=how, limit=limit)
     done = len(run.times)
     note = None if done == steps else f"{done} of {steps} steps took {sum(run.times):.3g} s"
-    found = figures(run, [sum(run.times) / done])
+    found = figures(run, sum(run.times) / done)
     return CpuRow(**_mesh(case, model, name), steps=done, residual_force=run.residual_force, note=note, **found)
 
 

@@ -136,7 +136,7 @@ def measure(case: Case, dtype: str, *, device: Any, steps: int, meshes: pathlib.
         tip=tip,
         tip_difference=None,
         setup_s=setup,
-        **figures(run, run.times[first_counted(steps) - 1 :]),
+        **figures(run, statistics.median(run.times[first_counted(steps) - 1 :])),
     )
     if case.peer_ms is None:
         return row
