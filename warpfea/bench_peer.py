@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import fnmatch
 import pathlib
+import statistics
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
