@@ -83,7 +83,7 @@ class Residual:
         if not model.device.is_cuda:
             many = assembled and not self.massive
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
-        self.lasting = False
+        self.keep, self.lasting = 0, False
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
             self.assembled = Assembled(model, work, launch, self.block_kernels)
@@ -99,7 +99,8 @@ class Residual:
             if constraints:
                 self.keep = 0
             self.lasting = self.keep == 2
-            self.lag = Lag(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
+            if self.keep:
+                self.lag = Lag(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
 
     def _additions(self) -> Any:
         """What products need besides the elements' part."""
@@ -115,7 +116,8 @@ class Residual:
         out = {k.module for k in self.block_kernels} | {self.gather.module}
         if self.by_matrix:
             assert self.assembled is not None
-            out |= {self.gather.matrix_module, self.lag.kernels.module} | self.assembled.modules()
+            out |= {self.gather.matrix_module} | self.assembled.modules()
+            out |= {self.lag.kernels.module} if self.keep else set()
         elif self.massive:
             out |= {k.massive_product.module for k in self.block_kernels}
         return out
