@@ -9,6 +9,7 @@ import types as _types
 import warp as wp
 
 from . import materials
+from .cluster import ELEMENTS, cluster_functions
 from .element_matrix import matrix_kernels
 from .element_output import output_kernels
 from .lanes import lane_functions
@@ -16,11 +17,7 @@ from .points import point_functions
 from .types import kernel_module
 from .vertex import vertex_product
 
-__all__ = ["MASSIVE_BLOCK", "element_kernels"]
-
-MASSIVE_BLOCK = 64
-"""Threads of a block of `massive_product`: it takes so many registers that small blocks fill a device better."""
-
+__all__ = ["element_kernels"]
 
 @functools.cache
 def element_kernels(
@@ -55,7 +52,7 @@ def element_kernels(
     name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
     module = kernel_module(name)
     # slots in registers, not in arrays that loops index; the loops over points stay loops
-    massive_module = kernel_module(f"{name}_massive", max_unroll=16, block_dim=MASSIVE_BLOCK)
+    massive_module = kernel_module(f"{name}_massive", max_unroll=16, block_dim=ELEMENTS)
     prepare_matrix, element_matrix = matrix_kernels(fn, kernel_module(f"{name}_matrix", max_unroll=16))
 
     @wp.kernel(module=module)
@@ -144,47 +141,50 @@ def element_kernels(
             f = fn.scatter(block, f, dP, q, elem)
         return f
 
+    shared = cluster_functions(dtype, NS, 3 if damping == "rate" else 2)
+    Pool = shared.Pool
+
+    @wp.func
+    def fetch_all(block: Block, pool: Pool, field: int, at: int) -> Local:
+        """Slot values of an element, translations taken relative to the first slot."""
+        out = Local()
+        first = shared.fetch(pool, field, 0, at)
+        for i in range(NS):
+            out[i] = shared.fetch(pool, field, i, at) - block.is_position[i] * first
+        return out
+
     if vertex:
-        massive_product = vertex_product(dtype, massive_module, points, damping == "rate", fn)
+        product = vertex_product(dtype, points, damping == "rate", fn, shared)
     else:
 
-        @wp.kernel(module=massive_module)
-        def massive_product(
+        @wp.func
+        def product(
             block: Block,
-            u: wp.array2d(dtype=vec3),
-            v: wp.array2d(dtype=vec3),
+            pool: Pool,
             history: wp.array2d(dtype=sym6),
-            mass_factor: wp.array(dtype=wp.float64),
-            dq_dv: wp.array(dtype=wp.float64),
-            active: wp.array(dtype=wp.int32),
-            direction: wp.array2d(dtype=vec3),
-            contribution: wp.array2d(dtype=vec3),
+            dq: T,
+            scale: T,
+            world: int,
+            elem: int,
+            at: int,
         ):
-            """c_M M p + (dq/dv) K p of straight elements, whose mass is one table times a number each.
-
-            One thread does an element: four that share its points were half as fast, even where most of a device idles.
-            """
-            world, elem = wp.tid()
-            if active[world] == 0:
-                return
-            U = fn.load(block, u, world, elem)
-            dU = fn.load(block, direction, world, elem)
+            """scale M p + dq K p of element `at` of a cluster."""
+            U = fetch_all(block, pool, 0, at)
+            dU = fetch_all(block, pool, 1, at)
             V = Local()
             if wp.static(damping == "rate"):
-                V = fn.load(block, v, world, elem)
-            dq = T(dq_dv[world])
+                V = fetch_all(block, pool, 2, at)
             f = tangent_force(block, U, dU, V, history, dq, world, elem)
-            scale = T(mass_factor[world]) * block.density[elem]
-            first = direction[world, block.conn[0, elem]]
+            first = shared.fetch(pool, 1, 0, at)
             for i in range(NS):
                 a = vec3()
                 total = T(0.0)
                 for j in range(NS):
                     a += block.mass[i, j] * dU[j]
                     total += block.mass[i, j]
-                a += total * first
-                entry = block.contribution_offset + i * block.count + elem
-                contribution[world, entry] = dq * f[i] + scale * a
+                shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
+
+    massive_product = shared.by_clusters(massive_module, Block, product)
 
     @wp.kernel(module=module)
     def tangent_product(

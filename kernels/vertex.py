@@ -30,47 +30,60 @@ SPOKES = tuple(
     for v in range(4)
 )
 """e(v, b)."""
+PACKED = wp.constant(wp.int64(sum(int(SPOKES[v][b]) << (16 * v + 4 * b) for v in range(4) for b in range(4))))
+"""The same in four bits each: the highest is 3, so that the number is positive."""
 
 
-def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, fn: _types.SimpleNamespace) -> wp.Kernel:
-    """The kernel `massive_product` in this form.
+def vertex_product(
+    dtype: str, points: int, rate: bool, fn: _types.SimpleNamespace, shared: _types.SimpleNamespace
+) -> wp.Function:
+    """What an element adds to the product, in this form.
 
     Args:
         dtype: precision.
-        module: for the kernel; its short loops must be unrolled, that slots are registers.
         points: 4, one for each vertex, or 5, the centroid before them.
         rate: increments need the velocity gradient.
         fn: functions of points.py.
+        shared: functions of cluster.py.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    Pool, fetch, set_force, add_force = shared.Pool, shared.fetch, shared.set_force, shared.add_force
+    U, DU, V = 0, 1, 2
     Block, coefficients, point_increment = fn.Block, fn.coefficients, fn.point_increment
     Local = wp.types.matrix(shape=(10, 3), dtype=T)
     FIRST = points - 4
 
     @wp.func
-    def spokes(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int, e: wp.vec4i) -> mat33:
+    def spokes_of(v: int) -> wp.vec4i:
+        """e(v, b)."""
+        bits = PACKED >> wp.int64(16 * v)
+        return wp.vec4i(
+            int(bits & wp.int64(15)), int((bits >> wp.int64(4)) & wp.int64(15)), int((bits >> wp.int64(8)) & wp.int64(15)), int((bits >> wp.int64(12)) & wp.int64(15)))
+
+    @wp.func
+    def spokes(pool: Pool, field: int, at: int, e: wp.vec4i) -> mat33:
         """sum_b u_e(b) dL_b^T."""
-        o = field[world, block.conn[e[0], elem]]
+        o = fetch(pool, field, e[0], at)
         return wp.matrix_from_cols(
-            field[world, block.conn[e[1], elem]] - o,
-            field[world, block.conn[e[2], elem]] - o,
-            field[world, block.conn[e[3], elem]] - o,
+            fetch(pool, field, e[1], at) - o,
+            fetch(pool, field, e[2], at) - o,
+            fetch(pool, field, e[3], at) - o,
         )
 
     @wp.func
-    def central(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> mat33:
+    def central(pool: Pool, field: int, at: int) -> mat33:
         """S, where opposite edges have opposite signs."""
-        a = field[world, block.conn[5, elem]] - field[world, block.conn[7, elem]]
-        b = field[world, block.conn[8, elem]] - field[world, block.conn[6, elem]]
-        c = field[world, block.conn[9, elem]] - field[world, block.conn[4, elem]]
+        a = fetch(pool, field, 5, at) - fetch(pool, field, 7, at)
+        b = fetch(pool, field, 8, at) - fetch(pool, field, 6, at)
+        c = fetch(pool, field, 9, at) - fetch(pool, field, 4, at)
         return wp.matrix_from_cols(a + b, a + c, b + c)
 
     @wp.func
-    def shared(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int, s: T) -> mat33:
+    def common(pool: Pool, field: int, at: int, s: T) -> mat33:
         """H."""
-        S = central(block, field, world, elem)
-        return S - s * (S + spokes(block, field, world, elem, wp.vec4i(0, 1, 2, 3)))
+        S = central(pool, field, at)
+        return S - s * (S + spokes(pool, field, at, wp.vec4i(0, 1, 2, 3)))
 
     @wp.func
     def column(Q: mat33, b: int) -> vec3:
@@ -80,11 +93,11 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, fn: _
         return vec3(Q[0, b - 1], Q[1, b - 1], Q[2, b - 1])
 
     @wp.func
-    def inertia(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int, scale: T, force: Local) -> Local:
-        """Adds scale M u, where M has one number for each way that two slots can lie to each other."""
+    def inertia(block: Block, pool: Pool, scale: T, at: int):
+        """scale M p, where M has one number for each way that two slots can lie to each other."""
         u = Local()
         for i in range(10):
-            u[i] = field[world, block.conn[i, elem]]
+            u[i] = fetch(pool, DU, i, at)
         beside = scale * block.mass[0, 1]
         near = scale * block.mass[0, 4]
         far = scale * block.mass[0, 5]
@@ -97,73 +110,67 @@ def vertex_product(dtype: str, module: wp.Module, points: int, rate: bool, fn: _
         # what all corners and all edges have in common, then what differs from it
         at_corner = beside * corners + far * edges
         at_edge = far * corners + joined * edges
-        out = force
         for i in range(4):
-            out[i] = out[i] + at_corner + of_corner * u[i]
+            e = wp.static(SPOKES[i])
+            near_edges = u[e[0]] + u[e[1]] + u[e[2]] + u[e[3]] - u[i]
+            set_force(pool, i, at, at_corner + of_corner * u[i] + (near - far) * near_edges)
         for k in range(6):
             a, b = wp.static(EDGES[k][0]), wp.static(EDGES[k][1])
             o = wp.static(4 + OPPOSITE[k])
-            out[a] = out[a] + (near - far) * u[4 + k]
-            out[b] = out[b] + (near - far) * u[4 + k]
-            out[4 + k] = out[4 + k] + at_edge + (near - far) * (u[a] + u[b]) + of_edge * u[4 + k] + across * u[o]
-        return out
+            f = at_edge + (near - far) * (u[a] + u[b]) + of_edge * u[4 + k] + across * u[o]
+            set_force(pool, 4 + k, at, f)
 
-    @wp.kernel(module=module)
-    def massive_product(
+    @wp.func
+    def product(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        pool: Pool,
         history: wp.array2d(dtype=sym6),
-        mass_factor: wp.array(dtype=wp.float64),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
+        dq: T,
+        scale: T,
+        world: int,
+        elem: int,
+        at: int,
     ):
-        """c_M M p + (dq/dv) K p; slots are read anew at each vertex, to hold fewer registers."""
-        world, elem = wp.tid()
-        if active[world] == 0:
-            return
+        """scale M p + dq K p of element `at` of a cluster.
+
+        Slots are read anew at each vertex, and forces lie in the pool, to hold fewer registers.
+        """
+        inertia(block, pool, scale, at)
         c = coefficients(block, world, elem)
-        dq = T(dq_dv[world])
         # the first function's gradient at the first vertex's point is 3 s dL_0
         s = -block.gradient[FIRST, 0, 0][0] / T(3.0)
-        H = shared(block, u, world, elem, s)
-        dH = shared(block, direction, world, elem, s)
+        H = common(pool, U, at, s)
+        dH = common(pool, DU, at, s)
         rate_H = mat33()
         if wp.static(rate):
-            rate_H = shared(block, v, world, elem, s)
-        f = Local()
+            rate_H = common(pool, V, at, s)
         B = mat33()
-        for k in range(4):
+        for q in range(FIRST, block.gradient.shape[0]):
+            e = spokes_of(q - FIRST)
             J0_inv = block.J0_inv[elem]
-            G = (H + T(4.0) * s * spokes(block, u, world, elem, wp.static(SPOKES[k]))) * J0_inv
-            dG = (dH + T(4.0) * s * spokes(block, direction, world, elem, wp.static(SPOKES[k]))) * J0_inv
+            G = (H + T(4.0) * s * spokes(pool, U, at, e)) * J0_inv
+            dG = (dH + T(4.0) * s * spokes(pool, DU, at, e)) * J0_inv
             Fdot = mat33()
             if wp.static(rate):
-                Fdot = (rate_H + T(4.0) * s * spokes(block, v, world, elem, wp.static(SPOKES[k]))) * J0_inv
-            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, FIRST + k, elem)
-            w = dq * s * block.weight[FIRST + k, 0] * block.det_J0[elem]
+                Fdot = (rate_H + T(4.0) * s * spokes(pool, V, at, e)) * J0_inv
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, q, elem)
+            w = dq * s * block.weight[q, 0] * block.det_J0[elem]
             Q = w * dP * wp.transpose(J0_inv)
             B += Q
             for b in range(4):
-                slot = wp.static(SPOKES[k][b])
-                f[slot] = f[slot] + T(4.0) * column(Q, b)
+                add_force(pool, e[b], at, T(4.0) * column(Q, b))
         R = (T(1.0) / s - T(1.0)) * B
         if wp.static(FIRST == 1):
-            G = central(block, u, world, elem) * block.J0_inv[elem]
-            dG = central(block, direction, world, elem) * block.J0_inv[elem]
+            G = central(pool, U, at) * block.J0_inv[elem]
+            dG = central(pool, DU, at) * block.J0_inv[elem]
             Fdot = mat33()
             if wp.static(rate):
-                Fdot = central(block, v, world, elem) * block.J0_inv[elem]
+                Fdot = central(pool, V, at) * block.J0_inv[elem]
             dP = point_increment(block, G, dG, Fdot, history, c, dq, world, 0, elem)
             R += dq * block.weight[0, 0] * block.det_J0[elem] * dP * wp.transpose(block.J0_inv[elem])
         for b in range(4):
-            f[b] = f[b] - column(B, b)
+            add_force(pool, b, at, -column(B, b))
         for k in range(6):
-            f[4 + k] = f[4 + k] + column(R, wp.static(EDGES[k][0])) + column(R, wp.static(EDGES[k][1]))
-        f = inertia(block, direction, world, elem, T(mass_factor[world]) * block.density[elem], f)
-        for i in range(10):
-            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+            add_force(pool, 4 + k, at, column(R, wp.static(EDGES[k][0])) + column(R, wp.static(EDGES[k][1])))
 
-    return massive_product
+    return product

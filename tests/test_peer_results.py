@@ -9,15 +9,6 @@ from warpfea.bench_peer import LARGE, PEER, required
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 
-MISSED = {"beam-300": "2.98 times the peer's speed in this run, not 3"}
-"""Rows below their bar; when one is measured above it, it must be taken out here."""
-
-
-def cased(case):
-    marks = [pytest.mark.xfail(strict=True, reason=MISSED[case.label])] if case.label in MISSED else []
-    return pytest.param(case, id=case.label, marks=marks)
-
-
 @pytest.fixture(scope="module")
 def peer():
     content = json.loads((RESULTS / "peer_h200.json").read_text())
@@ -37,7 +28,7 @@ def test_peer_table_is_whole_and_follows_the_protocol(peer):
     assert [row["label"] for row in rows] == [case.label for case in (*PEER, LARGE)]
 
 
-@pytest.mark.parametrize("case", [cased(case) for case in PEER])
+@pytest.mark.parametrize("case", PEER, ids=[case.label for case in PEER])
 def test_faster_than_the_peer_at_the_stated_residual(peer, case):
     (row,) = (r for r in peer["rows"] if r["label"] == case.label and r["dtype"] == "float64")
     assert row["peer_ms"] == case.peer_ms

@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from ..kernels.cluster import ELEMENTS
 from ..kernels.constraints import SUM_ROWS, constraint_struct
-from ..kernels.element import MASSIVE_BLOCK
 from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
 from ..kernels.reduce import CHUNK, reduce_kernels
 from ..kernels.structs import additions_struct
 from ..launch import labelled
 from .assembled import Assembled, shaped
+from .clusters import Cluster, make_clusters
 from .lag import Lag
 
 if TYPE_CHECKING:
@@ -83,6 +84,11 @@ class Residual:
         if not model.device.is_cuda:
             many = assembled and not self.massive
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
+        self.clusters: Cluster | None = None
+        if self.massive and not self.by_matrix:
+            if "clusters" not in model.cache:
+                model.cache["clusters"] = make_clusters(model)
+            self.clusters = model.cache["clusters"]
         self.keep, self.lasting = 0, False
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
@@ -118,7 +124,7 @@ class Residual:
             assert self.assembled is not None
             out |= {self.gather.matrix_module} | self.assembled.modules()
             out |= {self.lag.kernels.module} if self.keep else set()
-        elif self.massive:
+        elif self.clusters:
             out |= {k.massive_product.module for k in self.block_kernels}
         return out
 
@@ -235,10 +241,12 @@ class Residual:
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate, and p.Hp in parts in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
-        if self.massive and not self.by_matrix:
-            for block, kernels in zip(m.blocks, self.block_kernels):
-                args = [block.data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p, w.contribution]
-                launch(kernels.massive_product, (m.worlds, block.count), args, block_dim=MASSIVE_BLOCK)
+        if self.clusters:
+            lanes = ELEMENTS if m.device.is_cuda else 1
+            for block, kernels, (data, count) in zip(m.blocks, self.block_kernels, self.clusters.blocks):
+                args = [block.data, data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
+                args += [lanes, self.clusters.pool, w.contribution]
+                launch(kernels.massive_product, (m.worlds, count * lanes), args, block_dim=ELEMENTS)
         elif not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
                 args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
@@ -258,7 +266,8 @@ class Residual:
             launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:
             self.curvature_rows = w.warp_rows
-            args = [m.topology, w.contribution, *rest, int(self.massive), out, w.warp_rows]
+            topology = self.clusters.topology if self.clusters else m.topology
+            args = [topology, w.contribution, *rest, int(self.massive), out, w.warp_rows]
             launch(self.gather.product, (m.worlds, launch.padded(m.slots)), args)
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:

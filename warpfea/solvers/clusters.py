@@ -1,0 +1,108 @@
+"""Clusters of straight elements on the host: the tables of kernels/cluster.py, and who sums what they give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.cluster import ELEMENTS, cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
+from ..kernels.structs import topology_struct
+
+if TYPE_CHECKING:
+    from ..model import Model
+
+__all__ = ["Cluster", "ClusterTables", "cluster_tables", "make_clusters"]
+
+
+@dataclass(eq=False)
+class ClusterTables:
+    """Clusters of elements with connectivity `conn`, see kernels/cluster.py.
+
+    Slots of a cluster come by falling number of elements, so that threads of a warp sum about as many.
+    """
+
+    start: np.ndarray
+    slot_start: np.ndarray
+    slot: np.ndarray
+    table: np.ndarray
+
+
+def cluster_tables(conn: np.ndarray) -> ClusterTables:
+    """Tables of runs of ELEMENTS elements; a run with more slots than a cluster holds is halved."""
+    count, slots = conn.shape
+    start = np.append(np.arange(0, count, ELEMENTS), count)
+    cluster = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    pairs = np.unique(cluster[:, None] * (conn.max() + 1) + conn) // (conn.max() + 1)
+    full = np.bincount(pairs) > slot_capacity(slots)
+    start = np.sort(np.concatenate([start, start[:-1][full] + ELEMENTS // 2]))
+    cluster = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    # pairs (cluster, slot), then again by falling count
+    _, first, pair, times = np.unique(
+        cluster[:, None] * (conn.max() + 1) + conn, return_index=True, return_inverse=True, return_counts=True
+    )
+    owner, slot = cluster[first // slots], conn.ravel()[first]
+    order = np.lexsort((slot, -times, owner))
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    pair = rank[pair].reshape(conn.shape)
+    slot_start = np.concatenate([[0], np.cumsum(np.bincount(owner))])
+    within = np.arange(count) - start[cluster]
+    at_place, at_start, words = table_layout(slots)
+    table = np.zeros((len(start) - 1, 2 * words), dtype=np.uint16)
+    by_slot = np.argsort(pair.T.ravel(), kind="stable")
+    local, elem = np.divmod(by_slot, count)
+    own = np.repeat(owner[order], times[order])  # of contributions
+    table[own, np.arange(len(own)) - slots * start[own]] = local * ELEMENTS + within[elem]
+    for k in range(slots):
+        table[cluster, at_place + k * ELEMENTS + within] = pair[:, k] - slot_start[cluster]
+    end = np.cumsum(times[order]) - slots * start[owner[order]]
+    table[owner[order], at_start + 1 + np.arange(len(order)) - slot_start[owner[order]]] = end
+    return ClusterTables(start, slot_start, slot[order], table.view(np.int32))
+
+
+@dataclass(eq=False)
+class Cluster:
+    """The clusters of a model.
+
+    Attributes:
+        blocks: device struct and number of clusters of each block.
+        topology: who contributes to a slot, with the sums of clusters as contributions.
+        sums: their number.
+        pool: memory of a cluster on the CPU.
+    """
+
+    blocks: list[tuple[Any, int]]
+    topology: Any
+    sums: int
+    pool: Any
+
+
+def make_clusters(model: Model) -> Cluster:
+    """Those of a model whose blocks are all massive."""
+    blocks, slots, offset = [], [], 0
+    for block in model.blocks:
+        tables = cluster_tables(np.concatenate([p.conn + p.body.slot_offset for p in block.parts]))
+        data = cluster_struct()()
+        for name in ("start", "slot_start", "slot", "table"):
+            setattr(data, name, model.array("clusters", getattr(tables, name), wp.int32))
+        data.offset = offset
+        blocks.append((data, len(tables.start) - 1))
+        slots.append(tables.slot)
+        offset += len(tables.slot)
+    of = np.concatenate(slots)
+    topo, own = topology_struct(model.dtype)(), model.topology
+    start = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=model.slots))])
+    topo.start = model.array("clusters", start, wp.int32)
+    topo.entry = model.array("clusters", np.argsort(of, kind="stable"), wp.int32)
+    topo.mass_start, topo.mass_column, topo.mass_value = own.mass_start, own.mass_column, own.mass_value
+    topo.free = own.free
+    pool = pool_struct(model.dtype)()
+    numbers = max(pool_size(block.slots, 3 if block.key.damping == "rate" else 2) for block in model.blocks)
+    words = max(table_layout(block.slots)[2] for block in model.blocks)
+    on_host = not model.device.is_cuda
+    pool.number = wp.zeros(numbers if on_host else 1, dtype=model.types.T, device=model.device)
+    pool.table = wp.zeros(words if on_host else 1, dtype=wp.int32, device=model.device)
+    return Cluster(blocks, topo, offset, pool)
