@@ -9,7 +9,7 @@ import types as _types
 import warp as wp
 
 from . import materials
-from .cluster import ELEMENTS, cluster_functions
+from .cluster import CLUSTER, cluster_functions
 from .element_matrix import matrix_kernels
 from .element_output import output_kernels
 from .lanes import lane_functions
@@ -52,7 +52,7 @@ def element_kernels(
     name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
     module = kernel_module(name)
     # slots in registers, not in arrays that loops index; the loops over points stay loops
-    massive_module = kernel_module(f"{name}_massive", max_unroll=16, block_dim=ELEMENTS)
+    massive_module = kernel_module(f"{name}_massive", max_unroll=16, block_dim=CLUSTER[dtype])
     prepare_matrix, element_matrix = matrix_kernels(fn, kernel_module(f"{name}_matrix", max_unroll=16))
 
     @wp.kernel(module=module)
@@ -184,7 +184,9 @@ def element_kernels(
                     total += block.mass[i, j]
                 shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
 
-    massive_product = shared.by_clusters(massive_module, Block, product)
+    # of this kind spilling was measured to be little; of others the compiler decides
+    bounded = vertex and law == "svk" and damping is None
+    massive_product = shared.by_clusters(massive_module, Block, product, bounded)
 
     @wp.kernel(module=module)
     def tangent_product(
@@ -234,7 +236,7 @@ def element_kernels(
             for i in range(NS):
                 a = vec3()
                 if wp.static(affine):
-                    a = wp.transpose(block.J0_inv[elem]) * block.gradient[q, i, 0]
+                    a = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[q, i, 0]
                 else:
                     a = block.gradient[q, i, elem]
                 K = mat33()

@@ -120,7 +120,7 @@ def matrix_kernels(fn: _types.SimpleNamespace, module: wp.Module) -> tuple[wp.Ke
             S = mat33(d[0], o[2], o[1], o[2], d[1], o[0], o[1], o[0], d[2])
             h = vec3()
             if wp.static(affine):
-                h = wp.transpose(block.J0_inv[elem]) * block.gradient[q, b, 0]
+                h = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[q, b, 0]
             else:
                 h = block.gradient[q, b, elem]
             if wp.static(framed):
@@ -144,7 +144,7 @@ def matrix_kernels(fn: _types.SimpleNamespace, module: wp.Module) -> tuple[wp.Ke
                 dP = dP * wp.transpose(block.frame[q, elem])
             dP = fn.weight_of(block, q, elem) * dP
             if wp.static(affine):
-                dP = dP * wp.transpose(block.J0_inv[elem])
+                dP = dP * wp.transpose(fn.inverse_jacobian(block, elem))
             for a in range(NS):
                 if a <= b:
                     if wp.static(affine):

@@ -25,6 +25,8 @@ part of Phi and its magnitude; g.p with non-potential forces held; what Phi chan
 squared norm of the rounding of the positions; |g|^2."""
 
 
+SUM_BLOCKS = {"float64": 6, "float32": 8}
+"""Blocks of 256 threads of `massive_sum` that registers must leave room for: it waits for memory most of the time."""
 REACTION = wp.constant(wp.float64(1.0e-6))
 """Share of the squared reactions in the squared scale of the residual."""
 
@@ -225,7 +227,11 @@ def gather_kernels(
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
                 tie += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
             out += vec3(tie)
-        return wp.cw_mul(out, topo.free[slot])
+        held = int(topo.held[slot])
+        for k in range(3):
+            if held & (1 << k) != 0:
+                out[k] = T(0.0)
+        return out
 
     @wp.kernel(module=module)
     def product(
@@ -236,14 +242,10 @@ def gather_kernels(
         active: wp.array(dtype=wp.int32),
         con: Constraints,
         mul: Multipliers,
-        massive: int,
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots.
-
-        `massive`: the contributions hold mass and factors.
-        """
+        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -252,16 +254,42 @@ def gather_kernels(
             f = vec3()
             for k in range(topo.start[slot], topo.start[slot + 1]):
                 f += contribution[world, topo.entry[k]]
+            a = vec3()
+            for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+                a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
             dq = T(more.dq_dv[world])
-            h = f
-            if massive == 0:
-                a = vec3()
-                for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-                    a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
-                h = T(more.mass_factor[world]) * a + dq * f
-            h = finish(topo, h, more, dq, con, mul, world, slot)
+            h = finish(topo, T(more.mass_factor[world]) * a + dq * f, more, dq, con, mul, world, slot)
             out[world, slot] = h
             share = f64(wp.dot(h, p_in[world, slot]))
+        share = row_sum(share, more.warp)
+        if slot % more.warp == 0:
+            rows[0, world, slot / more.warp] = share
+
+    @wp.kernel(module=module, launch_bounds=(256, SUM_BLOCKS[dtype]))
+    def massive_sum(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        more: Additions,
+        p_in: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
+        out: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """The same from contributions that hold the mass and the factors."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        share = f64(0.0)
+        if slot < out.shape[1]:
+            p = p_in[world, slot]
+            f = vec3()
+            for k in range(topo.start[slot], topo.start[slot + 1]):
+                f += contribution[world, topo.entry[k]]
+            h = finish(topo, f, more, T(more.dq_dv[world]), con, mul, world, slot)
+            out[world, slot] = h
+            share = f64(wp.dot(h, p))
         share = row_sum(share, more.warp)
         if slot % more.warp == 0:
             rows[0, world, slot / more.warp] = share
@@ -352,6 +380,7 @@ def gather_kernels(
         gather_force=gather_force,
         residual=residual,
         product=product,
+        massive_sum=massive_sum,
         gather_blocks=gather_blocks,
         mass_product=mass_product,
     )

@@ -30,7 +30,7 @@ def block_struct(dtype: str):
         vertex_gradient: wp.array3d(dtype=vec3)  # the same at the vertices, for laws that need J > 0
         shape: wp.array3d(dtype=T)  # [point, local, elem or 0] s_i at the points of the mass rule (field loads)
         field_weight: wp.array2d(dtype=T)  # [point, elem] rho w at those points
-        J0_inv: wp.array(dtype=mat33)  # [elem], affine only
+        J0_inv: wp.array2d(dtype=T)  # [3 row + column, elem], affine only
         vertex_J0_inv: wp.array2d(dtype=mat33)
         weight: wp.array2d(dtype=T)  # [point, elem] W det J0; affine: [point, 0] W
         det_J0: wp.array(dtype=T)  # [elem], affine only
@@ -89,6 +89,15 @@ def point_functions(
         return U
 
     @wp.func
+    def inverse_jacobian(block: Block, elem: int) -> mat33:
+        """J0^-1 of a straight element."""
+        return mat33(
+            block.J0_inv[0, elem], block.J0_inv[1, elem], block.J0_inv[2, elem],
+            block.J0_inv[3, elem], block.J0_inv[4, elem], block.J0_inv[5, elem],
+            block.J0_inv[6, elem], block.J0_inv[7, elem], block.J0_inv[8, elem],
+        )  # fmt: skip
+
+    @wp.func
     def gradient_of(block: Block, U: Local, point: int, elem: int) -> mat33:
         """sum_i u_i h_i^T at a point."""
         D = mat33()
@@ -98,7 +107,7 @@ def point_functions(
             else:
                 D += wp.outer(U[i], block.gradient[point, i, elem])
         if wp.static(affine):
-            D = D * block.J0_inv[elem]
+            D = D * inverse_jacobian(block, elem)
         return D
 
     @wp.func
@@ -113,7 +122,7 @@ def point_functions(
         """f_i += w P h_i."""
         Q = weight_of(block, point, elem) * P
         if wp.static(affine):
-            Q = Q * wp.transpose(block.J0_inv[elem])
+            Q = Q * wp.transpose(inverse_jacobian(block, elem))
         out = f
         for i in range(NS):
             if wp.static(affine):
@@ -183,7 +192,7 @@ def point_functions(
                 else:
                     D += wp.outer(U[i], block.vertex_gradient[q, i, elem])
             if wp.static(affine):
-                D = D * block.J0_inv[elem]
+                D = D * inverse_jacobian(block, elem)
             J = wp.min(J, T(1.0) + t.volume_change(D))
         return J
 
@@ -213,7 +222,7 @@ def point_functions(
     return _types.SimpleNamespace(
         types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
         framed=framed, needs_J=law not in materials.ANY_J,
-        coefficients=coefficients, damping_coefficients=damping_coefficients, load=load, gradient_of=gradient_of,
+        coefficients=coefficients, damping_coefficients=damping_coefficients, load=load, inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
         weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
         into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,
         strain_rate=strain_rate, vertex_jacobian=vertex_jacobian, point_increment=point_increment,

@@ -36,6 +36,7 @@ def topology_struct(dtype: str):
         mass_column: wp.array(dtype=wp.int32)
         mass_value: wp.array(dtype=T)  # kg
         free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
+        held: wp.array(dtype=wp.uint8)  # [slot] bit k is set where component k is prescribed
 
     return Topology
 

@@ -30,8 +30,15 @@ SPOKES = tuple(
     for v in range(4)
 )
 """e(v, b)."""
-PACKED = wp.constant(wp.int64(sum(int(SPOKES[v][b]) << (16 * v + 4 * b) for v in range(4) for b in range(4))))
-"""The same in four bits each: the highest is 3, so that the number is positive."""
+
+
+@wp.func_native("""
+    #if defined(__CUDA_ARCH__)
+    asm volatile("" ::: "memory");
+    #endif
+""")
+def forget():
+    """Nothing read before is kept: it would take registers that more blocks could have."""
 
 
 def vertex_product(
@@ -50,16 +57,11 @@ def vertex_product(
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Pool, fetch, set_force, add_force = shared.Pool, shared.fetch, shared.set_force, shared.add_force
     U, DU, V = 0, 1, 2
-    Block, coefficients, point_increment = fn.Block, fn.coefficients, fn.point_increment
+    Block, coefficients, inverse_jacobian, point_increment = (
+        fn.Block, fn.coefficients, fn.inverse_jacobian, fn.point_increment
+    )
     Local = wp.types.matrix(shape=(10, 3), dtype=T)
     FIRST = points - 4
-
-    @wp.func
-    def spokes_of(v: int) -> wp.vec4i:
-        """e(v, b)."""
-        bits = PACKED >> wp.int64(16 * v)
-        return wp.vec4i(
-            int(bits & wp.int64(15)), int((bits >> wp.int64(4)) & wp.int64(15)), int((bits >> wp.int64(8)) & wp.int64(15)), int((bits >> wp.int64(12)) & wp.int64(15)))
 
     @wp.func
     def spokes(pool: Pool, field: int, at: int, e: wp.vec4i) -> mat33:
@@ -93,8 +95,8 @@ def vertex_product(
         return vec3(Q[0, b - 1], Q[1, b - 1], Q[2, b - 1])
 
     @wp.func
-    def inertia(block: Block, pool: Pool, scale: T, at: int):
-        """scale M p, where M has one number for each way that two slots can lie to each other."""
+    def finish(block: Block, pool: Pool, scale: T, B: mat33, R: mat33, at: int):
+        """Adds what B and R give, and scale M p, where M has one number for each way that two slots can lie."""
         u = Local()
         for i in range(10):
             u[i] = fetch(pool, DU, i, at)
@@ -112,13 +114,13 @@ def vertex_product(
         at_edge = far * corners + joined * edges
         for i in range(4):
             e = wp.static(SPOKES[i])
-            near_edges = u[e[0]] + u[e[1]] + u[e[2]] + u[e[3]] - u[i]
-            set_force(pool, i, at, at_corner + of_corner * u[i] + (near - far) * near_edges)
+            around = u[e[0]] + u[e[1]] + u[e[2]] + u[e[3]] - u[i]
+            add_force(pool, i, at, at_corner + of_corner * u[i] + (near - far) * around - column(B, i))
         for k in range(6):
             a, b = wp.static(EDGES[k][0]), wp.static(EDGES[k][1])
             o = wp.static(4 + OPPOSITE[k])
             f = at_edge + (near - far) * (u[a] + u[b]) + of_edge * u[4 + k] + across * u[o]
-            set_force(pool, 4 + k, at, f)
+            add_force(pool, 4 + k, at, f + column(R, a) + column(R, b))
 
     @wp.func
     def product(
@@ -135,7 +137,6 @@ def vertex_product(
 
         Slots are read anew at each vertex, and forces lie in the pool, to hold fewer registers.
         """
-        inertia(block, pool, scale, at)
         c = coefficients(block, world, elem)
         # the first function's gradient at the first vertex's point is 3 s dL_0
         s = -block.gradient[FIRST, 0, 0][0] / T(3.0)
@@ -145,32 +146,35 @@ def vertex_product(
         if wp.static(rate):
             rate_H = common(pool, V, at, s)
         B = mat33()
-        for q in range(FIRST, block.gradient.shape[0]):
-            e = spokes_of(q - FIRST)
-            J0_inv = block.J0_inv[elem]
+        for k in range(4):
+            forget()
+            q = FIRST + k
+            e = wp.static(SPOKES[k])
+            J0_inv = inverse_jacobian(block, elem)
             G = (H + T(4.0) * s * spokes(pool, U, at, e)) * J0_inv
             dG = (dH + T(4.0) * s * spokes(pool, DU, at, e)) * J0_inv
             Fdot = mat33()
             if wp.static(rate):
                 Fdot = (rate_H + T(4.0) * s * spokes(pool, V, at, e)) * J0_inv
             dP = point_increment(block, G, dG, Fdot, history, c, dq, world, q, elem)
-            w = dq * s * block.weight[q, 0] * block.det_J0[elem]
+            w = T(4.0) * dq * s * block.weight[q, 0] * block.det_J0[elem]
             Q = w * dP * wp.transpose(J0_inv)
-            B += Q
+            B += T(0.25) * Q
             for b in range(4):
-                add_force(pool, e[b], at, T(4.0) * column(Q, b))
+                if wp.static(b < k):  # an edge to a vertex that has been
+                    add_force(pool, wp.static(SPOKES[k][b]), at, column(Q, b))
+                else:
+                    set_force(pool, wp.static(SPOKES[k][b]), at, column(Q, b))
+        forget()
         R = (T(1.0) / s - T(1.0)) * B
         if wp.static(FIRST == 1):
-            G = central(pool, U, at) * block.J0_inv[elem]
-            dG = central(pool, DU, at) * block.J0_inv[elem]
+            G = central(pool, U, at) * inverse_jacobian(block, elem)
+            dG = central(pool, DU, at) * inverse_jacobian(block, elem)
             Fdot = mat33()
             if wp.static(rate):
-                Fdot = central(pool, V, at) * block.J0_inv[elem]
+                Fdot = central(pool, V, at) * inverse_jacobian(block, elem)
             dP = point_increment(block, G, dG, Fdot, history, c, dq, world, 0, elem)
-            R += dq * block.weight[0, 0] * block.det_J0[elem] * dP * wp.transpose(block.J0_inv[elem])
-        for b in range(4):
-            add_force(pool, b, at, -column(B, b))
-        for k in range(6):
-            add_force(pool, 4 + k, at, column(R, wp.static(EDGES[k][0])) + column(R, wp.static(EDGES[k][1])))
+            R += dq * block.weight[0, 0] * block.det_J0[elem] * dP * wp.transpose(inverse_jacobian(block, elem))
+        finish(block, pool, scale, B, R, at)
 
     return product

@@ -44,12 +44,14 @@ def test_bytes_and_operations_of_straight_tetrahedra():
     bench_product.apply(model, residual)
     E, S, Q, n, w = model.info()["elements"], 10, 4, model.slots, 8
     C, v = E * S, 3 * 8
-    elements = 11 * w * E + 4 * E * (S + 1) + 2 * v * n + v * C
-    slots = 4 * (n + 1) + 4 * C + v * C + 3 * v * n + 8 * n  # on the CPU a row per slot
+    assert E <= 64  # one cluster: a sum for each slot, room for 32 S slots, two 16-bit numbers for each of 64 S places
+    cluster = 4 * (2 + 2 + 32 * S) + 4 * (64 * S + 16 * S + 4)
+    elements = 11 * w * E + 4 * E + 2 * v * n + v * n + cluster
+    slots = 4 * (n + 1) + 4 * n + v * n + (2 * v + 1) * n + 8 * n  # on the CPU a row per slot
     tables = w * (3 * S * Q + Q + S * S + S + 11)  # gradients, weights, mass, kinds of slots, coefficients
     counted = cost(residual)
     assert counted.bytes == elements + slots + tables
-    assert counted.flops == E * (Q * (96 + 305 + 136) + 480) + 3 * C + 10 * n
+    assert counted.flops == E * (Q * (96 + 305 + 136) + 480) + 3 * C + 3 * n + 10 * n
 
 
 def test_bytes_of_the_matrix():
@@ -57,7 +59,7 @@ def test_bytes_of_the_matrix():
     _, residual = bench_product.prepare(model, "matrix")
     bench_product.apply(model, residual)
     n, m = model.slots, residual.assembled.pattern.entries
-    assert cost(residual).bytes == 4 * (n + 1) + (4 + 36) * m + 3 * 12 * n + 8 * n
+    assert cost(residual).bytes == 4 * (n + 1) + (4 + 36) * m + (2 * 12 + 1) * n + 8 * n
 
 
 def test_product_measures_both_operators(tmp_path, capfd):

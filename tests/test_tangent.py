@@ -139,7 +139,8 @@ def massive_product(model, kernels, u, v, p, mass_factor=1e3):
     args = [block.data, data, u, v, history, mass, dq, on, p, 1, clusters.pool, out]
     wp.launch(kernels.massive_product, dim=(2, count), inputs=args, device="cpu")
     total = np.zeros((2, model.slots, 3))
-    np.add.at(total, (slice(None), data.slot.numpy()), out.numpy().astype(float))
+    slot = np.repeat(np.arange(model.slots), np.diff(clusters.topology.start.numpy()))
+    np.add.at(total, (slice(None), slot), out.numpy().astype(float)[:, clusters.topology.entry.numpy()])
     return total
 
 

@@ -1,16 +1,18 @@
 """What one product H p must move and compute, counted from the tables that its kernels take.
 
 Bytes: each launch reads or writes each of its arrays once, as if caches were perfect within a launch and empty between
-two. With E elements of S slots and Q points, n slots, C = E S contributions, vectors of v = 3 w and words of w bytes:
+two. With E elements of S slots and Q points, n slots, C contributions, vectors of v = 3 w and words of w bytes:
 
 elements, one launch per block
     w(tables) + 4 E (S + 1) + 2 v n + v C (+ v n or 6 w E Q with damping)
         tables: straight tetrahedra 11 w E (J0^-1, det J0, rho det J0) and the parent's tables; others (3 S + 1) w E Q,
         9 w E Q more with axes of the law; shears at T tying points of width W: (2 S + 6 + W) w E T
+        by clusters the tables of kernels/cluster.py in place of the 4 E S
 sum over the slots, one launch
-    4 (n + 1) + 4 C + v C + 3 v n + 8 n/32 (+ 4 (n + 1) + (4 + w) m for m masses, where elements do not hold it)
+    4 (n + 1) + 4 C + v C + (2 v + 1) n + 8 n/32 (+ 4 (n + 1) + (4 + w) m for m masses, where elements do not hold it)
+        C = E S, or the sums of the clusters
 matrix of m blocks of 3 x 3, one launch
-    4 (n + 1) + (4 + 9 w) m + 3 v n + 8 (threads)/32
+    4 (n + 1) + (4 + 9 w) m + (2 v + 1) n + 8 (threads)/32
 
 Operations: multiplications and additions each count one, as the kernels write them, before the compiler joins what is
 the same; so the count is approximate. Per element:
@@ -39,7 +41,7 @@ __all__ = ["Cost", "cost"]
 LAWS = {"svk": 305, "orthotropic": 285}
 STRAIGHT, FRAMED, DAMPED = 136, 270, 330
 VERTEX_POINT, VERTEX = 96, 480
-COMMON = ("conn", "is_position", "material", "coefficients")
+COMMON = ("is_position", "material", "coefficients")
 
 
 @dataclass(frozen=True)
@@ -54,15 +56,20 @@ def cost(residual: Residual) -> Cost:
     """Count those of `residual.product`, which has been called once. Constraints and follower loads are not counted."""
     model, topo = residual.model, residual.model.topology
     n, vector = model.slots, 3 * wp.types.type_size_in_bytes(model.types.T)
-    moved = 3 * vector * n + 8 * residual.curvature_rows.shape[2]  # p, what is free, H p; p.Hp in parts
+    moved = (2 * vector + 1) * n + 8 * residual.curvature_rows.shape[2]  # p, H p, what is held; p.Hp in parts
     if residual.by_matrix:
         assert residual.assembled is not None
         pattern = residual.assembled.pattern
         moved += _sizes(pattern.data, ("start", "column")) + _size(residual.matrix) // model.worlds
         return Cost(moved, 18 * pattern.entries + 10 * n)
-    moved += _sizes(topo, ("start", "entry")) + vector * model.contributions
-    flops = 3 * model.contributions + 10 * n
-    if not residual.massive:
+    clusters = residual.clusters
+    sums = clusters.sums if clusters else model.contributions
+    moved += _sizes(clusters.topology if clusters else topo, ("start", "entry")) + 2 * vector * sums
+    flops = 3 * model.contributions + 3 * (sums if clusters else 0) + 10 * n
+    if clusters:
+        for data, _ in clusters.blocks:
+            moved += _sizes(data, ("start", "slot_start", "slot", "table"))
+    else:
         moved += _sizes(topo, ("mass_start", "mass_column", "mass_value"))
         flops += 6 * topo.mass_value.size
     for block in model.blocks:
@@ -72,9 +79,9 @@ def cost(residual: Residual) -> Cost:
 
 
 def _block_bytes(block: Any, massive: bool, vector: int, slots: int) -> int:
-    """Tables, u, p and contributions of the elements of a block."""
+    """Tables, u and p of the elements of a block."""
     key = block.key
-    names: tuple[str, ...] = COMMON
+    names: tuple[str, ...] = COMMON if massive else (*COMMON, "conn")
     if key.tying:
         names += ("first", "second", "X_first", "X_second", "coupling")
     else:
@@ -87,8 +94,7 @@ def _block_bytes(block: Any, massive: bool, vector: int, slots: int) -> int:
         touched[part.conn + part.body.slot_offset] = True
     fields = 3 if key.damping == "rate" else 2
     past = 2 * vector * block.points * block.count if key.damping == "incremental" else 0
-    written = vector * block.slots * block.count
-    return _sizes(block.data, names) + fields * vector * int(touched.sum()) + past + written
+    return _sizes(block.data, names) + fields * vector * int(touched.sum()) + past
 
 
 def _element_flops(block: Any, massive: bool) -> int:

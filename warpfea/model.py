@@ -267,7 +267,7 @@ class Model:
         if key.affine:
             _, ds = family.shape(points, np.zeros((1, len(family.node_slots), 3)))
             table = ds[0][:, :, None, :]
-            data.J0_inv = self.array("elements", np.concatenate(J0), mat33)
+            data.J0_inv = self.element_array(np.concatenate(J0).reshape(-1, 9).T, T)
             data.det_J0 = self.array("elements", np.concatenate(w), T)
             if not any(callable(p.body.materials[p.material][1].density) for p in parts):
                 data.mass = self.array("elements", assembly.parent_mass(family), T)
@@ -294,6 +294,7 @@ class Model:
         topo.mass_column = self.array("mass", self.mass_host.indices, wp.int32)
         topo.mass_value = self.array("mass", self.mass_host.data, T)
         topo.free = self.array("slots", self.free_host, vec3)
+        topo.held = self.array("slots", (self.free_host == 0.0) @ [1, 2, 4], wp.uint8)
         self.topology = topo
 
     def graph(self) -> sp.csr_matrix:

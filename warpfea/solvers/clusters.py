@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.cluster import ELEMENTS, cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
+from ..kernels.cluster import CLUSTER, cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
 from ..kernels.structs import topology_struct
 
 if TYPE_CHECKING:
@@ -30,37 +30,38 @@ class ClusterTables:
     table: np.ndarray
 
 
-def cluster_tables(conn: np.ndarray) -> ClusterTables:
-    """Tables of runs of ELEMENTS elements; a run with more slots than a cluster holds is halved."""
+def cluster_tables(conn: np.ndarray, dtype: str) -> ClusterTables:
+    """Tables of runs of CLUSTER[dtype] elements; a run with more slots than a cluster holds is halved."""
     count, slots = conn.shape
-    start = np.append(np.arange(0, count, ELEMENTS), count)
-    cluster = np.repeat(np.arange(len(start) - 1), np.diff(start))
-    pairs = np.unique(cluster[:, None] * (conn.max() + 1) + conn) // (conn.max() + 1)
-    full = np.bincount(pairs) > slot_capacity(slots)
-    start = np.sort(np.concatenate([start, start[:-1][full] + ELEMENTS // 2]))
-    cluster = np.repeat(np.arange(len(start) - 1), np.diff(start))
-    # pairs (cluster, slot), then again by falling count
-    _, first, pair, times = np.unique(
-        cluster[:, None] * (conn.max() + 1) + conn, return_index=True, return_inverse=True, return_counts=True
-    )
-    owner, slot = cluster[first // slots], conn.ravel()[first]
+    start = np.append(np.arange(0, count, CLUSTER[dtype]), count)
+    while True:
+        cluster = np.repeat(np.arange(len(start) - 1), np.diff(start))
+        # pairs (cluster, slot)
+        _, first, pair, times = np.unique(
+            cluster[:, None] * (conn.max() + 1) + conn, return_index=True, return_inverse=True, return_counts=True
+        )
+        owner, slot = cluster[first // slots], conn.ravel()[first]
+        full = np.bincount(owner) > slot_capacity(dtype, slots)
+        if not full.any():
+            break
+        start = np.sort(np.concatenate([start, (start[:-1] + start[1:])[full] // 2]))
     order = np.lexsort((slot, -times, owner))
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     pair = rank[pair].reshape(conn.shape)
     slot_start = np.concatenate([[0], np.cumsum(np.bincount(owner))])
     within = np.arange(count) - start[cluster]
-    at_place, at_start, words = table_layout(slots)
+    at_place, at_start, words = table_layout(dtype, slots)
     table = np.zeros((len(start) - 1, 2 * words), dtype=np.uint16)
     by_slot = np.argsort(pair.T.ravel(), kind="stable")
     local, elem = np.divmod(by_slot, count)
     own = np.repeat(owner[order], times[order])  # of contributions
-    table[own, np.arange(len(own)) - slots * start[own]] = local * ELEMENTS + within[elem]
+    table[own, np.arange(len(own)) - slots * start[own]] = local * CLUSTER[dtype] + within[elem]
     for k in range(slots):
-        table[cluster, at_place + k * ELEMENTS + within] = pair[:, k] - slot_start[cluster]
+        table[cluster, at_place + k * CLUSTER[dtype] + within] = pair[:, k] - slot_start[cluster]
     end = np.cumsum(times[order]) - slots * start[owner[order]]
     table[owner[order], at_start + 1 + np.arange(len(order)) - slot_start[owner[order]]] = end
-    return ClusterTables(start, slot_start, slot[order], table.view(np.int32))
+    return ClusterTables(start, slot_start, slot[order], table.view(np.int32).ravel())
 
 
 @dataclass(eq=False)
@@ -84,12 +85,16 @@ def make_clusters(model: Model) -> Cluster:
     """Those of a model whose blocks are all massive."""
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
-        tables = cluster_tables(np.concatenate([p.conn + p.body.slot_offset for p in block.parts]))
+        conn = np.concatenate([p.conn + p.body.slot_offset for p in block.parts])
+        tables = cluster_tables(conn, model.dtype)
         data = cluster_struct()()
-        for name in ("start", "slot_start", "slot", "table"):
+        for name in ("start", "slot_start", "table"):
             setattr(data, name, model.array("clusters", getattr(tables, name), wp.int32))
         data.offset = offset
-        blocks.append((data, len(tables.start) - 1))
+        count = np.diff(tables.slot_start)
+        place = np.minimum(np.arange(slot_capacity(model.dtype, block.slots)), count[:, None] - 1)
+        data.slot = model.array("clusters", tables.slot[tables.slot_start[:-1, None] + place], wp.int32)
+        blocks.append((data, len(count)))
         slots.append(tables.slot)
         offset += len(tables.slot)
     of = np.concatenate(slots)
@@ -98,10 +103,10 @@ def make_clusters(model: Model) -> Cluster:
     topo.start = model.array("clusters", start, wp.int32)
     topo.entry = model.array("clusters", np.argsort(of, kind="stable"), wp.int32)
     topo.mass_start, topo.mass_column, topo.mass_value = own.mass_start, own.mass_column, own.mass_value
-    topo.free = own.free
+    topo.free, topo.held = own.free, own.held
     pool = pool_struct(model.dtype)()
-    numbers = max(pool_size(block.slots, 3 if block.key.damping == "rate" else 2) for block in model.blocks)
-    words = max(table_layout(block.slots)[2] for block in model.blocks)
+    numbers = max(pool_size(model.dtype, block.slots, 3 if block.key.damping == "rate" else 2) for block in model.blocks)
+    words = max(table_layout(model.dtype, block.slots)[2] for block in model.blocks)
     on_host = not model.device.is_cuda
     pool.number = wp.zeros(numbers if on_host else 1, dtype=model.types.T, device=model.device)
     pool.table = wp.zeros(words if on_host else 1, dtype=wp.int32, device=model.device)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..kernels.cluster import ELEMENTS
+from ..kernels.cluster import CLUSTER
 from ..kernels.constraints import SUM_ROWS, constraint_struct
 from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
@@ -242,11 +242,12 @@ class Residual:
         """out = H p at the iterate, and p.Hp in parts in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
         if self.clusters:
-            lanes = ELEMENTS if m.device.is_cuda else 1
+            threads = CLUSTER[m.dtype]
+            lanes = threads if m.device.is_cuda else 1
             for block, kernels, (data, count) in zip(m.blocks, self.block_kernels, self.clusters.blocks):
                 args = [block.data, data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
                 args += [lanes, self.clusters.pool, w.contribution]
-                launch(kernels.massive_product, (m.worlds, count * lanes), args, block_dim=ELEMENTS)
+                launch(kernels.massive_product, (m.worlds, count * lanes), args, block_dim=threads)
         elif not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
                 args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
@@ -267,8 +268,9 @@ class Residual:
         else:
             self.curvature_rows = w.warp_rows
             topology = self.clusters.topology if self.clusters else m.topology
-            args = [topology, w.contribution, *rest, int(self.massive), out, w.warp_rows]
-            launch(self.gather.product, (m.worlds, launch.padded(m.slots)), args)
+            total = self.gather.massive_sum if self.clusters else self.gather.product
+            args = [topology, w.contribution, *rest, out, w.warp_rows]
+            launch(total, (m.worlds, launch.padded(m.slots)), args)
 
     def _push_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""

@@ -1,0 +1,76 @@
+"""Clusters of straight elements: every contribution is summed once, however elements and slots are ordered."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from warpfea.kernels.cluster import CLUSTER, slot_capacity, table_layout
+
+import warpfea as wf
+from warpfea import bench_product
+from warpfea.solvers.clusters import cluster_tables
+
+
+def summed(conn, dtype, values, n):
+    """What the kernel does with contributions [element, local], from the tables alone."""
+    count, slots = conn.shape
+    t = cluster_tables(conn, dtype)
+    place, start, words = table_layout(dtype, slots)
+    table = t.table.view(np.uint16).reshape(-1, 2 * words).astype(int)
+    assert t.start[0] == 0 and t.start[-1] == count
+    out = np.zeros(n)
+    for k, (begin, end) in enumerate(zip(t.start[:-1], t.start[1:])):
+        own = t.slot[t.slot_start[k] : t.slot_start[k + 1]]
+        assert 0 < end - begin <= CLUSTER[dtype]
+        assert len(own) == len(set(own)) <= slot_capacity(dtype, slots)
+        elem = np.arange(end - begin)
+        for i in range(slots):
+            at = table[k, place + i * CLUSTER[dtype] + elem]
+            np.testing.assert_array_equal(own[at], conn[begin:end, i])
+        for j, slot in enumerate(own):
+            for e in range(table[k, start + j], table[k, start + j + 1]):
+                local, elem = divmod(table[k, e], CLUSTER[dtype])
+                assert conn[begin + elem, local] == slot
+                out[slot] += values[begin + elem, local]
+    return out
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(("count", "slots", "n"), [(1, 4, 4), (64, 10, 90), (300, 10, 5000), (300, 4, 60)])
+def test_every_contribution_is_summed_once(dtype, count, slots, n):
+    rng = np.random.default_rng(count)
+    conn = np.array([rng.choice(n, slots, replace=False) for _ in range(count)])
+    values = rng.uniform(-1, 1, conn.shape)
+    expected = np.zeros(n)
+    np.add.at(expected, conn, values)
+    np.testing.assert_allclose(summed(conn, dtype, values, n), expected, atol=1e-14)
+
+
+def test_clusters_with_too_many_slots_are_halved():
+    conn = np.arange(640).reshape(64, 10)
+    assert np.diff(cluster_tables(conn, "float64").start).tolist() == [32, 32]
+
+
+@pytest.mark.parametrize(("element", "dtype", "tol"), [("T10", "float64", 1e-12), ("T10", "float32", 1e-4), ("T4", "float64", 1e-12)])
+def test_product_of_elements_in_any_order(element, dtype, tol):
+    mesh = wf.mesh.box((1, 1, 1), cells=(4, 4, 3), element=element)
+    rng = np.random.default_rng(1)
+    order, to = rng.permutation(len(mesh.cells)), rng.permutation(len(mesh.points))
+    points = np.empty_like(mesh.points)
+    points[to] = mesh.points
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    shuffled = wf.mesh.Mesh(points, to[mesh.cells][order], mesh.cell_type)
+    body = b.add_solid(shuffled, material=wf.SVK(E=1e6, nu=0.3, density=1e3))
+    b.clamp(body.nodes(lambda X: X[:, 0] < 1e-9))
+    model = b.finalize(device="cpu", dtype=dtype)
+    sim, residual = bench_product.prepare(model, "elements")
+    ((_, clusters),) = residual.clusters.blocks
+    assert (clusters > 1 + len(mesh.cells) // CLUSTER[dtype]) == (element == "T10")  # some were halved
+    _, direction, out = bench_product.apply(model, residual)
+    p, dt = direction.numpy()[0].astype(float), bench_product.DT
+    exact = b.finalize(device="cpu") if dtype == "float32" else model
+    state = exact.state()
+    state.displacement.assign(sim.stepper.work.u.numpy().astype(float))
+    expected = model.mass_host @ p / dt + dt * (exact.tangent_matrix(state) @ p.ravel()).reshape(-1, 3)
+    expected *= model.free_host
+    assert np.abs(out.numpy()[0] - expected).max() < tol * np.abs(expected).max()
