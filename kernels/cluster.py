@@ -1,9 +1,9 @@
 """Products of elements by clusters: each reads its slots once, and adds up for each what its elements give.
 
 A cluster is a run of elements that one block of threads does. The fields at its slots lie in memory that the threads
-share, and so do the elements' contributions until they are summed, in a fixed order. What it writes is one sum per slot,
-about a third of the contributions, and to read a slot costs no address in global memory. On the CPU a cluster is one
-thread's, and arrays stand for the shared memory.
+share, and so do the elements' contributions until they are summed, in a fixed order. What it writes is one sum per
+slot, about a third of the contributions, and to read a slot costs no address in global memory. On the CPU a cluster is
+one thread's, and arrays stand for the shared memory.
 """
 
 import functools
@@ -15,7 +15,15 @@ import warp as wp
 from .lanes import lane_functions
 from .types import precision
 
-__all__ = ["CLUSTER", "cluster_functions", "cluster_struct", "pool_size", "pool_struct", "slot_capacity", "table_layout"]
+__all__ = [
+    "CLUSTER",
+    "cluster_functions",
+    "cluster_struct",
+    "pool_size",
+    "pool_struct",
+    "slot_capacity",
+    "table_layout",
+]
 
 CLUSTER = {"float64": 64, "float32": 128}
 """Elements of a cluster, and threads of its block: as many as shared memory and registers let fill a device well."""
@@ -48,8 +56,8 @@ def table_layout(dtype: str, slots: int) -> tuple[int, int, int]:
 def cluster_struct():
     """The clusters of a block of elements.
 
-    A table holds, in 16 bits each: sum_entry, local * CLUSTER + element of the cluster, of the contributions in the order
-    of the slots that they go to; place [local, element] of a slot in its cluster; sum_start [slot + 1].
+    A table holds, in 16 bits each: sum_entry, local * CLUSTER + element of the cluster, of the contributions in the
+    order of the slots that they go to; place [local, element] of a slot in its cluster; sum_start [slot + 1].
     """
 
     @wp.struct
@@ -186,7 +194,14 @@ def cluster_functions(dtype: str, slots: int, fields: int) -> _types.SimpleNames
 
     @wp.func
     def take_field(
-        field: wp.array2d(dtype=vec3), into: int, slot: Slots, world: int, first: int, lanes: int, count: int, pool: Pool
+        field: wp.array2d(dtype=vec3),
+        into: int,
+        slot: Slots,
+        world: int,
+        first: int,
+        lanes: int,
+        count: int,
+        pool: Pool,
     ):
         x = Values()
         for j in range(SLOTS_AT_ONCE):
@@ -196,7 +211,7 @@ def cluster_functions(dtype: str, slots: int, fields: int) -> _types.SimpleNames
                 put(3 * into * ROOM, ROOM, first + j * lanes, x[j], pool)
 
     def by_clusters(module: wp.Module, Block, product: wp.Function, bounded: bool) -> wp.Kernel:
-        """The kernel `massive_product`; `product` sets what an element gives, `bounded` holds its registers to BLOCKS."""
+        """The kernel `massive_product`; `product` sets what an element gives, `bounded`: registers go by BLOCKS."""
 
         @wp.kernel(module=module, launch_bounds=(ELEMENTS, BLOCKS[dtype]) if bounded else None)
         def massive_product(

@@ -19,6 +19,7 @@ from .vertex import vertex_product
 
 __all__ = ["element_kernels"]
 
+
 @functools.cache
 def element_kernels(
     dtype: str,

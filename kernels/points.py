@@ -222,7 +222,8 @@ def point_functions(
     return _types.SimpleNamespace(
         types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
         framed=framed, needs_J=law not in materials.ANY_J,
-        coefficients=coefficients, damping_coefficients=damping_coefficients, load=load, inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
+        coefficients=coefficients, damping_coefficients=damping_coefficients, load=load,
+        inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
         weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
         into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,
         strain_rate=strain_rate, vertex_jacobian=vertex_jacobian, point_increment=point_increment,

@@ -58,7 +58,10 @@ def vertex_product(
     Pool, fetch, set_force, add_force = shared.Pool, shared.fetch, shared.set_force, shared.add_force
     U, DU, V = 0, 1, 2
     Block, coefficients, inverse_jacobian, point_increment = (
-        fn.Block, fn.coefficients, fn.inverse_jacobian, fn.point_increment
+        fn.Block,
+        fn.coefficients,
+        fn.inverse_jacobian,
+        fn.point_increment,
     )
     Local = wp.types.matrix(shape=(10, 3), dtype=T)
     FIRST = points - 4

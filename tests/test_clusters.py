@@ -17,7 +17,7 @@ def summed(conn, dtype, values, n):
     t = cluster_tables(conn, dtype)
     place, start, words = table_layout(dtype, slots)
     table = t.table.view(np.uint16).reshape(-1, 2 * words).astype(int)
-    assert t.start[0] == 0 and t.start[-1] == count
+    assert (t.start[0], t.start[-1]) == (0, count)
     out = np.zeros(n)
     for k, (begin, end) in enumerate(zip(t.start[:-1], t.start[1:])):
         own = t.slot[t.slot_start[k] : t.slot_start[k + 1]]
@@ -51,7 +51,9 @@ def test_clusters_with_too_many_slots_are_halved():
     assert np.diff(cluster_tables(conn, "float64").start).tolist() == [32, 32]
 
 
-@pytest.mark.parametrize(("element", "dtype", "tol"), [("T10", "float64", 1e-12), ("T10", "float32", 1e-4), ("T4", "float64", 1e-12)])
+@pytest.mark.parametrize(
+    ("element", "dtype", "tol"), [("T10", "float64", 1e-12), ("T10", "float32", 1e-4), ("T4", "float64", 1e-12)]
+)
 def test_product_of_elements_in_any_order(element, dtype, tol):
     mesh = wf.mesh.box((1, 1, 1), cells=(4, 4, 3), element=element)
     rng = np.random.default_rng(1)

@@ -9,6 +9,7 @@ from warpfea.bench_peer import LARGE, PEER, required
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 
+
 @pytest.fixture(scope="module")
 def peer():
     content = json.loads((RESULTS / "peer_h200.json").read_text())

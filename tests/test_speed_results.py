@@ -32,8 +32,8 @@ def test_iterations_grow_where_the_readme_says(problem, below, worst):
 def test_the_operator_at_four_million_unknowns():
     rows = {r["dtype"]: r for r in load("product_h200.json")}
     assert rows["float64"]["unknowns"] > 3.9e6
-    assert rows["float64"]["unknowns_per_s"] > 10.8e9  # the bar is 8e9
-    assert rows["float32"]["unknowns_per_s"] > 16.4e9
+    assert rows["float64"]["unknowns_per_s"] > 11e9  # the bar is 8e9
+    assert rows["float32"]["unknowns_per_s"] > 20e9
 
 
 @pytest.mark.parametrize("problem", ["beam", "plate", "ENMC", "FN18"])

@@ -105,7 +105,9 @@ def make_clusters(model: Model) -> Cluster:
     topo.mass_start, topo.mass_column, topo.mass_value = own.mass_start, own.mass_column, own.mass_value
     topo.free, topo.held = own.free, own.held
     pool = pool_struct(model.dtype)()
-    numbers = max(pool_size(model.dtype, block.slots, 3 if block.key.damping == "rate" else 2) for block in model.blocks)
+    numbers = max(
+        pool_size(model.dtype, block.slots, 3 if block.key.damping == "rate" else 2) for block in model.blocks
+    )
     words = max(table_layout(model.dtype, block.slots)[2] for block in model.blocks)
     on_host = not model.device.is_cuda
     pool.number = wp.zeros(numbers if on_host else 1, dtype=model.types.T, device=model.device)
