@@ -6,10 +6,10 @@ inverse of P^T H P. C is dense when that is small; else it is CHEBYSHEV_STEPS st
 preconditioned by the same construction one level down. Adding all levels up instead (each treated once) is cheaper per
 iteration, but then iterations grow with the mesh.
 
-What was measured and costs more time than it saves: tiles that overlap (16 of 64 slots their own: 93 iterations in place
-of 172 with nu = 0.49, but inverses 16 times as large), and the ten quadratic functions of groups for shells (50k unknowns
-in statics 42 iterations in place of 105; in dynamics on the CPU 32 for 48, but 8.6 ms for 3.0 each, 593 ms per step for
-478; in groups of 160 slots, where they cost the same, statics gain a third and dynamics nothing).
+What was measured and costs more time than it saves: tiles that overlap (16 of 64 slots their own: 93 iterations in
+place of 172 with nu = 0.49, but inverses 16 times as large), and the ten quadratic functions of groups for shells (in
+statics 42 iterations in place of 105; 50k unknowns in dynamics on the CPU 32 for 48, but 8.6 ms for 3.0 each, 593 ms
+per step for 478; in groups of 160 slots, where they cost the same, statics gain a third and dynamics nothing).
 
 An odd number of Chebyshev steps keeps C positive whatever the largest eigenvalue is.
 
