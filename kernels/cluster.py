@@ -16,8 +16,9 @@ from .lanes import lane_functions
 from .types import precision
 
 __all__ = [
-    "CLUSTER",
+    "LARGEST",
     "cluster_functions",
+    "cluster_size",
     "cluster_struct",
     "pool_size",
     "pool_struct",
@@ -25,30 +26,38 @@ __all__ = [
     "table_layout",
 ]
 
-CLUSTER = {"float64": 64, "float32": 128}
+LARGEST = {"float64": 64, "float32": 128}
 """Elements of a cluster, and threads of its block: as many as shared memory and registers let fill a device well."""
-CAPACITY = {"float64": 32, "float32": 46}
-"""Slots that a cluster has room for, by slots of an element."""
-BLOCKS = {"float64": 6, "float32": 5}
-"""Blocks that registers must leave room for on a multiprocessor."""
+CAPACITY = {32: 24, 64: 32, 128: 46}
+"""Slots that clusters of these sizes have room for, by slots of an element."""
+THREADS = {"float64": 384, "float32": 640}
+"""Threads that registers must leave room for on a multiprocessor."""
 QUAD = 4
 """Words of a table that are read at once."""
 
 
-def slot_capacity(dtype: str, slots: int) -> int:
-    """Slots that a cluster of elements with so many has at most."""
-    return slots * CAPACITY[dtype]
+def cluster_size(dtype: str, count: int, *, fit: bool) -> int:
+    """Elements of a cluster in a block of so many.
+
+    `fit`: small blocks have small clusters, so that few threads idle where thousands of worlds are done at once.
+    """
+    return min(n for n in CAPACITY if n == LARGEST[dtype] or (fit and count <= n < LARGEST[dtype]))
 
 
-def pool_size(dtype: str, slots: int, fields: int) -> int:
+def slot_capacity(size: int, slots: int) -> int:
+    """Slots that a cluster of `size` elements with so many has at most."""
+    return slots * CAPACITY[size]
+
+
+def pool_size(size: int, slots: int, fields: int) -> int:
     """Numbers that a cluster holds: fields at its slots, contributions of its elements."""
-    return 3 * (fields * slot_capacity(dtype, slots) + slots * CLUSTER[dtype])
+    return 3 * (fields * slot_capacity(size, slots) + slots * size)
 
 
-def table_layout(dtype: str, slots: int) -> tuple[int, int, int]:
+def table_layout(size: int, slots: int) -> tuple[int, int, int]:
     """Where place and sum_start begin in a cluster's table of 16-bit numbers, and the words of the table."""
-    place = slots * CLUSTER[dtype]
-    words = place + slot_capacity(dtype, slots) // 2 + 1
+    place = slots * size
+    words = place + slot_capacity(size, slots) // 2 + 1
     return place, 2 * place, QUAD * -(-words // QUAD)
 
 
@@ -56,7 +65,7 @@ def table_layout(dtype: str, slots: int) -> tuple[int, int, int]:
 def cluster_struct():
     """The clusters of a block of elements.
 
-    A table holds, in 16 bits each: sum_entry, local * CLUSTER + element of the cluster, of the contributions in the
+    A table holds, in 16 bits each: sum_entry, local * size + element of the cluster, of the contributions in the
     order of the slots that they go to; place [local, element] of a slot in its cluster; sum_start [slot + 1].
     """
 
@@ -128,8 +137,8 @@ def _table_access(words: int) -> Callable:
 
 
 @functools.cache
-def cluster_functions(dtype: str, slots: int, fields: int) -> _types.SimpleNamespace:
-    """What element kernels need to take part.
+def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.SimpleNamespace:
+    """What kernels of elements with so many slots need to take part in clusters of `size`.
 
     `fetch(pool, field, i, at)`: a field (0 u, 1 direction, 2 v) at slot i of element `at` of the cluster; `set_force`
     and `add_force(pool, i, at, f)`: what it gives there; `by_clusters(module, Block, product, bounded)`:
@@ -139,10 +148,10 @@ def cluster_functions(dtype: str, slots: int, fields: int) -> _types.SimpleNames
     T, vec3, sym6 = p.T, p.vec3, p.sym
     Clusters, Pool = cluster_struct(), pool_struct(dtype)
     sync = lane_functions(dtype).sync
-    NS, ELEMENTS, ROOM = slots, CLUSTER[dtype], slot_capacity(dtype, slots)
-    PLACE, SUM_START, WORDS = table_layout(dtype, slots)
+    NS, ELEMENTS, ROOM = slots, size, slot_capacity(size, slots)
+    PLACE, SUM_START, WORDS = table_layout(size, slots)
     FORCE = 3 * fields * ROOM
-    number = _pool_access(dtype, pool_size(dtype, slots, fields))
+    number = _pool_access(dtype, pool_size(size, slots, fields))
     bits = _table_access(WORDS)
     # loads under way at once
     SLOTS_AT_ONCE, QUADS_AT_ONCE = -(-ROOM // ELEMENTS), -(-WORDS // (QUAD * ELEMENTS))
@@ -211,9 +220,9 @@ def cluster_functions(dtype: str, slots: int, fields: int) -> _types.SimpleNames
                 put(3 * into * ROOM, ROOM, first + j * lanes, x[j], pool)
 
     def by_clusters(module: wp.Module, Block, product: wp.Function, bounded: bool) -> wp.Kernel:
-        """The kernel `massive_product`; `product` sets what an element gives, `bounded`: registers go by BLOCKS."""
+        """The kernel `massive_product`; `product` sets what an element gives, `bounded`: registers go by THREADS."""
 
-        @wp.kernel(module=module, launch_bounds=(ELEMENTS, BLOCKS[dtype]) if bounded else None)
+        @wp.kernel(module=module, launch_bounds=(ELEMENTS, THREADS[dtype] // ELEMENTS) if bounded else None)
         def massive_product(
             block: Block,
             clusters: Clusters,

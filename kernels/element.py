@@ -9,13 +9,11 @@ import types as _types
 import warp as wp
 
 from . import materials
-from .cluster import CLUSTER, cluster_functions
 from .element_matrix import matrix_kernels
 from .element_output import output_kernels
 from .lanes import lane_functions
 from .points import point_functions
 from .types import kernel_module
-from .vertex import vertex_product
 
 __all__ = ["element_kernels"]
 
@@ -29,7 +27,6 @@ def element_kernels(
     affine: bool,
     damping: str | None,
     framed: bool = False,
-    vertex: bool = False,
 ) -> _types.SimpleNamespace:
     """Kernels of one kind of element block.
 
@@ -40,7 +37,6 @@ def element_kernels(
         affine: parent gradients and one J0 per element, or a table of h.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         framed: the law has axes of its own at each point.
-        vertex: straight 10-node tetrahedra with a rule for the product of kernels/vertex.py.
     """
     fn = point_functions(dtype, law, slots, affine, damping, framed)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
@@ -49,11 +45,9 @@ def element_kernels(
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
     viscous = materials.svk(dtype)
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
-    form = "vertex" if vertex else "affine" if affine else "framed" if framed else "table"
+    form = "affine" if affine else "framed" if framed else "table"
     name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
     module = kernel_module(name)
-    # slots in registers, not in arrays that loops index; the loops over points stay loops
-    massive_module = kernel_module(f"{name}_massive", max_unroll=16, block_dim=CLUSTER[dtype])
     prepare_matrix, element_matrix = matrix_kernels(fn, kernel_module(f"{name}_matrix", max_unroll=16))
 
     @wp.kernel(module=module)
@@ -120,75 +114,6 @@ def element_kernels(
             energy[0, world, block.element_offset + elem] = stored
             energy[1, world, block.element_offset + elem] = lost
 
-    @wp.func
-    def tangent_force(
-        block: Block,
-        U: Local,
-        dU: Local,
-        V: Local,
-        history: wp.array2d(dtype=sym6),
-        dq: T,
-        world: int,
-        elem: int,
-    ) -> Local:
-        """K dU of an element."""
-        c = fn.coefficients(block, world, elem)
-        f = Local()
-        for q in range(block.gradient.shape[0]):
-            G = fn.gradient_of(block, U, q, elem)
-            dG = fn.gradient_of(block, dU, q, elem)
-            Fdot = fn.velocity_gradient(block, V, q, elem)
-            dP = fn.point_increment(block, G, dG, Fdot, history, c, dq, world, q, elem)
-            f = fn.scatter(block, f, dP, q, elem)
-        return f
-
-    shared = cluster_functions(dtype, NS, 3 if damping == "rate" else 2)
-    Pool = shared.Pool
-
-    @wp.func
-    def fetch_all(block: Block, pool: Pool, field: int, at: int) -> Local:
-        """Slot values of an element, translations taken relative to the first slot."""
-        out = Local()
-        first = shared.fetch(pool, field, 0, at)
-        for i in range(NS):
-            out[i] = shared.fetch(pool, field, i, at) - block.is_position[i] * first
-        return out
-
-    if vertex:
-        product = vertex_product(dtype, points, damping == "rate", fn, shared)
-    else:
-
-        @wp.func
-        def product(
-            block: Block,
-            pool: Pool,
-            history: wp.array2d(dtype=sym6),
-            dq: T,
-            scale: T,
-            world: int,
-            elem: int,
-            at: int,
-        ):
-            """scale M p + dq K p of element `at` of a cluster."""
-            U = fetch_all(block, pool, 0, at)
-            dU = fetch_all(block, pool, 1, at)
-            V = Local()
-            if wp.static(damping == "rate"):
-                V = fetch_all(block, pool, 2, at)
-            f = tangent_force(block, U, dU, V, history, dq, world, elem)
-            first = shared.fetch(pool, 1, 0, at)
-            for i in range(NS):
-                a = vec3()
-                total = T(0.0)
-                for j in range(NS):
-                    a += block.mass[i, j] * dU[j]
-                    total += block.mass[i, j]
-                shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
-
-    # of this kind spilling was measured to be little; of others the compiler decides
-    bounded = vertex and law == "svk" and damping is None
-    massive_product = shared.by_clusters(massive_module, Block, product, bounded)
-
     @wp.kernel(module=module)
     def tangent_product(
         block: Block,
@@ -209,7 +134,7 @@ def element_kernels(
         V = Local()
         if wp.static(damping == "rate"):
             V = fn.load(block, v, world, elem)
-        f = tangent_force(block, U, dU, V, history, T(dq_dv[world]), world, elem)
+        f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), world, elem)
         for i in range(NS):
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
 
@@ -255,7 +180,6 @@ def element_kernels(
         module=module,
         internal_force=internal_force,
         tangent_product=tangent_product,
-        massive_product=massive_product,
         diagonal_blocks=diagonal_blocks,
         prepare_matrix=prepare_matrix,
         element_matrix=element_matrix,

@@ -219,6 +219,28 @@ def point_functions(
             dP = dP + dG * S + F * dS
         return dP
 
+    @wp.func
+    def tangent_force(
+        block: Block,
+        U: Local,
+        dU: Local,
+        V: Local,
+        history: wp.array2d(dtype=sym6),
+        dq: T,
+        world: int,
+        elem: int,
+    ) -> Local:
+        """K dU of an element."""
+        c = coefficients(block, world, elem)
+        f = Local()
+        for q in range(block.gradient.shape[0]):
+            G = gradient_of(block, U, q, elem)
+            dG = gradient_of(block, dU, q, elem)
+            Fdot = velocity_gradient(block, V, q, elem)
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, q, elem)
+            f = scatter(block, f, dP, q, elem)
+        return f
+
     return _types.SimpleNamespace(
         types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
         framed=framed, needs_J=law not in materials.ANY_J,
@@ -227,4 +249,5 @@ def point_functions(
         weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
         into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,
         strain_rate=strain_rate, vertex_jacobian=vertex_jacobian, point_increment=point_increment,
+        tangent_force=tangent_force,
     )  # fmt: skip

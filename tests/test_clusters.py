@@ -4,51 +4,57 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from warpfea.kernels.cluster import CLUSTER, slot_capacity, table_layout
+from warpfea.kernels.cluster import cluster_size, slot_capacity, table_layout
 
 import warpfea as wf
 from warpfea import bench_product
 from warpfea.solvers.clusters import cluster_tables
 
 
-def summed(conn, dtype, values, n):
+def summed(conn, size, values, n):
     """What the kernel does with contributions [element, local], from the tables alone."""
     count, slots = conn.shape
-    t = cluster_tables(conn, dtype)
-    place, start, words = table_layout(dtype, slots)
+    t = cluster_tables(conn, size)
+    place, start, words = table_layout(size, slots)
     table = t.table.view(np.uint16).reshape(-1, 2 * words).astype(int)
     assert (t.start[0], t.start[-1]) == (0, count)
     out = np.zeros(n)
     for k, (begin, end) in enumerate(zip(t.start[:-1], t.start[1:])):
         own = t.slot[t.slot_start[k] : t.slot_start[k + 1]]
-        assert 0 < end - begin <= CLUSTER[dtype]
-        assert len(own) == len(set(own)) <= slot_capacity(dtype, slots)
+        assert 0 < end - begin <= size
+        assert len(own) == len(set(own)) <= slot_capacity(size, slots)
         elem = np.arange(end - begin)
         for i in range(slots):
-            at = table[k, place + i * CLUSTER[dtype] + elem]
+            at = table[k, place + i * size + elem]
             np.testing.assert_array_equal(own[at], conn[begin:end, i])
         for j, slot in enumerate(own):
             for e in range(table[k, start + j], table[k, start + j + 1]):
-                local, elem = divmod(table[k, e], CLUSTER[dtype])
+                local, elem = divmod(table[k, e], size)
                 assert conn[begin + elem, local] == slot
                 out[slot] += values[begin + elem, local]
     return out
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("size", [32, 64, 128])
 @pytest.mark.parametrize(("count", "slots", "n"), [(1, 4, 4), (64, 10, 90), (300, 10, 5000), (300, 4, 60)])
-def test_every_contribution_is_summed_once(dtype, count, slots, n):
+def test_every_contribution_is_summed_once(size, count, slots, n):
     rng = np.random.default_rng(count)
     conn = np.array([rng.choice(n, slots, replace=False) for _ in range(count)])
     values = rng.uniform(-1, 1, conn.shape)
     expected = np.zeros(n)
     np.add.at(expected, conn, values)
-    np.testing.assert_allclose(summed(conn, dtype, values, n), expected, atol=1e-14)
+    np.testing.assert_allclose(summed(conn, size, values, n), expected, atol=1e-14)
+
+
+def test_sizes_of_clusters():
+    assert [cluster_size("float32", n, fit=True) for n in (1, 32, 33, 64, 65, 1000)] == [32, 32, 64, 64, 128, 128]
+    assert [cluster_size("float64", n, fit=True) for n in (1, 32, 33, 1000)] == [32, 32, 64, 64]
+    assert [cluster_size(dtype, 1, fit=False) for dtype in ("float32", "float64")] == [128, 64]
 
 
 def test_clusters_with_too_many_slots_are_halved():
     conn = np.arange(640).reshape(64, 10)
-    assert np.diff(cluster_tables(conn, "float64").start).tolist() == [32, 32]
+    assert np.diff(cluster_tables(conn, 64).start).tolist() == [32, 32]
 
 
 @pytest.mark.parametrize(
@@ -67,7 +73,7 @@ def test_product_of_elements_in_any_order(element, dtype, tol):
     model = b.finalize(device="cpu", dtype=dtype)
     sim, residual = bench_product.prepare(model, "elements")
     ((_, clusters),) = residual.clusters.blocks
-    assert (clusters > 1 + len(mesh.cells) // CLUSTER[dtype]) == (element == "T10")  # some were halved
+    assert (clusters > 1 + len(mesh.cells) // model.blocks[0].cluster) == (element == "T10")  # some were halved
     _, direction, out = bench_product.apply(model, residual)
     p, dt = direction.numpy()[0].astype(float), bench_product.DT
     exact = b.finalize(device="cpu") if dtype == "float32" else model

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from warpfea.kernels.element import element_kernels
+from warpfea.kernels.massive import massive_kernel
 
 import warpfea as wf
 from warpfea.mesh.cells import TET_EDGES
@@ -124,7 +124,7 @@ def massive_model(material, form, dtype, rule):
     return body, b.finalize(device="cpu", dtype=dtype, worlds=2)
 
 
-def massive_product(model, kernels, u, v, p, mass_factor=1e3):
+def massive_product(model, kernel, u, v, p, mass_factor=1e3):
     """Sums [world, slot] of what fields [world, slot] give in both worlds."""
     (block,) = model.blocks
     rng = np.random.default_rng(3)
@@ -137,7 +137,7 @@ def massive_product(model, kernels, u, v, p, mass_factor=1e3):
     ((data, count),) = clusters.blocks
     out = wp.zeros((2, clusters.sums), dtype=vec3, device="cpu")
     args = [block.data, data, u, v, history, mass, dq, on, p, 1, clusters.pool, out]
-    wp.launch(kernels.massive_product, dim=(2, count), inputs=args, device="cpu")
+    wp.launch(kernel, dim=(2, count), inputs=args, device="cpu")
     total = np.zeros((2, model.slots, 3))
     slot = np.repeat(np.arange(model.slots), np.diff(clusters.topology.start.numpy()))
     np.add.at(total, (slice(None), slot), out.numpy().astype(float)[:, clusters.topology.entry.numpy()])
@@ -161,14 +161,24 @@ def test_both_forms_of_the_product_agree(material, form, dtype, rule, data):
     body, model = massive_model(material, form, dtype, rule)
     (block,) = model.blocks
     assert block.key.vertex
-    general = element_kernels(dtype, material, 10, block.points, True, form)
+    general = massive_kernel(dtype, material, 10, block.points, form, False, block.cluster)
     u = np.stack([deformed(body), deformed(body, seed=1)])
     v, p = np.random.default_rng(2).uniform(-1, 1, (2, *u.shape))
     for mass_factor in (0.0, 1e3):  # 1e3: mass and stiffness are of one size
         expected = massive_product(model, general, u, v, p, mass_factor)
-        got = massive_product(model, block.kernels, u, v, p, mass_factor)
+        got = massive_product(model, block.massive_product(dtype, form), u, v, p, mass_factor)
         for world in range(2):
             assert data.error(got[world], expected[world]) < (1e-13 if dtype == "float64" else 1e-5)
+
+
+def test_the_size_of_clusters_changes_nothing(data):
+    body, model = massive_model("svk", None, "float64", "tet4")
+    (block,) = model.blocks
+    u, v, p = np.random.default_rng(2).uniform(-0.1, 0.1, (3, 2, *body.reference.shape))
+    expected = massive_product(model, block.massive_product("float64", None), u, v, p)
+    block.cluster = 32
+    got = massive_product(model, block.massive_product("float64", None), u, v, p)
+    assert data.error(got, expected) < 1e-14
 
 
 def test_a_translation_strains_no_straight_element():
@@ -177,9 +187,10 @@ def test_a_translation_strains_no_straight_element():
     shape = (2, *body.reference.shape)
     u, far = np.zeros(shape), np.broadcast_to([1e6 / 3, -1e5 / 7, 1e3 / 11], shape)
     p = np.random.default_rng(2).uniform(-1, 1, shape)
-    assert np.all(massive_product(model, block.kernels, p, u, far, 0.0) == 0.0)
-    at_rest = massive_product(model, block.kernels, u, u, p)
-    np.testing.assert_array_equal(massive_product(model, block.kernels, far, u, p), at_rest)
+    kernel = block.massive_product("float64", None)
+    assert np.all(massive_product(model, kernel, p, u, far, 0.0) == 0.0)
+    at_rest = massive_product(model, kernel, u, u, p)
+    np.testing.assert_array_equal(massive_product(model, kernel, far, u, p), at_rest)
 
 
 @pytest.mark.parametrize(

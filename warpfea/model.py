@@ -15,7 +15,9 @@ from .bodies import Body
 from .constraints import Constraints
 from .errors import ModelError
 from .evaluation import Evaluation
+from .kernels.cluster import cluster_size
 from .kernels.element import element_kernels
+from .kernels.massive import massive_kernel
 from .kernels.materials import ANY_J, NCOEF
 from .kernels.pcg import groups_struct
 from .kernels.points import block_struct
@@ -44,6 +46,7 @@ class Block:
     slots: int
     contribution_offset: int
     element_offset: int
+    cluster: int
     field_rule: Any = None
     shear: Any = None
 
@@ -57,7 +60,12 @@ class Block:
         k = self.key
         if k.tying:
             return self.kernels
-        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed, k.vertex)
+        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
+
+    def massive_product(self, dtype: str, damping: str | None) -> wp.Kernel:
+        """The kernel of the product of a massive block, with a form of damping."""
+        k = self.key
+        return massive_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster)
 
 
 class Model:
@@ -209,9 +217,10 @@ class Model:
         else:
             self._point_tables(data, key, parts)
             points = len(key.rule.weights)
-            kind = (key.law, family.slots, points, key.affine, key.damping, key.framed, key.vertex)
+            kind = (key.law, family.slots, points, key.affine, key.damping, key.framed)
             kernels = element_kernels(self.dtype, *kind)
-        return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element)
+        cluster = cluster_size(self.dtype, len(conn), fit=self.device.is_cuda)
+        return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element, cluster)
 
     def shear_block(self, block: Block) -> Block:
         """Elements of a tied block with their shears at points, for output."""
@@ -232,7 +241,7 @@ class Model:
         self._point_tables(data, key, parts)
         points = len(key.rule.weights)
         kernels = element_kernels(self.dtype, key.law, block.slots, points, False, None, True)
-        return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0)
+        return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster)
 
     def _tied_tables(self, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
         T, vec3 = self.types.T, self.types.vec3

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.cluster import CLUSTER, cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
+from ..kernels.cluster import cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
 from ..kernels.structs import topology_struct
 
 if TYPE_CHECKING:
@@ -30,10 +30,10 @@ class ClusterTables:
     table: np.ndarray
 
 
-def cluster_tables(conn: np.ndarray, dtype: str) -> ClusterTables:
-    """Tables of runs of CLUSTER[dtype] elements; a run with more slots than a cluster holds is halved."""
+def cluster_tables(conn: np.ndarray, size: int) -> ClusterTables:
+    """Tables of runs of `size` elements; a run with more slots than a cluster holds is halved."""
     count, slots = conn.shape
-    start = np.append(np.arange(0, count, CLUSTER[dtype]), count)
+    start = np.append(np.arange(0, count, size), count)
     while True:
         cluster = np.repeat(np.arange(len(start) - 1), np.diff(start))
         # pairs (cluster, slot)
@@ -41,7 +41,7 @@ def cluster_tables(conn: np.ndarray, dtype: str) -> ClusterTables:
             cluster[:, None] * (conn.max() + 1) + conn, return_index=True, return_inverse=True, return_counts=True
         )
         owner, slot = cluster[first // slots], conn.ravel()[first]
-        full = np.bincount(owner) > slot_capacity(dtype, slots)
+        full = np.bincount(owner) > slot_capacity(size, slots)
         if not full.any():
             break
         start = np.sort(np.concatenate([start, (start[:-1] + start[1:])[full] // 2]))
@@ -51,14 +51,14 @@ def cluster_tables(conn: np.ndarray, dtype: str) -> ClusterTables:
     pair = rank[pair].reshape(conn.shape)
     slot_start = np.concatenate([[0], np.cumsum(np.bincount(owner))])
     within = np.arange(count) - start[cluster]
-    at_place, at_start, words = table_layout(dtype, slots)
+    at_place, at_start, words = table_layout(size, slots)
     table = np.zeros((len(start) - 1, 2 * words), dtype=np.uint16)
     by_slot = np.argsort(pair.T.ravel(), kind="stable")
     local, elem = np.divmod(by_slot, count)
     own = np.repeat(owner[order], times[order])  # of contributions
-    table[own, np.arange(len(own)) - slots * start[own]] = local * CLUSTER[dtype] + within[elem]
+    table[own, np.arange(len(own)) - slots * start[own]] = local * size + within[elem]
     for k in range(slots):
-        table[cluster, at_place + k * CLUSTER[dtype] + within] = pair[:, k] - slot_start[cluster]
+        table[cluster, at_place + k * size + within] = pair[:, k] - slot_start[cluster]
     end = np.cumsum(times[order]) - slots * start[owner[order]]
     table[owner[order], at_start + 1 + np.arange(len(order)) - slot_start[owner[order]]] = end
     return ClusterTables(start, slot_start, slot[order], table.view(np.int32).ravel())
@@ -86,13 +86,13 @@ def make_clusters(model: Model) -> Cluster:
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
         conn = np.concatenate([p.conn + p.body.slot_offset for p in block.parts])
-        tables = cluster_tables(conn, model.dtype)
+        tables = cluster_tables(conn, block.cluster)
         data = cluster_struct()()
         for name in ("start", "slot_start", "table"):
             setattr(data, name, model.array("clusters", getattr(tables, name), wp.int32))
         data.offset = offset
         count = np.diff(tables.slot_start)
-        place = np.minimum(np.arange(slot_capacity(model.dtype, block.slots)), count[:, None] - 1)
+        place = np.minimum(np.arange(slot_capacity(block.cluster, block.slots)), count[:, None] - 1)
         data.slot = model.array("clusters", tables.slot[tables.slot_start[:-1, None] + place], wp.int32)
         blocks.append((data, len(count)))
         slots.append(tables.slot)
@@ -105,10 +105,8 @@ def make_clusters(model: Model) -> Cluster:
     topo.mass_start, topo.mass_column, topo.mass_value = own.mass_start, own.mass_column, own.mass_value
     topo.free, topo.held = own.free, own.held
     pool = pool_struct(model.dtype)()
-    numbers = max(
-        pool_size(model.dtype, block.slots, 3 if block.key.damping == "rate" else 2) for block in model.blocks
-    )
-    words = max(table_layout(model.dtype, block.slots)[2] for block in model.blocks)
+    numbers = max(pool_size(b.cluster, b.slots, 3 if b.key.damping == "rate" else 2) for b in model.blocks)
+    words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)
     on_host = not model.device.is_cuda
     pool.number = wp.zeros(numbers if on_host else 1, dtype=model.types.T, device=model.device)
     pool.table = wp.zeros(words if on_host else 1, dtype=wp.int32, device=model.device)

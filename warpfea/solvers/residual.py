@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..kernels.cluster import CLUSTER
 from ..kernels.constraints import SUM_ROWS, constraint_struct
 from ..kernels.gather import RESIDUAL_ROWS
 from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
@@ -89,6 +88,8 @@ class Residual:
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
+            forms = [block.key.damping if viscous else None for block in model.blocks]
+            self.products = [block.massive_product(model.dtype, form) for block, form in zip(model.blocks, forms)]
         self.keep, self.lasting = 0, False
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
@@ -125,7 +126,7 @@ class Residual:
             out |= {self.gather.matrix_module} | self.assembled.modules()
             out |= {self.lag.kernels.module} if self.keep else set()
         elif self.clusters:
-            out |= {k.massive_product.module for k in self.block_kernels}
+            out |= {kernel.module for kernel in self.products}
         return out
 
     def register(self, state: State) -> None:
@@ -242,12 +243,11 @@ class Residual:
         """out = H p at the iterate, and p.Hp in parts in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
         if self.clusters:
-            threads = CLUSTER[m.dtype]
-            lanes = threads if m.device.is_cuda else 1
-            for block, kernels, (data, count) in zip(m.blocks, self.block_kernels, self.clusters.blocks):
+            for block, kernel, (data, count) in zip(m.blocks, self.products, self.clusters.blocks):
+                lanes = block.cluster if m.device.is_cuda else 1
                 args = [block.data, data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
                 args += [lanes, self.clusters.pool, w.contribution]
-                launch(kernels.massive_product, (m.worlds, count * lanes), args, block_dim=threads)
+                launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
         elif not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
                 args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
