@@ -16,7 +16,10 @@ from .lanes import lane_functions
 from .types import precision
 
 __all__ = [
+    "DIRECTION",
     "LARGEST",
+    "U",
+    "V",
     "cluster_functions",
     "cluster_size",
     "cluster_struct",
@@ -29,9 +32,13 @@ __all__ = [
 LARGEST = {"float64": 64, "float32": 128}
 """Elements of a cluster, and threads of its block: as many as shared memory and registers let fill a device well."""
 CAPACITY = {32: 24, 64: 32, 128: 46}
-"""Slots that clusters of these sizes have room for, by slots of an element."""
+"""Slots that clusters of these sizes have room for, as multiples of the slots of an element."""
+SHARED_BYTES = 48 * 1024
+"""Shared memory that a block may have without asking."""
 THREADS = {"float64": 384, "float32": 640}
 """Threads that registers must leave room for on a multiprocessor."""
+U, DIRECTION, V = 0, 1, 2
+"""Fields of a cluster."""
 QUAD = 4
 """Words of a table that are read at once."""
 
@@ -125,7 +132,13 @@ def _table_access(words: int) -> Callable:
     int* table = spare.data;
     if (copy) {{ for (int i = {QUAD} * k; i < {QUAD} * k + {QUAD}; ++i) table[i] = source.data[first + i]; return 0; }}
     #endif
-    return ((const unsigned short*)table)[k];
+    #if defined(__CUDA_ARCH__)
+    return ((const unsigned short*)table)[k];  // the block's barrier stands between this and the copy
+    #else
+    unsigned short x;
+    memcpy(&x, (const char*)table + 2 * k, 2);
+    return x;
+    #endif
     """
 
     @wp.func_native(snippet)
@@ -140,7 +153,7 @@ def _table_access(words: int) -> Callable:
 def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.SimpleNamespace:
     """What kernels of elements with so many slots need to take part in clusters of `size`.
 
-    `fetch(pool, field, i, at)`: a field (0 u, 1 direction, 2 v) at slot i of element `at` of the cluster; `set_force`
+    `fetch(pool, field, i, at)`: a field (U, DIRECTION, V) at slot i of element `at` of the cluster; `set_force`
     and `add_force(pool, i, at, f)`: what it gives there; `by_clusters(module, Block, product, bounded)`:
     the kernel.
     """
@@ -151,7 +164,9 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
     NS, ELEMENTS, ROOM = slots, size, slot_capacity(size, slots)
     PLACE, SUM_START, WORDS = table_layout(size, slots)
     FORCE = 3 * fields * ROOM
-    number = _pool_access(dtype, pool_size(size, slots, fields))
+    numbers = pool_size(size, slots, fields)
+    assert numbers * (8 if dtype == "float64" else 4) + 4 * WORDS < SHARED_BYTES, "smaller clusters are wanted"
+    number = _pool_access(dtype, numbers)
     bits = _table_access(WORDS)
     # loads under way at once
     SLOTS_AT_ONCE, QUADS_AT_ONCE = -(-ROOM // ELEMENTS), -(-WORDS // (QUAD * ELEMENTS))
@@ -253,10 +268,10 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
             for first in range(lane, count, SLOTS_AT_ONCE * lanes):
                 if first != lane:
                     slot = slots_from(clusters, cluster, first, lanes)
-                take_field(u, 0, slot, world, first, lanes, count, pool)
-                take_field(direction, 1, slot, world, first, lanes, count, pool)
+                take_field(u, U, slot, world, first, lanes, count, pool)
+                take_field(direction, DIRECTION, slot, world, first, lanes, count, pool)
                 if wp.static(fields == 3):
-                    take_field(v, 2, slot, world, first, lanes, count, pool)
+                    take_field(v, V, slot, world, first, lanes, count, pool)
             sync()
             first_elem = clusters.start[cluster]
             for elem in range(first_elem + lane, clusters.start[cluster + 1], lanes):

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from .cluster import cluster_functions
+from .cluster import DIRECTION, U, V, cluster_functions
 from .points import point_functions
 from .types import kernel_module
 from .vertex import vertex_product
@@ -53,18 +53,18 @@ def massive_kernel(
             block: Block, pool: Pool, history: wp.array2d(dtype=sym6), dq: T, scale: T, world: int, elem: int, at: int
         ):
             """scale M p + dq K p of element `at` of a cluster."""
-            U = fetch_all(block, pool, 0, at)
-            dU = fetch_all(block, pool, 1, at)
-            V = Local()
+            u = fetch_all(block, pool, U, at)
+            du = fetch_all(block, pool, DIRECTION, at)
+            v = Local()
             if wp.static(damping == "rate"):
-                V = fetch_all(block, pool, 2, at)
-            f = fn.tangent_force(block, U, dU, V, history, dq, world, elem)
-            first = shared.fetch(pool, 1, 0, at)
+                v = fetch_all(block, pool, V, at)
+            f = fn.tangent_force(block, u, du, v, history, dq, world, elem)
+            first = shared.fetch(pool, DIRECTION, 0, at)
             for i in range(NS):
                 a = vec3()
                 total = T(0.0)
                 for j in range(NS):
-                    a += block.mass[i, j] * dU[j]
+                    a += block.mass[i, j] * du[j]
                     total += block.mass[i, j]
                 shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
 

@@ -12,13 +12,14 @@ translation. Forces are the transpose: slot e(v, b) takes 4 s Q_v dL_b of the st
 
     corner b: -B dL_b,    edge a b: R (dL_a + dL_b),    B = s sum_v Q_v,    R = Q_centroid + (1 - s) sum_v Q_v.
 
-What lives across a point is H of each field, B, and the slots that earlier vertices touched, not all values of slots.
+What lives across a point is H of each field and B; forces lie with the fields in the memory of a cluster.
 """
 
 import types as _types
 
 import warp as wp
 
+from .cluster import DIRECTION, U, V
 from .types import precision
 
 __all__ = ["vertex_product"]
@@ -56,7 +57,6 @@ def vertex_product(
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Pool, fetch, set_force, add_force = shared.Pool, shared.fetch, shared.set_force, shared.add_force
-    U, DU, V = 0, 1, 2
     Block, coefficients, inverse_jacobian, point_increment = (
         fn.Block,
         fn.coefficients,
@@ -102,7 +102,7 @@ def vertex_product(
         """Adds what B and R give, and scale M p, where M has one number for each way that two slots can lie."""
         u = Local()
         for i in range(10):
-            u[i] = fetch(pool, DU, i, at)
+            u[i] = fetch(pool, DIRECTION, i, at)
         beside = scale * block.mass[0, 1]
         near = scale * block.mass[0, 4]
         far = scale * block.mass[0, 5]
@@ -144,7 +144,7 @@ def vertex_product(
         # the first function's gradient at the first vertex's point is 3 s dL_0
         s = -block.gradient[FIRST, 0, 0][0] / T(3.0)
         H = common(pool, U, at, s)
-        dH = common(pool, DU, at, s)
+        dH = common(pool, DIRECTION, at, s)
         rate_H = mat33()
         if wp.static(rate):
             rate_H = common(pool, V, at, s)
@@ -155,7 +155,7 @@ def vertex_product(
             e = wp.static(SPOKES[k])
             J0_inv = inverse_jacobian(block, elem)
             G = (H + T(4.0) * s * spokes(pool, U, at, e)) * J0_inv
-            dG = (dH + T(4.0) * s * spokes(pool, DU, at, e)) * J0_inv
+            dG = (dH + T(4.0) * s * spokes(pool, DIRECTION, at, e)) * J0_inv
             Fdot = mat33()
             if wp.static(rate):
                 Fdot = (rate_H + T(4.0) * s * spokes(pool, V, at, e)) * J0_inv
@@ -172,7 +172,7 @@ def vertex_product(
         R = (T(1.0) / s - T(1.0)) * B
         if wp.static(FIRST == 1):
             G = central(pool, U, at) * inverse_jacobian(block, elem)
-            dG = central(pool, DU, at) * inverse_jacobian(block, elem)
+            dG = central(pool, DIRECTION, at) * inverse_jacobian(block, elem)
             Fdot = mat33()
             if wp.static(rate):
                 Fdot = central(pool, V, at) * inverse_jacobian(block, elem)

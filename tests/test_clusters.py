@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 from warpfea.kernels.cluster import cluster_size, slot_capacity, table_layout
 
 import warpfea as wf
@@ -82,3 +83,32 @@ def test_product_of_elements_in_any_order(element, dtype, tol):
     expected = model.mass_host @ p / dt + dt * (exact.tangent_matrix(state) @ p.ravel()).reshape(-1, 3)
     expected *= model.free_host
     assert np.abs(out.numpy()[0] - expected).max() < tol * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(("dtype", "tol"), [("float64", 1e-14), ("float32", 1e-5)])
+def test_several_blocks_and_worlds_against_the_plain_sum(dtype, tol):
+    b = wf.ModelBuilder()
+    for k, (element, form) in enumerate([("T10", "rate"), ("T4", None), ("T10", "incremental")]):
+        damping = wf.KelvinVoigt(2e4, 3e4, form=form) if form else None
+        mesh = wf.mesh.box((1, 1, 1), cells=(3, 3, 2 + k), element=element, origin=(2 * k, 0, 0))
+        b.clamp(b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1e3, damping=damping)).nodes("x-"))
+    model = b.finalize(device="cpu", dtype=dtype, worlds=3)
+    sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(operator="elements"))
+    residual, w = sim.stepper.newton.residual, sim.stepper.work
+    rng = np.random.default_rng(5)
+    for field in (w.u, w.v, w.p):
+        field.assign((0.05 * rng.uniform(-1, 1, (3, model.slots, 3))).astype(dtype))
+    w.history.assign((0.05 * rng.uniform(-1, 1, (3, model.history_count, 6))).astype(dtype))
+    w.step.mass_factor.assign([1e3, 2e3, 3e3])
+    w.step.dq_dv.assign([1e-3, 2e-3, 3e-3])
+    active = wp.array([1, 0, 1], dtype=wp.int32, device="cpu")
+    got = []
+    for clusters in (residual.clusters, None):
+        residual.clusters = clusters
+        w.contribution.fill_(np.nan)
+        residual.pool.number.fill_(np.nan)
+        w.Hp.fill_(7.0)
+        residual.product(w.p, w.Hp, active)
+        got.append(w.Hp.numpy().astype(float))
+    assert np.all(got[0][1] == 7.0)
+    assert np.abs(got[0] - got[1]).max() < tol * np.abs(got[1]).max()

@@ -1,7 +1,8 @@
 """What one product H p must move and compute, counted from the tables that its kernels take.
 
 Bytes: each launch reads or writes each of its arrays once, as if caches were perfect within a launch and empty between
-two. With E elements of S slots and Q points, n slots, C contributions, vectors of v = 3 w and words of w bytes:
+two. With E elements of S slots and Q points, n slots, C contributions (E S, or the sums of clusters), vectors of
+v = 3 w and words of w bytes:
 
 elements, one launch per block
     w(tables) + 4 E (S + 1) + 2 v n + v C (+ v n or 6 w E Q with damping)
@@ -10,7 +11,6 @@ elements, one launch per block
         by clusters the tables of kernels/cluster.py in place of the 4 E S
 sum over the slots, one launch
     4 (n + 1) + 4 C + v C + (2 v + 1) n + 8 n/32 (+ 4 (n + 1) + (4 + w) m for m masses, where elements do not hold it)
-        C = E S, or the sums of the clusters
 matrix of m blocks of 3 x 3, one launch
     4 (n + 1) + (4 + 9 w) m + (2 v + 1) n + 8 (threads)/32
 

@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from .. import assembly
 from ..kernels.cluster import cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
 from ..kernels.structs import topology_struct
 
 if TYPE_CHECKING:
     from ..model import Model
+    from ..workspace import Workspace
 
-__all__ = ["Cluster", "ClusterTables", "cluster_tables", "make_clusters"]
+__all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_clusters", "make_pool"]
 
 
 @dataclass(eq=False)
@@ -65,23 +67,21 @@ def cluster_tables(conn: np.ndarray, size: int) -> ClusterTables:
 
 
 @dataclass(eq=False)
-class Cluster:
+class ModelClusters:
     """The clusters of a model.
 
     Attributes:
         blocks: device struct and number of clusters of each block.
         topology: who contributes to a slot, with the sums of clusters as contributions.
         sums: their number.
-        pool: memory of a cluster on the CPU.
     """
 
     blocks: list[tuple[Any, int]]
     topology: Any
     sums: int
-    pool: Any
 
 
-def make_clusters(model: Model) -> Cluster:
+def make_clusters(model: Model) -> ModelClusters:
     """Those of a model whose blocks are all massive."""
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
@@ -97,17 +97,18 @@ def make_clusters(model: Model) -> Cluster:
         blocks.append((data, len(count)))
         slots.append(tables.slot)
         offset += len(tables.slot)
-    of = np.concatenate(slots)
-    topo, own = topology_struct(model.dtype)(), model.topology
-    start = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=model.slots))])
-    topo.start = model.array("clusters", start, wp.int32)
-    topo.entry = model.array("clusters", np.argsort(of, kind="stable"), wp.int32)
-    topo.mass_start, topo.mass_column, topo.mass_value = own.mass_start, own.mass_column, own.mass_value
-    topo.free, topo.held = own.free, own.held
-    pool = pool_struct(model.dtype)()
+    topo = topology_struct(model.dtype)()
+    start, entry = assembly.gather_table([of[:, None] for of in slots], model.slots)
+    topo.start, topo.entry = model.array("clusters", start, wp.int32), model.array("clusters", entry, wp.int32)
+    topo.held = model.topology.held
+    return ModelClusters(blocks, topo, offset)
+
+
+def make_pool(model: Model, work: Workspace) -> Any:
+    """What stands for the shared memory of a cluster on the CPU."""
+    pool, on_host = pool_struct(model.dtype)(), not model.device.is_cuda
     numbers = max(pool_size(b.cluster, b.slots, 3 if b.key.damping == "rate" else 2) for b in model.blocks)
     words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)
-    on_host = not model.device.is_cuda
-    pool.number = wp.zeros(numbers if on_host else 1, dtype=model.types.T, device=model.device)
-    pool.table = wp.zeros(words if on_host else 1, dtype=wp.int32, device=model.device)
-    return Cluster(blocks, topo, offset, pool)
+    pool.number = work.array("cluster numbers", (numbers if on_host else 1,), model.types.T)
+    pool.table = work.array("cluster table", (words if on_host else 1,), wp.int32)
+    return pool

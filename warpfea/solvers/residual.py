@@ -13,7 +13,7 @@ from ..kernels.reduce import CHUNK, reduce_kernels
 from ..kernels.structs import additions_struct
 from ..launch import labelled
 from .assembled import Assembled, shaped
-from .clusters import Cluster, make_clusters
+from .clusters import ModelClusters, make_clusters, make_pool
 from .lag import Lag
 
 if TYPE_CHECKING:
@@ -83,11 +83,12 @@ class Residual:
         if not model.device.is_cuda:
             many = assembled and not self.massive
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
-        self.clusters: Cluster | None = None
+        self.clusters: ModelClusters | None = None
         if self.massive and not self.by_matrix:
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
+            self.pool = make_pool(model, work)
             forms = [block.key.damping if viscous else None for block in model.blocks]
             self.products = [block.massive_product(model.dtype, form) for block, form in zip(model.blocks, forms)]
         self.keep, self.lasting = 0, False
@@ -246,7 +247,7 @@ class Residual:
             for block, kernel, (data, count) in zip(m.blocks, self.products, self.clusters.blocks):
                 lanes = block.cluster if m.device.is_cuda else 1
                 args = [block.data, data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
-                args += [lanes, self.clusters.pool, w.contribution]
+                args += [lanes, self.pool, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
         elif not self.by_matrix:
             for block, kernels in zip(m.blocks, self.block_kernels):
