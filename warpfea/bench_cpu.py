@@ -144,7 +144,7 @@ def cpu(options: argparse.Namespace) -> None:
     if options.device not in (None, "cpu"):
         raise UsageError(f"--device {options.device} does not go with --cpu")
     options.device = "cpu"
-    cases = by_label(options.rows, CASES) if options.rows else list(CASES)
+    cases = by_label(options.rows, CASES) if options.rows is not None else list(CASES)
     steps, limit = options.steps or STEPS, options.limit or LIMIT
     settings = {
         "rows": [case.label for case in cases],

@@ -78,7 +78,7 @@ class PeerRow:
     Attributes:
         unknowns: 3 x nodes or slots, as the peer counts.
         free_unknowns: those that are not clamped; bytes are per free unknown.
-        speedup: peer_ms over ms_per_step.
+        speedup: peer_ms over ms_per_step; None where a step kept more than FORCE_TOL, as float32 may.
         required: smallest speedup that will do.
         residual_force: largest |g|_2 of a step.
         tip_difference: of the tip from the tighter solve, over the latter.
@@ -144,7 +144,9 @@ def measure(case: Case, dtype: str, *, device: Any, steps: int, meshes: pathlib.
     if dtype != "float64":
         model = builder.finalize(device=device)
     exact = float(tight(model, at).tip(problem.axis)[-1])
-    return replace(row, speedup=case.peer_ms / row.ms_per_step, tip_difference=abs(tip - exact) / abs(exact))
+    met = row.residual_force <= FORCE_TOL
+    speedup = case.peer_ms / row.ms_per_step if met else None
+    return replace(row, speedup=speedup, tip_difference=abs(tip - exact) / abs(exact))
 
 
 def tight(model: Any, steps: int) -> Run:
@@ -177,7 +179,7 @@ def by_label(rows: str, every: Sequence[Any]) -> list[Any]:
     """Cases whose labels fit one of the words with commas, in their order. UsageError for a word that fits none."""
     from .cli.parser import UsageError
 
-    words = rows.split(",")
+    words = [word.strip() for word in rows.split(",")]
     for word in words:
         if not any(fnmatch.fnmatchcase(case.label, word) for case in every):
             raise UsageError(f"--rows: no row {word!r}; there are {', '.join(case.label for case in every)}")

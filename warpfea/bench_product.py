@@ -26,7 +26,7 @@ import warp as wp
 from .bench import check_sizes, solver, write
 from .bench_cost import cost
 from .bench_problems import DENSITY, PROBLEMS
-from .model import Model
+from .model import Model, find_device
 from .profiling import copy_bandwidth
 from .simulation import Simulation
 from .solvers.residual import Residual
@@ -188,7 +188,7 @@ def product(options: argparse.Namespace) -> None:
     """Do `warpfea bench --product`: a line per row, and the file after each."""
     problems = [PROBLEMS[name] for name in options.problem or PROBLEM_SIZES]
     check_sizes(problems, options.unknowns)
-    device = wp.get_device(options.device) if options.device else wp.get_preferred_device()
+    device = find_device(options.device)
     repeat, dtypes = options.repeat or REPEAT, options.dtype or ["float64", "float32"]
     sizes = {p.name: options.unknowns or [PROBLEM_SIZES.get(p.name, 1_000_000)] for p in problems}
     settings = {

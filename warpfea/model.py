@@ -30,7 +30,7 @@ from .state import State
 if TYPE_CHECKING:
     from .builder import ModelBuilder
 
-__all__ = ["Block", "Model"]
+__all__ = ["Block", "Model", "find_device"]
 
 
 @dataclass(eq=False)
@@ -96,7 +96,7 @@ class Model:
             raise ModelError(f"worlds = {worlds!r} must be a positive whole number")
         if not builder.bodies:
             raise ModelError("the model has no body: call add_solid, add_beam or add_shell first")
-        self.device = _device(device)
+        self.device = find_device(device)
         self.dtype = dtype
         self.worlds = int(worlds)
         self.up_axis = builder.up_axis
@@ -557,7 +557,8 @@ class Model:
         return h.hexdigest()
 
 
-def _device(device: Any) -> Any:
+def find_device(device: Any) -> Any:
+    """A Warp device by name, None for the preferred one. ModelError lists those there are."""
     try:
         return wp.get_device(device) if device is not None else wp.get_preferred_device()
     except Exception as error:

@@ -26,6 +26,7 @@ from .errors import ModelError
 from .kernels.probe import probe_kernels
 from .launch import PARTS, kernel_name
 from .simulation import Simulation
+from .solvers.checks import is_count
 
 __all__ = ["KernelTime", "Profile", "Recorder", "copy_bandwidth", "launch_bytes", "profile"]
 
@@ -247,8 +248,8 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
         ModelError: steps out of range, or a simulation whose steps are not recorded.
         ConvergenceError, ConstraintError: a step failed.
     """
-    if steps < 1:
-        raise ModelError(f"profile: steps = {steps!r} must be at least 1")
+    if not (is_count(steps) and steps >= 1):
+        raise ModelError(f"profile: steps = {steps!r} must be a whole number, at least 1")
     stepper = sim.stepper
     if stepper.graph is None:
         raise ModelError("profile: the simulation was made with capture=False, or with linear='direct'")

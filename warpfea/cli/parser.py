@@ -205,9 +205,9 @@ def _call(module: str, function: str) -> Any:
     return command
 
 
-def _add_general(to: argparse.ArgumentParser) -> None:
+def _add_general(to: argparse.ArgumentParser, quiet: str = "no bars and no summary table") -> None:
     group = to.add_argument_group("general")
-    group.add_argument("--quiet", action="store_true", help="no bars and no summary table")
+    group.add_argument("--quiet", action="store_true", help=quiet)
     group.add_argument("--no-progress", action="store_true", help="no bars; there are none without a terminal")
     group.add_argument("--debug", action="store_true", help="errors as Python tracebacks")
 
@@ -352,7 +352,7 @@ def _add_bench(commands: Any) -> None:
     to.add_argument(
         "--linear", action="append", choices=("pcg", "direct"), help="linear solver, may be repeated; default pcg"
     )
-    to.add_argument("--steps", type=count, metavar="N", help="steps to simulate (default 10, --peer 120, --cpu 6)")
+    to.add_argument("--steps", type=count, metavar="N", help="steps to simulate (default 10, --peer 120, --cpu 20)")
     to.add_argument("--repeat", type=count, metavar="N", help="runs; the median counts (default 3, --product 9)")
     to.add_argument("--dt", type=positive, metavar="S", help="step, s (default 1e-3)")
     to.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
@@ -364,11 +364,13 @@ def _add_bench(commands: Any) -> None:
     )
     group = to.add_argument_group("with --peer or --cpu")
     group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
-    group.add_argument("--limit", type=positive, metavar="S", help="--cpu: s that a step may take (default 60)")
+    group.add_argument(
+        "--limit", type=positive, metavar="S", help="--cpu: s after which a row takes no more steps (default 60)"
+    )
     group.add_argument("--large", action="store_true", help="a bar of 4 million unknowns too, ten steps")
     group.add_argument("--meshes", metavar="FOLDER", help="unstructured meshes (default: tests/data of the checkout)")
     to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")
-    _add_general(to)
+    _add_general(to, "no bars; the table is what it is for")
     to.set_defaults(command=_bench)
 
 

@@ -20,6 +20,10 @@ __all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "WHOLE_SLOTS", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
 """Slots of a group whose affine motions are the coarse space: 16 unknowns of a level to one of the next."""
+SMALL_GROUPS = (16, 32)
+SMALL_COARSE = 48
+"""Groups of fewer slots where that gives a coarse level of up to so many: a small slender body has too few groups of 64
+to bend (a cantilever of 180 slots takes half of the iterations)."""
 WHOLE_SLOTS = 160
 """A model of up to so many slots is inverted as one dense matrix: it needs no levels."""
 BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
@@ -83,6 +87,7 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[
         # larger groups where that makes the next level the bottom: one dense product costs less than more levels
         large = 2 * GROUP_SLOTS
         capacity = large if 4 * n / GROUP_SLOTS > bottom >= 4.05 * n / large else GROUP_SLOTS
+        capacity = next((c for c in SMALL_GROUPS if 4.05 * n / c <= SMALL_COARSE), capacity)
         level, points, pattern = _make_level(model, pattern, points, capacity)
         levels.append(level)
         # joints tie what elements don't; further down anything near may share a group

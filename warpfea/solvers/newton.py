@@ -80,8 +80,10 @@ class NewtonPCG:
             raise ModelError(f"NewtonPCG: force_tol = {self.force_tol!r} must be zero or positive, N")
         if self.linear not in ("pcg", "direct"):
             raise ModelError(f"NewtonPCG: linear = {self.linear!r} is neither 'pcg' nor 'direct'")
-        if self.linear == "direct" and self.preconditioner != "auto":
-            raise ModelError(f"NewtonPCG: preconditioner = {self.preconditioner!r} is not for linear = 'direct'")
+        idle = {"preconditioner": "auto", "preconditioner_dtype": None, "forcing": None}
+        for name, default in idle.items() if self.linear == "direct" else ():
+            if getattr(self, name) != default:
+                raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} is not for linear = 'direct'")
         if self.preconditioner not in ("auto", *NAMES):
             raise ModelError(
                 f"preconditioner {self.preconditioner!r} is unknown; there are auto, two-level, deflated, block-jacobi"
