@@ -33,7 +33,7 @@ def lag_struct():
         build: wp.array(dtype=wp.int32)  # make it now
         moved: wp.array(dtype=wp.int32)  # at the present iterate; else again where it was made
         changed: wp.array(dtype=wp.int32)  # it was moved since the state last heard
-        stale: wp.array(dtype=wp.int32)  # the matrices at hand are not those of the state
+        stale: wp.array(dtype=wp.int32)  # the matrices at hand are not those of the state; 2: its counts are
         due: wp.array(dtype=wp.int32)  # make it at the next solve
         mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv it was made for; negative: never made
         dq_dv: wp.array(dtype=wp.float64)
@@ -59,6 +59,18 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
     module = block_kernels(dtype).module  # one with the matrices that it keeps
 
     @wp.func
+    def recall(lag: Lag, world: int):
+        """What the state remembers, once after it was set from elsewhere."""
+        if lag.stale[world] == 1:
+            lag.due[world] = int(lag.kept[world, 0])
+            lag.mass_factor[world] = lag.kept[world, 1]
+            lag.dq_dv[world] = lag.kept[world, 2]
+            lag.rate[world] = lag.kept[world, 3]
+            lag.excess[world] = lag.kept[world, 4]
+            lag.pace[world] = lag.kept[world, 5]
+            lag.stale[world] = 2
+
+    @wp.func
     def gain(reduction: f64) -> f64:
         """Decades."""
         return -wp.log10(wp.max(reduction, f64(1.0e-30)))
@@ -77,13 +89,7 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
         lag.moved[world] = 0
         if active[world] == 0:
             return
-        if lag.stale[world] != 0:
-            lag.due[world] = int(lag.kept[world, 0])
-            lag.mass_factor[world] = lag.kept[world, 1]
-            lag.dq_dv[world] = lag.kept[world, 2]
-            lag.rate[world] = lag.kept[world, 3]
-            lag.excess[world] = lag.kept[world, 4]
-            lag.pace[world] = lag.kept[world, 5]
+        recall(lag, world)
         same = lag.mass_factor[world] == mass_factor[world] and lag.dq_dv[world] == dq_dv[world]
         if lag.due[world] != 0 or not same:
             lag.moved[world] = 1
@@ -109,6 +115,8 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
         world = wp.tid()
         if newton.active[world] == 0:
             return
+        if keep == 2:
+            recall(lag, world)
         k = newton.iterations[world]
         need = wp.log10(wp.max(newton.excess[world], f64(1.0)))
         fresh = wp.max(need / f64(DECADES), f64(1.0))
@@ -122,7 +130,8 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
             if keep < 2:
                 lag.due[world] = 1
                 lag.stale[world] = 0  # whatever the state was, it holds none
-            elif lag.stale[world] == 0 and need > gain(lag.pace[world]) * (fresh + lag.limit):
+                return
+            if need > gain(lag.pace[world]) * (fresh + lag.limit):
                 lag.due[world] = 1
                 lag.pace[world] = f64(FADE) * lag.pace[world]
             return

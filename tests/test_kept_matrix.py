@@ -56,6 +56,23 @@ def test_a_run_from_any_step_is_the_same(damping):
         assert bits(other) == end
 
 
+def test_a_run_goes_on_the_same_where_kept_matrices_serve_badly():
+    """A box that spins: memory of how a matrix served decides at the start of steps."""
+    sim = box(spin=15.0, clamp=False)
+    states, paces = [], []
+    for _ in range(25):
+        states.append(sim.state.like())
+        sim.step()
+        paces.append(sim.state.numpy()["operator"][0, 5])
+    assert len(set(paces)) > 10
+    end = bits(sim)
+    for k in range(1, 25):
+        other = box(spin=15.0, clamp=False)
+        other.reset(state=states[k])
+        other.step(25 - k)
+        assert bits(other) == end, k
+
+
 def test_a_refused_step_leaves_no_trace():
     good, tried = (
         box(spin=40.0, clamp=False, solver=wf.NewtonPCG(max_newton=6, max_halvings=0, operator="matrix"))

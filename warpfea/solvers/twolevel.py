@@ -107,7 +107,6 @@ class TwoLevel:
         self.making = build_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
         self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
-        self.newton = residual.newton
         self.dim = (model.worlds, model.slots)
         key = "levels" if coarse else "tiles"
         if key not in model.cache:
