@@ -209,19 +209,20 @@ def gather_kernels(
         topo: Topology,
         h: vec3,
         more: Additions,
-        dq: T,
+        p: vec3,
         con: Constraints,
         mul: Multipliers,
         world: int,
         slot: int,
-    ) -> vec3:
-        """Follower loads and constraints added to the elements' part, on the free components."""
+        result: wp.array2d(dtype=vec3),
+    ) -> f64:
+        """H p: follower loads and constraints added to the elements' part, on the free components; returns p.Hp."""
         out = h
         if wp.static(pressure):
             f = vec3()
             for k in range(more.start[slot], more.start[slot + 1]):
                 f += more.contribution[world, more.entry[k]]
-            out -= dq * f
+            out -= T(more.dq_dv[world]) * f
         if wp.static(constrained):
             tie = wp.vec3d()
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
@@ -231,7 +232,15 @@ def gather_kernels(
         for k in range(3):
             if held & (1 << k) != 0:
                 out[k] = T(0.0)
-        return out
+        result[world, slot] = out
+        return f64(wp.dot(out, p))
+
+    @wp.func
+    def share_of_warp(share: f64, index: int, warp: int, world: int, rows: wp.array3d(dtype=f64)):
+        """p.Hp of a warp's rows."""
+        total = row_sum(share, warp)
+        if index % warp == 0:
+            rows[0, world, index / warp] = total
 
     @wp.kernel(module=module)
     def product(
@@ -258,12 +267,9 @@ def gather_kernels(
             for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
                 a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
             dq = T(more.dq_dv[world])
-            h = finish(topo, T(more.mass_factor[world]) * a + dq * f, more, dq, con, mul, world, slot)
-            out[world, slot] = h
-            share = f64(wp.dot(h, p_in[world, slot]))
-        share = row_sum(share, more.warp)
-        if slot % more.warp == 0:
-            rows[0, world, slot / more.warp] = share
+            h = T(more.mass_factor[world]) * a + dq * f
+            share = finish(topo, h, more, p_in[world, slot], con, mul, world, slot, out)
+        share_of_warp(share, slot, more.warp, world, rows)
 
     @wp.kernel(module=module, launch_bounds=(256, SUM_BLOCKS[dtype]))
     def massive_sum(
@@ -287,12 +293,8 @@ def gather_kernels(
             f = vec3()
             for k in range(topo.start[slot], topo.start[slot + 1]):
                 f += contribution[world, topo.entry[k]]
-            h = finish(topo, f, more, T(more.dq_dv[world]), con, mul, world, slot)
-            out[world, slot] = h
-            share = f64(wp.dot(h, p))
-        share = row_sum(share, more.warp)
-        if slot % more.warp == 0:
-            rows[0, world, slot / more.warp] = share
+            share = finish(topo, f, more, p, con, mul, world, slot, out)
+        share_of_warp(share, slot, more.warp, world, rows)
 
     @wp.kernel(module=matrix_module)
     def matrix_product(
@@ -321,13 +323,8 @@ def gather_kernels(
         h = lane_sum(h, lanes)
         share = f64(0.0)
         if lane == 0 and slot < out.shape[1]:
-            dq = T(more.dq_dv[world])
-            h = finish(topo, h, more, dq, con, mul, world, slot)
-            out[world, slot] = h
-            share = f64(wp.dot(h, p_in[world, slot]))
-        share = row_sum(share, more.warp)
-        if index % more.warp == 0:
-            rows[0, world, index / more.warp] = share
+            share = finish(topo, h, more, p_in[world, slot], con, mul, world, slot, out)
+        share_of_warp(share, index, more.warp, world, rows)
 
     @wp.kernel(module=module)
     def gather_blocks(

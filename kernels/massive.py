@@ -36,7 +36,7 @@ def massive_kernel(
     module = kernel_module(name, max_unroll=16, block_dim=size)
 
     if vertex:
-        product = vertex_product(dtype, points, damping == "rate", fn, shared)
+        product = vertex_product(points, fn, shared)
     else:
 
         @wp.func

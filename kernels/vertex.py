@@ -20,7 +20,6 @@ import types as _types
 import warp as wp
 
 from .cluster import DIRECTION, U, V
-from .types import precision
 
 __all__ = ["vertex_product"]
 
@@ -42,19 +41,15 @@ def forget():
     """Nothing read before is kept: it would take registers that more blocks could have."""
 
 
-def vertex_product(
-    dtype: str, points: int, rate: bool, fn: _types.SimpleNamespace, shared: _types.SimpleNamespace
-) -> wp.Function:
+def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.SimpleNamespace) -> wp.Function:
     """What an element adds to the product, in this form.
 
     Args:
-        dtype: precision.
         points: 4, one for each vertex, or 5, the centroid before them.
-        rate: increments need the velocity gradient.
         fn: functions of points.py.
         shared: functions of cluster.py.
     """
-    p = precision(dtype)
+    p, rate = fn.types, fn.damping == "rate"
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Pool, fetch, set_force, add_force = shared.Pool, shared.fetch, shared.set_force, shared.add_force
     Block, coefficients, inverse_jacobian, point_increment = (

@@ -5,6 +5,8 @@ import pathlib
 
 import pytest
 
+from warpfea.bench_cpu import CASES
+
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 
 
@@ -47,16 +49,37 @@ def test_the_matrix_of_ancf_elements_uses_half_of_the_bandwidth(problem):
         assert row["limit_share"] > (0.6 if row["dtype"] == "float64" else 0.4)
 
 
-def test_one_core_against_other_solvers():
+def on_one_core():
+    """ms per step by row and solver."""
     rows = {}
     for row in load("cpu.json"):
         rows.setdefault(row["label"], {})[row["solver"]] = row["ms_per_step"]
     assert len(rows) == 12
+    return rows
+
+
+BEHIND = {"bar-3k": "10.6 ms with kept factors, 13.9 by default", "bar-9.7k": "50.5 and 51.7 ms"}
+"""Rows in which SuperLU is faster; when one is measured ahead of it, it must be taken out here."""
+
+
+@pytest.mark.parametrize(
+    "label",
+    [
+        pytest.param(case.label, marks=[pytest.mark.xfail(strict=True, reason=BEHIND[case.label])])
+        if case.label in BEHIND
+        else case.label
+        for case in CASES
+    ],
+)
+def test_one_core_against_superlu(label):
+    ms = on_one_core()[label]
+    assert ms["direct"] is None or ms["default"] < ms["direct"]
+
+
+def test_one_core_against_block_jacobi_and_chrono():
+    rows = on_one_core()
     for label, ms in rows.items():
         assert ms["default"] < ms["block-jacobi"], label
-        # kept factors serve small bars that vibrate a little; all others are faster with the default
-        small = label in ("bar-3k", "bar-9.7k")
-        assert ms["direct"] is None or ms["default"] < (1.4 if small else 1.0) * ms["direct"], label
     chrono = {"bar-9.7k": 203.0, "bar-69k": 3874.0, "brick-1080": 1284.0, "plate-16x16": 37.0, "plate-64x64": 1314.0}
     for label, ms in chrono.items():
         assert rows[label]["default"] < ms, label

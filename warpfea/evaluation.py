@@ -151,7 +151,7 @@ class Evaluation:
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
         dq = wp.ones(1, dtype=wp.float64, device=m.device)
         history = self._zeros((1, 1), m.types.sym)
-        conns = [np.concatenate([p.conn + p.body.slot_offset for p in b.parts]) for b in m.blocks]
+        conns = [b.connectivity for b in m.blocks]
         colour = _colours(m.graph())
         rows, cols, values = [], [], []
         for c in range(int(colour.max()) + 1):

@@ -51,6 +51,11 @@ class Block:
     shear: Any = None
 
     @property
+    def connectivity(self) -> np.ndarray:
+        """(elements, slots per element) slots of the model, on the host."""
+        return np.concatenate([p.conn + p.body.slot_offset for p in self.parts])
+
+    @property
     def massive(self) -> bool:
         """Whether the mass of an element is one table times a number."""
         return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
@@ -295,8 +300,7 @@ class Model:
     def _build_topology(self) -> None:
         T, vec3 = self.types.T, self.types.vec3
         topo = topology_struct(self.dtype)()
-        conn = [np.concatenate([p.conn + p.body.slot_offset for p in b.parts]) for b in self.blocks]
-        start, entry = assembly.gather_table(conn, self.slots)
+        start, entry = assembly.gather_table([b.connectivity for b in self.blocks], self.slots)
         topo.start = self.array("topology", start, wp.int32)
         topo.entry = self.array("topology", entry, wp.int32)
         topo.mass_start = self.array("mass", self.mass_host.indptr, wp.int32)
@@ -308,7 +312,7 @@ class Model:
 
     def graph(self) -> sp.csr_matrix:
         """Which slots share an element."""
-        return assembly.slot_graph([p.conn + p.body.slot_offset for b in self.blocks for p in b.parts], self.slots)
+        return assembly.slot_graph([b.connectivity for b in self.blocks], self.slots)
 
     def _label_components(self) -> None:
         """Connected component of each slot: by elements alone (`part`), and with what joints tie (`component`)."""

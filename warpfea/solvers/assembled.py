@@ -114,7 +114,7 @@ class Assembled:
         runs: list[list[tuple[Any, Any]]] = []
         seen: list[np.ndarray] = []
         for block, kernels in zip(self.model.blocks, self.element_kernels):
-            conn = np.concatenate([p.conn + p.body.slot_offset for p in block.parts])
+            conn = block.connectivity
             for k, other in enumerate(seen):
                 if np.array_equal(conn, other):
                     runs[k].append((block, kernels))

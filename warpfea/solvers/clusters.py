@@ -85,8 +85,7 @@ def make_clusters(model: Model) -> ModelClusters:
     """Those of a model whose blocks are all massive."""
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
-        conn = np.concatenate([p.conn + p.body.slot_offset for p in block.parts])
-        tables = cluster_tables(conn, block.cluster)
+        tables = cluster_tables(block.connectivity, block.cluster)
         data = cluster_struct()()
         for name in ("start", "slot_start", "table"):
             setattr(data, name, model.array("clusters", getattr(tables, name), wp.int32))
