@@ -39,15 +39,47 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     NS = slots
+    PAIRS = slots * (slots + 1) // 2
     module = kernel_module(f"assembly_{dtype}_{slots}", max_unroll=SMALL)
+    table_module = kernel_module(f"contributions_{dtype}_{slots}")
 
-    @wp.kernel(module=module)
-    def add_elements(
+    @wp.kernel(module=table_module)
+    def list_contributions(
         topo: Topology,
         pattern: Pattern,
         conn: wp.array2d(dtype=wp.int32),
         offset: int,
         count: int,
+        listing: int,
+        start: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+    ):
+        """What of which element adds to an entry of Pattern.upper: start[index + 1] = how many, or with `listing` the
+        `source`s from start[index] on, 2 (PAIRS elem + pair) + 1 where the pair's block is transposed."""
+        index = wp.tid()
+        at = pattern.upper[index]
+        found = int(0)
+        for k in range(topo.start[at[2]], topo.start[at[2] + 1]):
+            inside = topo.entry[k] - offset
+            if inside >= 0 and inside < NS * count:
+                a = inside / count
+                elem = inside % count
+                for b in range(NS):
+                    if conn[b, elem] == at[3]:
+                        if listing != 0:
+                            low = wp.min(a, b)
+                            pair = low * NS - (low * (low - 1)) / 2 + wp.abs(a - b)
+                            source[start[index] + found] = 2 * (PAIRS * elem + pair) + wp.where(a <= b, 0, 1)
+                        found += 1
+        if listing == 0:
+            start[index + 1] = found
+
+    @wp.kernel(module=module)
+    def add_elements(
+        topo: Topology,
+        pattern: Pattern,
+        start: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=vec3),
         mass: wp.array(dtype=T),
         first: int,
@@ -67,22 +99,17 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         row = at[2]
         column = at[3]
         A = mat33()
-        for k in range(topo.start[row], topo.start[row + 1]):
-            inside = topo.entry[k] - offset
-            if inside >= 0 and inside < NS * count:
-                a = inside / count
-                elem = inside % count
-                for b in range(NS):
-                    if conn[b, elem] == column:
-                        low = wp.min(a, b)
-                        k = 3 * (low * NS - (low * (low - 1)) / 2 + wp.abs(a - b))
-                        x = matrix[world, k, elem]
-                        y = matrix[world, k + 1, elem]
-                        z = matrix[world, k + 2, elem]
-                        if a <= b:
-                            A += wp.matrix_from_cols(x, y, z)
-                        else:
-                            A += wp.matrix_from_rows(x, y, z)
+        for k in range(start[index], start[index + 1]):
+            code = source[k]
+            elem = (code / 2) / PAIRS
+            item = 3 * ((code / 2) % PAIRS)
+            x = matrix[world, item, elem]
+            y = matrix[world, item + 1, elem]
+            z = matrix[world, item + 2, elem]
+            if code % 2 == 0:
+                A += wp.matrix_from_cols(x, y, z)
+            else:
+                A += wp.matrix_from_rows(x, y, z)
         A = T(dq_dv[world]) * A
         if first != 0:
             A += T(mass_factor[world]) * mass[index] * wp.identity(n=3, dtype=T)
@@ -98,7 +125,7 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         if at[1] != at[0]:
             value[world, at[1]] = wp.transpose(A)
 
-    return _types.SimpleNamespace(module=module, add_elements=add_elements)
+    return _types.SimpleNamespace(module=module, add_elements=add_elements, list_contributions=list_contributions)
 
 
 @functools.cache

@@ -48,7 +48,6 @@ def element_kernels(
     form = "affine" if affine else "framed" if framed else "table"
     name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
     module = kernel_module(name)
-    prepare_matrix, element_matrix = matrix_kernels(fn, kernel_module(f"{name}_matrix", max_unroll=16))
 
     @wp.kernel(module=module)
     def internal_force(
@@ -181,7 +180,6 @@ def element_kernels(
         internal_force=internal_force,
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,
-        prepare_matrix=prepare_matrix,
-        element_matrix=element_matrix,
+        **vars(matrix_kernels(dtype, law, slots, affine, damping, framed)),
         **vars(output_kernels(fn, name, points)),
     )

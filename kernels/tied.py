@@ -9,6 +9,7 @@ import types as _types
 
 import warp as wp
 
+from .element_matrix import UNROLL, panels_of
 from .types import kernel_module, precision
 
 __all__ = ["tied_kernels", "tied_struct"]
@@ -56,6 +57,12 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     Ties = wp.types.vector(length=ties, dtype=T)
     TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
     NS, NT, W = slots, ties, width
+    PANELS, P = panels_of(NS)
+    Row = wp.types.vector(length=P, dtype=T)
+    Slots = wp.types.matrix(shape=(NT * PANELS, P), dtype=T)
+    Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
+    Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
+    rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
 
     @wp.func
     def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
@@ -243,7 +250,6 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         lines: wp.array3d(dtype=vec3),
         form: int,
         add: int,
-        by_element: int,
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=vec3),
     ):
@@ -253,9 +259,6 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             return
         column = index / block.count
         elem = index % block.count
-        if by_element != 0:
-            column = index % (3 * NS)
-            elem = index / (3 * NS)
         b = column / 3
         axis = column % 3
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
@@ -288,8 +291,80 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                     out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
                 matrix[world, 3 * pair + axis, elem] = out[a]
 
+    @wp.kernel(module=rows_module)
+    def element_rows(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        form: int,
+        active: wp.array(dtype=wp.int32),
+        add: int,
+        matrix: wp.array3d(dtype=vec3),
+    ):
+        """As of `element_kernels`: K = mu B^T A B + geometric part, with the slots of a panel side by side."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        U = load(block, u, world, elem)
+        stress = stresses(block, shears(block, U, elem), world, elem)
+        first, second, B = Slots(), Slots(), Changes()
+        for t in range(NT):
+            x = block.X_first[t, elem] + line(block.first, U, t, elem)
+            y = block.X_second[t, elem] + line(block.second, U, t, elem)
+            for a in range(NS):
+                f = block.first[t, a, elem]
+                s = block.second[t, a, elem]
+                row = NT * (a / P) + t
+                first[row, a % P] = f
+                second[row, a % P] = s
+                for i in range(3):
+                    B[3 * row + i, a % P] = f * y[i] + s * x[i]
+        for panel in range((block.conn.shape[0] + P - 1) / P):
+            AB = Products()
+            for t in range(NT):
+                for k in range(W):
+                    other = 3 * (NT * panel + (t / W) * W + k)
+                    c = mu * block.coupling[t, k, elem]
+                    for j in range(3):
+                        AB[3 * t + j] = AB[3 * t + j] + c * B[other + j]
+            for a in range(wp.min(NS, P * (panel + 1))):
+                G = Row()
+                if form != 1:
+                    for t in range(NT):
+                        row = NT * (a / P) + t
+                        f = stress[t] * first[row, a % P]
+                        s = stress[t] * second[row, a % P]
+                        G = G + f * second[NT * panel + t] + s * first[NT * panel + t]
+                for i in range(3):
+                    Kx, Ky, Kz = Row(), Row(), Row()
+                    for t in range(NT):
+                        c = B[3 * (NT * (a / P) + t) + i, a % P]
+                        Kx = Kx + c * AB[3 * t]
+                        Ky = Ky + c * AB[3 * t + 1]
+                        Kz = Kz + c * AB[3 * t + 2]
+                    if i == 0:
+                        Kx = Kx + G
+                    if i == 1:
+                        Ky = Ky + G
+                    if i == 2:
+                        Kz = Kz + G
+                    for n in range(P):
+                        b = P * panel + n
+                        if a <= b and b < NS:
+                            pair = 3 * (a * NS - (a * (a - 1)) / 2 + b - a)
+                            entry = vec3(Kx[n], Ky[n], Kz[n])
+                            for j in range(3):
+                                total = entry[j]
+                                if add != 0:
+                                    total += matrix[world, pair + j, elem][i]
+                                matrix[world, pair + j, elem][i] = total
+
     return _types.SimpleNamespace(
         module=module,
+        element_rows=element_rows,
         prepare_matrix=prepare_matrix,
         prepare_stress=prepare_stress,
         element_matrix=element_matrix,

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from ..errors import ModelError
 from ..kernels.blocks import assembly_kernels, block_kernels, coupling_struct
 from ..kernels.structs import pattern_struct
 
@@ -79,13 +80,17 @@ class Assembled:
     def __init__(self, model: Model, work: Workspace, launch: Launcher, block_kernels_of: list[Any]) -> None:
         self.model, self.work, self.launch = model, work, launch
         self.element_kernels = block_kernels_of
+        self.whole = not model.device.is_cuda
         if "matrix" not in model.cache:
             model.cache["matrix"] = self._make_tables()
         self.pattern, self.mass, self.couplings, self.coupled = model.cache["matrix"]
         self.runs = self._runs()
+        if "contributions" not in model.cache:
+            model.cache["contributions"] = [self._contributions(parts[0][0]) for parts in self.runs]
+        self.contributions: list[tuple[wp.array, wp.array]] = model.cache["contributions"]
         self.common = block_kernels(model.dtype)
         S = max(3 * block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
-        points = max(5 * block.points * block.count for block in model.blocks)
+        points = 0 if self.whole else max(5 * block.points * block.count for block in model.blocks)
         self.lines = work.array("element gradients", (model.worlds, points), model.types.vec3)
         self.scratch = work.array("element matrices", (model.worlds, S), model.types.vec3)
 
@@ -103,7 +108,7 @@ class Assembled:
 
     def modules(self) -> set[wp.Module]:
         """Modules that assembly launches."""
-        out = {k.element_matrix.module for k in self.element_kernels}
+        out = {(k.element_rows if self.whole else k.element_matrix).module for k in self.element_kernels}
         out |= {assembly_kernels(self.model.dtype, block.slots).module for block in self.model.blocks}
         if self.model.constraints:
             out.add(self.common.coupling_module)
@@ -123,6 +128,26 @@ class Assembled:
                 seen.append(conn)
                 runs.append([(block, kernels)])
         return runs
+
+    def _contributions(self, block: Any) -> tuple[wp.array, wp.array]:
+        """What of its elements adds to which entry, found on the device: see `list_contributions`."""
+        model = self.model
+        pairs = block.slots * (block.slots + 1) // 2
+        if 2 * pairs * block.count >= 2**31:
+            raise ModelError(
+                f"{block.count} elements of {block.slots} slots have too many pairs of slots for a matrix, more than "
+                f"2^30: take fewer elements, or preconditioner='block-jacobi' with operator='elements'"
+            )
+        upper = len(self.pattern.upper)
+        start = wp.zeros(upper + 1, dtype=wp.int32, device=model.device)
+        source = wp.zeros(0, dtype=wp.int32, device=model.device)
+        find = assembly_kernels(model.dtype, block.slots).list_contributions
+        args = [model.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count]
+        wp.launch(find, upper, inputs=[*args, 0, start, source], device=model.device)
+        wp.utils.array_scan(start, start, inclusive=True)
+        source = wp.empty(int(start[-1:].numpy()[0]), dtype=wp.int32, device=model.device)
+        wp.launch(find, upper, inputs=[*args, 1, start, source], device=model.device)
+        return start, source
 
     def _mass_of(self, pattern: Pattern) -> np.ndarray:
         """Scalar masses of the upper entries, kg."""
@@ -191,25 +216,23 @@ class Assembled:
         mass_factor, dq_dv = factors
         for first, parts in enumerate(self.runs):
             for k, (block, elements) in enumerate(parts):
-                matrix = self._by_element(self.scratch, 3 * block.slots * (block.slots + 1) // 2, block.count)
-                lines = self._by_element(self.lines, 5 * block.points, block.count)
+                pairs = 3 * block.slots * (block.slots + 1) // 2
+                state = [block.data, u, w.v, w.history, dq_dv, int(projected), active]
+                if self.whole:
+                    matrix = shaped(self.scratch, (m.worlds, block.count, pairs)).transpose((0, 2, 1))
+                    launch(elements.element_rows, (m.worlds, block.count), [*state, int(k > 0), matrix])
+                    continue
+                matrix = shaped(self.scratch, (m.worlds, pairs, block.count))
+                lines = shaped(self.lines, (m.worlds, 5 * block.points, block.count))
                 points = (m.worlds, block.points, block.count)
-                args = [block.data, u, w.v, w.history, dq_dv, int(projected), active, lines]
-                launch(elements.prepare_matrix, points, args)
+                launch(elements.prepare_matrix, points, [*state, lines])
                 if block.key.tying and not projected:
                     launch(elements.prepare_stress, points, [block.data, active, lines])
-                args = [block.data, dq_dv, lines, int(projected), int(k > 0), int(not m.device.is_cuda), active, matrix]
+                args = [block.data, dq_dv, lines, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (m.worlds, 3 * block.slots * block.count), args)
-            args = [m.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count, matrix]
+            args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
             args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]
             launch(assembly_kernels(m.dtype, block.slots).add_elements, (m.worlds, len(self.pattern.upper)), args)
-
-    def _by_element(self, scratch: wp.array, items: int, elements: int) -> wp.array:
-        """Scratch as [world, item, element], in the order of Model.element_array."""
-        B = self.model.worlds
-        if self.model.device.is_cuda:
-            return shaped(scratch, (B, items, elements))
-        return shaped(scratch, (B, elements, items)).transpose((0, 2, 1))
 
     def add_constraints(
         self, gradient: wp.array, stiffness: wp.array, dq_dv: wp.array, active: wp.array, out: wp.array
