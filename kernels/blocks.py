@@ -8,6 +8,7 @@ import types as _types
 
 import warp as wp
 
+from .element_matrix import panels_of
 from .gather import inverse_function
 from .structs import pattern_struct, topology_struct
 from .types import SMALL, kernel_module, precision
@@ -31,19 +32,42 @@ def coupling_struct():
 
 
 @functools.cache
-def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
-    """Assembly from the matrices of elements with so many slots."""
+def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespace:
+    """Assembly from the matrices of elements with so many slots, as `element_matrix` or, `rows`, `element_rows` leave
+    them."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     NS = slots
-    PAIRS = slots * (slots + 1) // 2
-    module = kernel_module(f"assembly_{dtype}_{slots}", max_unroll=SMALL)
-    table_module = kernel_module(f"contributions_{dtype}_{slots}")
+    PANELS, P = panels_of(slots)
+    PLACES = PANELS * P * NS if rows else NS * (NS + 1) // 2
+    Number = T if rows else vec3
+    module = kernel_module(f"assembly_{dtype}_{slots}{'_rows' if rows else ''}", max_unroll=SMALL)
 
-    @wp.kernel(module=table_module)
+    @wp.func
+    def place(low: int, high: int) -> int:
+        """Of the block of two slots in an element's matrix."""
+        if wp.static(rows):
+            return P * (NS * (high / P) + low) + high % P
+        else:
+            return low * NS - (low * (low - 1)) / 2 + high - low
+
+    @wp.func
+    def block_at(matrix: wp.array3d(dtype=Number), world: int, elem: int, where: int) -> mat33:
+        if wp.static(rows):
+            first = 9 * P * (where / P) + where % P
+            A = mat33()
+            for i in range(3):
+                for j in range(3):
+                    A[i, j] = matrix[world, elem, first + P * (3 * i + j)]
+            return A
+        else:
+            k = 3 * where
+            return wp.matrix_from_cols(matrix[world, k, elem], matrix[world, k + 1, elem], matrix[world, k + 2, elem])
+
+    @wp.kernel(module=module)
     def list_contributions(
         topo: Topology,
         pattern: Pattern,
@@ -55,7 +79,7 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         source: wp.array(dtype=wp.int32),
     ):
         """What of which element adds to an entry of Pattern.upper: start[index + 1] = how many, or with `listing` the
-        `source`s from start[index] on, 2 (PAIRS elem + pair) + 1 where the pair's block is transposed."""
+        `source`s from start[index] on, 2 (PLACES elem + place) + 1 where the block is to be transposed."""
         index = wp.tid()
         at = pattern.upper[index]
         found = int(0)
@@ -67,9 +91,8 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
                 for b in range(NS):
                     if conn[b, elem] == at[3]:
                         if listing != 0:
-                            low = wp.min(a, b)
-                            pair = low * NS - (low * (low - 1)) / 2 + wp.abs(a - b)
-                            source[start[index] + found] = 2 * (PAIRS * elem + pair) + wp.where(a <= b, 0, 1)
+                            where = PLACES * elem + place(wp.min(a, b), wp.max(a, b))
+                            source[start[index] + found] = 2 * where + wp.where(a <= b, 0, 1)
                         found += 1
         if listing == 0:
             start[index + 1] = found
@@ -80,7 +103,7 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         pattern: Pattern,
         start: wp.array(dtype=wp.int32),
         source: wp.array(dtype=wp.int32),
-        matrix: wp.array3d(dtype=vec3),
+        matrix: wp.array3d(dtype=Number),
         mass: wp.array(dtype=T),
         first: int,
         mass_factor: wp.array(dtype=f64),
@@ -88,7 +111,7 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=mat33),
     ):
-        """value += (dq/dv) K of a block's elements, whose matrices come in columns; `first`: = c_M M + (dq/dv) K.
+        """value += (dq/dv) K of a block's elements; `first`: = c_M M + (dq/dv) K.
 
         Prescribed components keep their diagonal and nothing else.
         """
@@ -101,15 +124,11 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         A = mat33()
         for k in range(start[index], start[index + 1]):
             code = source[k]
-            elem = (code / 2) / PAIRS
-            item = 3 * ((code / 2) % PAIRS)
-            x = matrix[world, item, elem]
-            y = matrix[world, item + 1, elem]
-            z = matrix[world, item + 2, elem]
+            K = block_at(matrix, world, (code / 2) / PLACES, (code / 2) % PLACES)
             if code % 2 == 0:
-                A += wp.matrix_from_cols(x, y, z)
+                A += K
             else:
-                A += wp.matrix_from_rows(x, y, z)
+                A += wp.transpose(K)
         A = T(dq_dv[world]) * A
         if first != 0:
             A += T(mass_factor[world]) * mass[index] * wp.identity(n=3, dtype=T)
@@ -125,7 +144,9 @@ def assembly_kernels(dtype: str, slots: int) -> _types.SimpleNamespace:
         if at[1] != at[0]:
             value[world, at[1]] = wp.transpose(A)
 
-    return _types.SimpleNamespace(module=module, add_elements=add_elements, list_contributions=list_contributions)
+    return _types.SimpleNamespace(
+        module=module, add_elements=add_elements, list_contributions=list_contributions, places=PLACES
+    )
 
 
 @functools.cache

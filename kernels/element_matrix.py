@@ -11,9 +11,9 @@ import warp as wp
 
 from . import materials
 from .points import point_functions
-from .types import kernel_module
+from .types import kernel_module, precision
 
-__all__ = ["UNROLL", "matrix_kernels", "panels_of"]
+__all__ = ["UNROLL", "matrix_kernels", "panels_of", "rows_type"]
 
 WIDEST = 8
 """Most slots of a panel: eight numbers of 64 bits fill the widest registers there are."""
@@ -25,6 +25,11 @@ def panels_of(slots: int) -> tuple[int, int]:
     """How many panels, and slots per panel."""
     panels = -(-slots // WIDEST)
     return panels, -(-slots // panels)
+
+
+def rows_type(dtype: str, slots: int):
+    """K_ab of one slot and a panel of so many: rows 3 i + j over b."""
+    return wp.types.matrix(shape=(9, slots), dtype=precision(dtype).T)
 
 
 @functools.cache
@@ -42,9 +47,10 @@ def matrix_kernels(
     module = kernel_module(f"{name}_matrix", max_unroll=16)
     rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
     PANELS, P = panels_of(NS)
-    Row = wp.types.vector(length=P, dtype=T)
+    Rows = rows_type(dtype, P)
     Slots = wp.types.matrix(shape=(3 * PANELS, P), dtype=T)
     Tensor = wp.types.matrix(shape=(9, 9), dtype=T)
+    moduli9 = t.moduli9
     Products = wp.types.matrix(shape=(27, P), dtype=T)
 
     @wp.func
@@ -206,6 +212,58 @@ def matrix_kernels(
                     out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
                 matrix[world, 3 * pair + axis, elem] = out[a]
 
+    @wp.func
+    def elasticity(F: mat33, S: mat33, moduli: moduli9, c: coef, form: int, w: T) -> Tensor:
+        """w dP_ik/dF_jl, [3 i + k, 3 j + l]: the linear part, of S = `moduli` : E and of viscosity, and the rest.
+
+        With the shears G and the other moduli D of pairs k, l: for k != l it is
+        S_kl delta_ij + D_kl F_ik F_jl + G_kl F_il F_jk, and for k = l S_kk delta_ij + D_kk F_ik F_jk + the sum over the
+        other m of G_mk F_im F_jm.
+        """
+        A = Tensor()
+        for k in range(3):
+            for l in range(k, 3):
+                shear = vec3()
+                if k == l:
+                    for o in range(3):
+                        if o != k:
+                            shear[o] = w * moduli[9 - k - o]
+                for i in range(3):
+                    x = T(0.0)
+                    y = T(0.0)
+                    if k == l:
+                        x = w * moduli[k] * F[i, k]
+                    else:
+                        x = w * moduli[6 - k - l] * F[i, k]
+                        y = w * moduli[9 - k - l] * F[i, l]
+                    for j in range(3):
+                        a = x * F[j, l]
+                        if k != l:
+                            a += y * F[j, k]
+                        else:
+                            for o in range(3):
+                                if o != k:
+                                    a += shear[o] * F[i, o] * F[j, o]
+                        if i == j:
+                            a += w * S[k, l]
+                        A[3 * i + k, 3 * j + l] = a
+                        if k != l:
+                            A[3 * j + l, 3 * i + k] = a
+        if wp.static(needs_J):
+            for j in range(3):
+                for l in range(3):
+                    dF = mat33()
+                    dF[j, l] = w
+                    dP = mat33()
+                    if form == 1:
+                        dP = stand_in(F, dF, c)
+                    else:
+                        dP = m.increment(F - t.identity(), dF, c)
+                    for i in range(3):
+                        for k in range(3):
+                            A[3 * i + k, 3 * j + l] = A[3 * i + k, 3 * j + l] + dP[i, k]
+        return A
+
     @wp.kernel(module=rows_module)
     def element_rows(
         block: Block,
@@ -216,20 +274,31 @@ def matrix_kernels(
         form: int,
         active: wp.array(dtype=wp.int32),
         add: int,
-        matrix: wp.array3d(dtype=vec3),
+        matrix: wp.array3d(dtype=Rows),
     ):
-        """`element_matrix` of all columns, and what `prepare_matrix` does, by one thread per element.
+        """K of an element by one thread, what `prepare_matrix` does included.
 
         A is dP/dF at a point; a panel's A : (e_j h_b^T) are the rows of D, over b, and K_ab = h_a . D_b.
+
+        Args:
+            matrix: [world, elem, NS panel + a] rows 3 i + j of K_ab, over the slots b of the panel, for a up to its last.
+            form, add: as of `element_matrix`.
         """
         world, elem = wp.tid()
         if active[world] == 0:
             return
         c = fn.coefficients(block, world, elem)
         cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
+        moduli = t.moduli9()
+        if wp.static(not needs_J):
+            moduli = m.moduli(c)
+        if wp.static(damping == "incremental" or damping == "rate"):
+            moduli += t.isotropic_moduli(cv[0], cv[1])
         U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
-        K = wp.zeros(shape=(wp.static(9 * NS * PANELS),), dtype=Row)
-        H = Slots()
+        if add == 0:
+            for k in range(matrix.shape[2]):
+                matrix[world, elem, k] = Rows()
+        h, H = Local(), Slots()
         for q in range(block.gradient.shape[0]):
             F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, q, elem)
             into = t.identity()
@@ -238,44 +307,15 @@ def matrix_kernels(
             if wp.static(affine):
                 into = into * wp.transpose(fn.inverse_jacobian(block, elem))
             for a in range(NS):
-                h = vec3()
                 if wp.static(affine):
-                    h = into * block.gradient[q, a, 0]
+                    h[a] = into * block.gradient[q, a, 0]
                 elif wp.static(framed):
-                    h = into * block.gradient[q, a, elem]
+                    h[a] = into * block.gradient[q, a, elem]
                 else:
-                    h = block.gradient[q, a, elem]
+                    h[a] = block.gradient[q, a, elem]
                 for l in range(3):
-                    H[3 * (a / P) + l, a % P] = h[l]
-            A = Tensor()
-            w = fn.weight_of(block, q, elem)
-            for j in range(3):
-                half = (T(0.5) * w) * F[j]
-                for l in range(3):
-                    # sym(F^T dF) of dF = w e_j e_l^T
-                    B = mat33()
-                    for n in range(3):
-                        B[n, l] = B[n, l] + half[n]
-                        B[l, n] = B[l, n] + half[n]
-                    dP = mat33()
-                    if wp.static(not needs_J):
-                        dS = m.stiffness(B, c)
-                        if wp.static(damping == "incremental" or damping == "rate"):
-                            dS += t.isotropic(B, cv[0], cv[1])
-                        dP = F * dS
-                    else:
-                        if wp.static(damping == "incremental" or damping == "rate"):
-                            dP = F * t.isotropic(B, cv[0], cv[1])
-                        dF = mat33()
-                        dF[j, l] = w
-                        if form == 1:
-                            dP += stand_in(F, dF, c)
-                        else:
-                            dP += m.increment(F - t.identity(), dF, c)
-                    dP[j] = dP[j] + w * S[l]
-                    for i in range(3):
-                        for k in range(3):
-                            A[3 * i + k, 3 * j + l] = dP[i, k]
+                    H[3 * (a / P) + l, a % P] = h[a][l]
+            A = elasticity(F, S, moduli, c, form, fn.weight_of(block, q, elem))
             for panel in range((block.conn.shape[0] + P - 1) / P):
                 D = Products()
                 for i in range(9):
@@ -286,24 +326,13 @@ def matrix_kernels(
                             + A[i, 3 * j + 2] * H[3 * panel + 2]
                         )
                 for a in range(wp.min(NS, P * (panel + 1))):
-                    x = H[3 * (a / P), a % P]
-                    y = H[3 * (a / P) + 1, a % P]
-                    z = H[3 * (a / P) + 2, a % P]
-                    r = 9 * (panel * NS + a)
+                    g = h[a]
+                    R = matrix[world, elem, NS * panel + a]
                     for i in range(3):
                         for j in range(3):
-                            K[r + 3 * i + j] = (
-                                K[r + 3 * i + j] + x * D[9 * i + j] + y * D[9 * i + 3 + j] + z * D[9 * i + 6 + j]
-                            )
-        for b in range(NS):
-            for a in range(b + 1):
-                pair = a * NS - (a * (a - 1)) / 2 + b - a
-                r = 9 * ((b / P) * NS + a)
-                for j in range(3):
-                    total = vec3(K[r + j][b % P], K[r + 3 + j][b % P], K[r + 6 + j][b % P])
-                    if add != 0:
-                        total += matrix[world, 3 * pair + j, elem]
-                    matrix[world, 3 * pair + j, elem] = total
+                            k = 3 * i + j
+                            R[k] = R[k] + g[0] * D[6 * i + k] + g[1] * D[6 * i + 3 + k] + g[2] * D[6 * i + 6 + k]
+                    matrix[world, elem, NS * panel + a] = R
 
     return _types.SimpleNamespace(
         prepare_matrix=prepare_matrix, element_matrix=element_matrix, element_rows=element_rows

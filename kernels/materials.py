@@ -9,7 +9,8 @@ subtracting nearly equal numbers, which float32 needs. A law is four functions
     block(G, a, c)          symmetric 3x3 matrix B with d.B d = d2Psi along the rank-one dF = d a^T, projected to be
                             positive semi-definite where the exact one need not be (for preconditioners)
 
-of the law's coefficients c. Laws whose S is linear in E have a fifth, stiffness(E, c), that linear function.
+of the law's coefficients c. Laws whose S is linear in E have two more, stiffness(E, c), that linear function, and
+moduli(c), its numbers: (D11, D22, D33, D23, D13, D12, G23, G13, G12) with S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
 Kelvin-Voigt damping adds to any of them and is made of the same St. Venant-Kirchhoff form.
 """
 
@@ -33,6 +34,7 @@ def tensors(dtype: str) -> _types.SimpleNamespace:
     """Small tensor functions shared by the laws."""
     p = precision(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
+    moduli9 = wp.types.vector(length=9, dtype=T)
 
     @wp.func
     def identity() -> mat33:
@@ -59,9 +61,16 @@ def tensors(dtype: str) -> _types.SimpleNamespace:
         """lambda tr(E) I + 2 mu E."""
         return lam * wp.trace(E) * identity() + T(2.0) * mu * E
 
+    @wp.func
+    def isotropic_moduli(lam: T, mu: T) -> moduli9:
+        """The numbers of `isotropic`, see `moduli` of laws."""
+        d = lam + T(2.0) * mu
+        return moduli9(d, d, d, lam, lam, lam, mu, mu, mu)
+
     return _types.SimpleNamespace(
-        identity=identity, green=green, sym=sym, volume_change=volume_change, isotropic=isotropic, vec3=vec3
-    )
+        identity=identity, green=green, sym=sym, volume_change=volume_change, isotropic=isotropic,
+        isotropic_moduli=isotropic_moduli, moduli9=moduli9, vec3=vec3,
+    )  # fmt: skip
 
 
 @functools.cache
@@ -69,11 +78,16 @@ def svk(dtype: str) -> _types.SimpleNamespace:
     """St. Venant-Kirchhoff, Eqs. (25)-(28); c = (lambda, mu)."""
     p, t = precision(dtype), tensors(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
+    moduli9 = t.moduli9
     coef = wp.types.vector(length=NCOEF, dtype=T)
 
     @wp.func
     def stiffness(E: mat33, c: coef) -> mat33:
         return t.isotropic(E, c[0], c[1])
+
+    @wp.func
+    def moduli(c: coef) -> moduli9:
+        return t.isotropic_moduli(c[0], c[1])
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
@@ -101,7 +115,9 @@ def svk(dtype: str) -> _types.SimpleNamespace:
         geometric = wp.max(T(0.0), wp.dot(a, S * a))
         return (c[0] + c[1]) * wp.outer(Fa, Fa) + c[1] * wp.dot(a, a) * (F * wp.transpose(F)) + geometric * t.identity()
 
-    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness)
+    return _types.SimpleNamespace(
+        energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness, moduli=moduli
+    )
 
 
 @functools.cache
@@ -238,6 +254,7 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
     """
     p, t = precision(dtype), tensors(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
+    moduli9 = t.moduli9
     coef = wp.types.vector(length=NCOEF, dtype=T)
 
     @wp.func
@@ -249,6 +266,10 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
         t13 = T(2.0) * c[7] * E[0, 2]
         t12 = T(2.0) * c[8] * E[0, 1]
         return mat33(s1, t12, t13, t12, s2, t23, t13, t23, s3)
+
+    @wp.func
+    def moduli(c: coef) -> moduli9:
+        return moduli9(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
@@ -284,7 +305,9 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
         M[2, 1] = M[1, 2]
         return F * M * wp.transpose(F)
 
-    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness)
+    return _types.SimpleNamespace(
+        energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness, moduli=moduli
+    )
 
 
 LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, "neo_hookean": neo_hookean}

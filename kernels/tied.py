@@ -9,7 +9,7 @@ import types as _types
 
 import warp as wp
 
-from .element_matrix import UNROLL, panels_of
+from .element_matrix import UNROLL, panels_of, rows_type
 from .types import kernel_module, precision
 
 __all__ = ["tied_kernels", "tied_struct"]
@@ -59,6 +59,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     NS, NT, W = slots, ties, width
     PANELS, P = panels_of(NS)
     Row = wp.types.vector(length=P, dtype=T)
+    SOME = 4 if NT % 4 == 0 else 1
+    Rows = rows_type(dtype, P)
     Slots = wp.types.matrix(shape=(NT * PANELS, P), dtype=T)
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
     Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
@@ -301,7 +303,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         form: int,
         active: wp.array(dtype=wp.int32),
         add: int,
-        matrix: wp.array3d(dtype=vec3),
+        matrix: wp.array3d(dtype=Rows),
     ):
         """As of `element_kernels`: K = mu B^T A B + geometric part, with the slots of a panel side by side."""
         world, elem = wp.tid()
@@ -309,11 +311,14 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             return
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         U = load(block, u, world, elem)
-        stress = stresses(block, shears(block, U, elem), world, elem)
         first, second, B = Slots(), Slots(), Changes()
+        e = Ties()
         for t in range(NT):
-            x = block.X_first[t, elem] + line(block.first, U, t, elem)
-            y = block.X_second[t, elem] + line(block.second, U, t, elem)
+            da = line(block.first, U, t, elem)
+            d1 = block.X_first[t, elem] + da
+            db = line(block.second, U, t, elem)
+            d2 = block.X_second[t, elem] + db
+            e[t] = wp.dot(block.X_first[t, elem], db) + wp.dot(da, d2)
             for a in range(NS):
                 f = block.first[t, a, elem]
                 s = block.second[t, a, elem]
@@ -321,46 +326,41 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                 first[row, a % P] = f
                 second[row, a % P] = s
                 for i in range(3):
-                    B[3 * row + i, a % P] = f * y[i] + s * x[i]
+                    B[3 * row + i, a % P] = f * d2[i] + s * d1[i]
+        stress = Ties()
+        if form != 1:
+            stress = stresses(block, e, world, elem)
+        if add == 0:
+            for k in range(matrix.shape[2]):
+                matrix[world, elem, k] = Rows()
         for panel in range((block.conn.shape[0] + P - 1) / P):
             AB = Products()
             for t in range(NT):
+                x, y, z = Row(), Row(), Row()
                 for k in range(W):
                     other = 3 * (NT * panel + (t / W) * W + k)
                     c = mu * block.coupling[t, k, elem]
-                    for j in range(3):
-                        AB[3 * t + j] = AB[3 * t + j] + c * B[other + j]
-            for a in range(wp.min(NS, P * (panel + 1))):
-                G = Row()
-                if form != 1:
-                    for t in range(NT):
-                        row = NT * (a / P) + t
-                        f = stress[t] * first[row, a % P]
-                        s = stress[t] * second[row, a % P]
-                        G = G + f * second[NT * panel + t] + s * first[NT * panel + t]
-                for i in range(3):
-                    Kx, Ky, Kz = Row(), Row(), Row()
-                    for t in range(NT):
-                        c = B[3 * (NT * (a / P) + t) + i, a % P]
-                        Kx = Kx + c * AB[3 * t]
-                        Ky = Ky + c * AB[3 * t + 1]
-                        Kz = Kz + c * AB[3 * t + 2]
-                    if i == 0:
-                        Kx = Kx + G
-                    if i == 1:
-                        Ky = Ky + G
-                    if i == 2:
-                        Kz = Kz + G
-                    for n in range(P):
-                        b = P * panel + n
-                        if a <= b and b < NS:
-                            pair = 3 * (a * NS - (a * (a - 1)) / 2 + b - a)
-                            entry = vec3(Kx[n], Ky[n], Kz[n])
+                    x = x + c * B[other]
+                    y = y + c * B[other + 1]
+                    z = z + c * B[other + 2]
+                AB[3 * t] = x
+                AB[3 * t + 1] = y
+                AB[3 * t + 2] = z
+            for some in range(NT / SOME):
+                for a in range(wp.min(NS, P * (panel + 1))):
+                    R = matrix[world, elem, NS * panel + a]
+                    row = NT * (a / P) + SOME * some
+                    n = a % P
+                    for o in range(SOME):
+                        t = SOME * some + o
+                        for i in range(3):
+                            c = B[3 * (row + o) + i, n]
                             for j in range(3):
-                                total = entry[j]
-                                if add != 0:
-                                    total += matrix[world, pair + j, elem][i]
-                                matrix[world, pair + j, elem][i] = total
+                                R[3 * i + j] = R[3 * i + j] + c * AB[3 * t + j]
+                        G = stress[t] * (second[row + o, n] * first[NT * panel + t] + first[row + o, n] * second[NT * panel + t])
+                        for i in range(3):
+                            R[4 * i] = R[4 * i] + G
+                    matrix[world, elem, NS * panel + a] = R
 
     return _types.SimpleNamespace(
         module=module,

@@ -15,6 +15,7 @@ import warp as wp
 
 from ..errors import ModelError
 from ..kernels.blocks import assembly_kernels, block_kernels, coupling_struct
+from ..kernels.element_matrix import panels_of, rows_type
 from ..kernels.structs import pattern_struct
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class Assembled:
             model.cache["contributions"] = [self._contributions(parts[0][0]) for parts in self.runs]
         self.contributions: list[tuple[wp.array, wp.array]] = model.cache["contributions"]
         self.common = block_kernels(model.dtype)
-        S = max(3 * block.slots * (block.slots + 1) // 2 * block.count for block in model.blocks)
+        S = max(self._size(block) for block in model.blocks)
         points = 0 if self.whole else max(5 * block.points * block.count for block in model.blocks)
         self.lines = work.array("element gradients", (model.worlds, points), model.types.vec3)
         self.scratch = work.array("element matrices", (model.worlds, S), model.types.vec3)
@@ -109,7 +110,7 @@ class Assembled:
     def modules(self) -> set[wp.Module]:
         """Modules that assembly launches."""
         out = {(k.element_rows if self.whole else k.element_matrix).module for k in self.element_kernels}
-        out |= {assembly_kernels(self.model.dtype, block.slots).module for block in self.model.blocks}
+        out |= {self.assembly(block).module for block in self.model.blocks}
         if self.model.constraints:
             out.add(self.common.coupling_module)
         return out
@@ -129,19 +130,30 @@ class Assembled:
                 runs.append([(block, kernels)])
         return runs
 
+    def assembly(self, block: Any) -> Any:
+        """Kernels that add a block's elements."""
+        return assembly_kernels(self.model.dtype, block.slots, self.whole)
+
+    def _size(self, block: Any) -> int:
+        """Vectors of three numbers in the matrices of a block's elements."""
+        if self.whole:
+            panels, width = panels_of(block.slots)
+            return 3 * panels * width * block.slots * block.count
+        return 3 * block.slots * (block.slots + 1) // 2 * block.count
+
     def _contributions(self, block: Any) -> tuple[wp.array, wp.array]:
         """What of its elements adds to which entry, found on the device: see `list_contributions`."""
         model = self.model
-        pairs = block.slots * (block.slots + 1) // 2
-        if 2 * pairs * block.count >= 2**31:
+        kernels = self.assembly(block)
+        if 2 * kernels.places * block.count >= 2**31:
             raise ModelError(
-                f"{block.count} elements of {block.slots} slots have too many pairs of slots for a matrix, more than "
-                f"2^30: take fewer elements, or preconditioner='block-jacobi' with operator='elements'"
+                f"{block.count} elements of {block.slots} slots have too many pairs of slots for a matrix: at most "
+                f"{2**30 // kernels.places} such elements, or preconditioner='block-jacobi' with operator='elements'"
             )
         upper = len(self.pattern.upper)
         start = wp.zeros(upper + 1, dtype=wp.int32, device=model.device)
         source = wp.zeros(0, dtype=wp.int32, device=model.device)
-        find = assembly_kernels(model.dtype, block.slots).list_contributions
+        find = kernels.list_contributions
         args = [model.topology, self.pattern.data, block.data.conn, block.contribution_offset, block.count]
         wp.launch(find, upper, inputs=[*args, 0, start, source], device=model.device)
         wp.utils.array_scan(start, start, inclusive=True)
@@ -216,12 +228,16 @@ class Assembled:
         mass_factor, dq_dv = factors
         for first, parts in enumerate(self.runs):
             for k, (block, elements) in enumerate(parts):
-                pairs = 3 * block.slots * (block.slots + 1) // 2
                 state = [block.data, u, w.v, w.history, dq_dv, int(projected), active]
                 if self.whole:
-                    matrix = shaped(self.scratch, (m.worlds, block.count, pairs)).transpose((0, 2, 1))
+                    panels, width = panels_of(block.slots)
+                    rows: Any = rows_type(m.dtype, width)
+                    matrix = shaped(self.scratch, (m.worlds, block.count, panels * block.slots), rows)
                     launch(elements.element_rows, (m.worlds, block.count), [*state, int(k > 0), matrix])
+                    numbers = 9 * width * panels * block.slots
+                    matrix = shaped(self.scratch, (m.worlds, block.count, numbers), m.types.T)
                     continue
+                pairs = 3 * block.slots * (block.slots + 1) // 2
                 matrix = shaped(self.scratch, (m.worlds, pairs, block.count))
                 lines = shaped(self.lines, (m.worlds, 5 * block.points, block.count))
                 points = (m.worlds, block.points, block.count)
@@ -232,7 +248,7 @@ class Assembled:
                 launch(elements.element_matrix, (m.worlds, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
             args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]
-            launch(assembly_kernels(m.dtype, block.slots).add_elements, (m.worlds, len(self.pattern.upper)), args)
+            launch(self.assembly(block).add_elements, (m.worlds, len(self.pattern.upper)), args)
 
     def add_constraints(
         self, gradient: wp.array, stiffness: wp.array, dq_dv: wp.array, active: wp.array, out: wp.array
@@ -249,8 +265,8 @@ class Assembled:
         return sp.bsr_matrix((data, graph.indices, graph.indptr), shape=(n, n)).tocsr()
 
 
-def shaped(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """The beginning of an array under another shape."""
-    out: Any = wp.array(ptr=array.ptr, dtype=array.dtype, shape=shape, device=array.device)
+def shaped(array: wp.array, shape: tuple[int, ...], dtype: Any = None) -> wp.array:
+    """The beginning of an array under another shape, and type."""
+    out: Any = wp.array(ptr=array.ptr, dtype=dtype or array.dtype, shape=shape, device=array.device)
     out._owner = array
     return out

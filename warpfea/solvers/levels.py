@@ -12,6 +12,7 @@ import warp as wp
 from ..kernels.levels import TILE_SLOTS, level_struct
 from ..partition import bisect, connected_groups
 from .assembled import Pattern, make_pattern
+from .band import Band, find_band
 
 if TYPE_CHECKING:
     from ..model import Model
@@ -38,6 +39,7 @@ class Level:
     Attributes:
         pattern: of its matrix.
         dense: it is the bottom, inverted as a whole; it has no tiles and no groups then.
+        band: it is the only one, factored as a whole; neither.
         data: device struct of tiles and groups.
         tiles, groups: their numbers; groups 0: nothing below.
         galerkin: device tables of the product that makes the next level's matrix.
@@ -50,6 +52,12 @@ class Level:
     tiles: int = 0
     groups: int = 0
     galerkin: tuple[wp.array, wp.array, wp.array] | None = None
+    band: Band | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is treated as a whole: nothing comes below."""
+        return self.dense or self.band is not None
 
 
 @dataclass(eq=False)
@@ -69,8 +77,14 @@ class Points:
     label: np.ndarray
 
 
-def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[Level]:
-    """The levels of a model, finest first; `pattern` is that of H. Without `coarse` the tiles of the first alone."""
+def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, banded: bool = True) -> list[Level]:
+    """The levels of a model, finest first; `pattern` is that of H. Without `coarse` the tiles of the first alone.
+
+    `banded`: where that is narrow, one level that is factored in a band.
+    """
+    band = find_band(model, pattern) if banded and coarse else None
+    if band is not None:
+        return [Level(pattern, pattern.graph.shape[0], False, level_struct(model.dtype)(), band=band)]
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
     place = model.reference + origin * position[:, None]

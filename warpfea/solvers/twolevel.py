@@ -30,6 +30,7 @@ from ..kernels.levels_build import build_kernels
 from ..kernels.pcg import pcg_kernels
 from ..kernels.types import precision
 from ..launch import labelled
+from .band import BandFactor
 from .lag import Lag
 from .levels import GROUP_SLOTS, Level, make_levels
 
@@ -60,6 +61,8 @@ class LevelArrays:
         other = storage != model.dtype
         name = f"level {depth}"
         self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
+        if level.band is not None:
+            return
         if level.dense:
             N = TILE * -(-n // TILE_SLOTS)
             self.size = N
@@ -108,16 +111,19 @@ class TwoLevel:
         self.blocks = block_kernels(model.dtype)
         self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
         self.dim = (model.worlds, model.slots)
-        key = "levels" if coarse else "tiles"
+        banded = self.storage == model.dtype
+        key = "tiles" if not coarse else "levels" if banded else "levels without a band"
         if key not in model.cache:
-            model.cache[key] = make_levels(model, self.assembled.pattern, coarse=coarse)
+            model.cache[key] = make_levels(model, self.assembled.pattern, coarse=coarse, banded=banded)
         self.levels: list[Level] = model.cache[key]
         self.arrays = [LevelArrays(model, work, level, k, self.storage) for k, level in enumerate(self.levels)]
+        band, pattern = self.levels[0].band, self.assembled.pattern
+        self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         self.value = self.assembled.values("preconditioner matrix")
         self.lanes = LANES if model.device.is_cuda else 1
         self.by_row = 0 if model.device.is_cuda else 1
         constraints = residual.constraints
-        self.tied = constraints is not None and not self.levels[0].dense
+        self.tied = constraints is not None and not self.levels[0].whole
         self.lag = Lag(model, work, launch, "preconditioner", REBUILD_COST)
         self.rebuild_cost = REBUILD_COST
         most = max([level.slots for level in self.levels[1:]], default=1)
@@ -152,7 +158,8 @@ class TwoLevel:
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
         k = self.kernels
-        return {k.module, self.making.module, self.lag.kernels.module, self.blocks.module} | self.assembled.modules()
+        out = {k.module, self.lag.kernels.module, self.blocks.module} | self.assembled.modules()
+        return out | {self.band.kernels.module if self.band else self.making.module}
 
     # the seam
 
@@ -192,8 +199,11 @@ class TwoLevel:
         """z = B r; rows r.z and r.D^-1 r."""
         m, w, launch, k = self.model, self.work, self.launch, self.kernels
         level = self.levels[0]
-        if level.dense:
-            self._apply_dense(0, r, z, active)
+        if level.whole:
+            if self.band:
+                self.band.solve(r, z, active)
+            else:
+                self._apply_dense(0, r, z, active)
             coarse, correct = z, 0
         else:
             coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
@@ -280,6 +290,9 @@ class TwoLevel:
             self._carry()
             self.assembled.add_constraints(*self.place_rows, lag.dq_dv, flags, self.value)
         self.lag.made()
+        if self.band:
+            self.band.make(self.value, flags)
+            return
         for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
             value = arrays.value if depth else self.value
             if level.dense:

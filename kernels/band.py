@@ -1,0 +1,173 @@
+"""Cholesky factors of a banded matrix, in blocks of 8 x 8 whose columns lie side by side; one thread per world.
+
+Block row I of L holds the blocks J = I - width .. I one after the other, columns within, L_II as its inverse. For the
+CPU: a row after the other is what one core does well, its units of arithmetic take a column at once.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .structs import pattern_struct
+from .types import kernel_module, precision
+
+__all__ = ["BLOCK", "band_kernels", "column_type"]
+
+BLOCK = 8
+
+
+def column_type(dtype: str):
+    """A column of a block."""
+    return wp.types.vector(length=BLOCK, dtype=precision(dtype).T)
+
+
+@functools.cache
+def band_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    Pattern = pattern_struct()
+    Column = column_type(dtype)
+    Block = wp.types.matrix(shape=(BLOCK, BLOCK), dtype=T)
+    # a pivot below this share of its diagonal is rounding, or the matrix is indefinite there
+    NEGLIGIBLE = {"float64": 1.0e-14, "float32": 1.0e-6}[dtype]
+    module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
+
+    @wp.kernel(module=module)
+    def fill(
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        slot_at: wp.array(dtype=wp.int32),
+        place_of: wp.array(dtype=wp.int32),
+        width: int,
+        active: wp.array(dtype=wp.int32),
+        band: wp.array3d(dtype=Column),
+    ):
+        """The lower half of A with slots in the order of `slot_at`, one thread per block row; rows beyond are 1."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        for k in range(band.shape[2]):
+            band[world, row, k] = Column()
+        for r in range(BLOCK):
+            i = BLOCK * row + r
+            if i / 3 < slot_at.shape[0]:
+                slot = slot_at[i / 3]
+                for k in range(pattern.start[slot], pattern.start[slot + 1]):
+                    first = 3 * place_of[pattern.column[k]]
+                    for a in range(3):
+                        j = first + a
+                        if j <= i:
+                            at = BLOCK * (j / BLOCK - row + width) + j % BLOCK
+                            band[world, row, at][r] = value[world, k][i % 3, a]
+            else:
+                band[world, row, BLOCK * width + r][r] = T(1.0)
+
+    @wp.func
+    def inverse_factor(A: Block, given: Column) -> Block:
+        """Columns of L^-1 of A = L L^T. A pivot that is not safely positive, measured by the `given` diagonal, is
+        replaced by that: A with something added to its diagonal."""
+        S = Block()
+        for c in range(BLOCK):
+            S[c] = A[c]
+        rows = Block()
+        for j in range(BLOCK):
+            pivot = S[j][j]
+            if pivot <= T(NEGLIGIBLE) * wp.abs(given[j]):
+                pivot = wp.max(wp.abs(given[j]), T(1.0e-30))
+            scale = T(1.0) / wp.sqrt(pivot)
+            column = scale * S[j]
+            for c in range(j + 1, BLOCK):
+                S[c] = S[c] - column[c] * column
+            # rows of L^-1: what the rows above leave of e_j, over the pivot
+            own = scale * rows[j]
+            own[j] = scale
+            rows[j] = own
+            for c in range(j + 1, BLOCK):
+                rows[c] = rows[c] - column[c] * own
+        return wp.transpose(rows)
+
+    @wp.kernel(module=module)
+    def factor(width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
+        """L in place."""
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        for row in range(band.shape[1]):
+            first = wp.max(row - width, 0)
+            for other in range(first, row + 1):
+                at = BLOCK * (other - row + width)
+                S = Block()
+                given = Column()
+                for c in range(BLOCK):
+                    S[c] = band[world, row, at + c]
+                    given[c] = S[c][c]
+                for m in range(first, other):
+                    left = BLOCK * (m - row + width)
+                    right = BLOCK * (m - other + width)
+                    for k in range(BLOCK):
+                        a = band[world, row, left + k]
+                        b = band[world, other, right + k]
+                        for c in range(BLOCK):
+                            S[c] = S[c] - b[c] * a
+                R = Block()
+                if other < row:
+                    for k in range(BLOCK):
+                        d = band[world, other, BLOCK * width + k]
+                        for c in range(BLOCK):
+                            R[c] = R[c] + d[c] * S[k]
+                else:
+                    R = inverse_factor(S, given)
+                for c in range(BLOCK):
+                    band[world, row, at + c] = R[c]
+
+    @wp.kernel(module=module)
+    def solve(
+        width: int,
+        band: wp.array3d(dtype=Column),
+        slot_at: wp.array(dtype=wp.int32),
+        r: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        y: wp.array2d(dtype=Column),
+        z: wp.array2d(dtype=vec3),
+    ):
+        """z = A^-1 r."""
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        slots = slot_at.shape[0]
+        rows = band.shape[1]
+        for row in range(rows):
+            s = Column()
+            for k in range(BLOCK):
+                i = BLOCK * row + k
+                if i / 3 < slots:
+                    s[k] = r[world, slot_at[i / 3]][i % 3]
+            for other in range(wp.max(row - width, 0), row):
+                x = y[world, other]
+                at = BLOCK * (other - row + width)
+                for k in range(BLOCK):
+                    s = s - x[k] * band[world, row, at + k]
+            x = Column()
+            for k in range(BLOCK):
+                x = x + s[k] * band[world, row, BLOCK * width + k]
+            y[world, row] = x
+        for back in range(rows):
+            row = rows - 1 - back
+            s = y[world, row]
+            x = Column()
+            for k in range(BLOCK):
+                x[k] = wp.dot(band[world, row, BLOCK * width + k], s)
+            for k in range(BLOCK):
+                i = BLOCK * row + k
+                if i / 3 < slots:
+                    z[world, slot_at[i / 3]][i % 3] = x[k]
+            for other in range(wp.max(row - width, 0), row):
+                at = BLOCK * (other - row + width)
+                t = y[world, other]
+                for k in range(BLOCK):
+                    t[k] = t[k] - wp.dot(band[world, row, at + k], x)
+                y[world, other] = t
+
+    return _types.SimpleNamespace(module=module, fill=fill, factor=factor, solve=solve)

@@ -1,0 +1,83 @@
+"""A matrix of 3x3 blocks factored as a whole in a band, where one is narrow: chains of beams, strips, slender bars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..kernels.band import BLOCK, band_kernels, column_type
+
+if TYPE_CHECKING:
+    from ..launch import Launcher
+    from ..model import Model
+    from ..workspace import Workspace
+    from .assembled import Pattern
+
+__all__ = ["Band", "BandFactor", "find_band"]
+
+WIDEST = 12
+"""Blocks beside the diagonal of a band, at most: beyond, levels of tiles are cheaper."""
+
+
+@dataclass(eq=False)
+class Band:
+    """An order of the slots in which the pattern is a band.
+
+    Attributes:
+        slot_at, place_of: (slots,) on the device, the order and its inverse.
+        rows: blocks of the diagonal. width: blocks beside the diagonal.
+    """
+
+    slot_at: wp.array
+    place_of: wp.array
+    rows: int
+    width: int
+
+
+def find_band(model: Model, pattern: Pattern) -> Band | None:
+    """The band of reverse Cuthill and McKee's order, on the CPU and if it is narrow."""
+    graph = pattern.graph
+    if model.device.is_cuda:
+        return None
+    n = graph.shape[0]
+    # no order makes a band narrower than half of a row's neighbours
+    if 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (WIDEST + 1):
+        return None
+    order = sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True)
+    place = np.empty(n, dtype=np.int64)
+    place[order] = np.arange(n)
+    rows = np.repeat(place, np.diff(graph.indptr))
+    columns = place[graph.indices]
+    width = int(((3 * rows + 2) // BLOCK - (3 * columns) // BLOCK).max())
+    if width > WIDEST:
+        return None
+    at, of = (model.array("band", values, wp.int32) for values in (order, place))
+    return Band(at, of, -(-3 * n // BLOCK), width)
+
+
+class BandFactor:
+    """Room for the factors, and the launches that make and apply them."""
+
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, band: Band, pattern: Pattern) -> None:
+        self.band, self.pattern, self.launch, self.worlds = band, pattern, launch, model.worlds
+        self.kernels = band_kernels(model.dtype)
+        column: Any = column_type(model.dtype)
+        B = model.worlds
+        self.factors = work.array("band", (B, band.rows, BLOCK * (band.width + 1)), column)
+        self.y = work.array("band vector", (B, band.rows), column)
+
+    def make(self, value: wp.array, active: wp.array) -> None:
+        """Factor the blocks `value`, [world, entry]."""
+        b, k = self.band, self.kernels
+        args = [self.pattern.data, value, b.slot_at, b.place_of, b.width, active, self.factors]
+        self.launch(k.fill, (self.worlds, b.rows), args)
+        self.launch(k.factor, self.worlds, [b.width, active, self.factors])
+
+    def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:
+        """z = A^-1 r."""
+        b = self.band
+        self.launch(self.kernels.solve, self.worlds, [b.width, self.factors, b.slot_at, r, active, self.y, z])
