@@ -35,58 +35,72 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
 
     @wp.kernel(module=module)
-    def fill(
-        pattern: Pattern,
-        value: wp.array2d(dtype=mat33),
-        slot_at: wp.array(dtype=wp.int32),
-        place_of: wp.array(dtype=wp.int32),
-        width: int,
-        active: wp.array(dtype=wp.int32),
-        band: wp.array3d(dtype=Column),
-    ):
-        """The lower half of A with slots in the order of `slot_at`, one thread per block row; rows beyond are 1."""
+    def clear(slots: int, width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
+        """Zeros, and ones on the diagonal beyond the slots; one thread per block row."""
         world, row = wp.tid()
         if active[world] == 0:
             return
         for k in range(band.shape[2]):
             band[world, row, k] = Column()
         for r in range(BLOCK):
-            i = BLOCK * row + r
-            if i / 3 < slot_at.shape[0]:
-                slot = slot_at[i / 3]
-                for k in range(pattern.start[slot], pattern.start[slot + 1]):
-                    first = 3 * place_of[pattern.column[k]]
-                    for a in range(3):
-                        j = first + a
-                        if j <= i:
-                            at = BLOCK * (j / BLOCK - row + width) + j % BLOCK
-                            band[world, row, at][r] = value[world, k][i % 3, a]
-            else:
+            if BLOCK * row + r >= 3 * slots:
                 band[world, row, BLOCK * width + r][r] = T(1.0)
 
+    @wp.kernel(module=module)
+    def fill(
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        place_of: wp.array(dtype=wp.int32),
+        width: int,
+        active: wp.array(dtype=wp.int32),
+        band: wp.array3d(dtype=Column),
+    ):
+        """The lower half of A with slots in the order of `place_of`, one thread per slot."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        place = place_of[slot]
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            other = place_of[pattern.column[k]]
+            if other <= place:
+                A = value[world, k]
+                for a in range(3):
+                    i = 3 * place + a
+                    for b in range(3):
+                        j = 3 * other + b
+                        if j <= i:
+                            at = BLOCK * (j / BLOCK - i / BLOCK + width) + j % BLOCK
+                            band[world, i / BLOCK, at][i % BLOCK] = A[a, b]
+
     @wp.func
-    def inverse_factor(A: Block, given: Column) -> Block:
-        """Columns of L^-1 of A = L L^T. A pivot that is not safely positive, measured by the `given` diagonal, is
-        replaced by that: A with something added to its diagonal."""
-        S = Block()
+    def inverse_factor(A: Block, given: Column, n: int) -> Block:
+        """Columns of L^-1 of A = L L^T; n = BLOCK, which the compiler need not know: unrolled this is slower.
+
+        A pivot that is not safely positive, measured by the `given` diagonal, is replaced by that: A with something
+        added to its diagonal.
+        """
+        S = wp.zeros(shape=(BLOCK,), dtype=Column)
+        rows = wp.zeros(shape=(BLOCK,), dtype=Column)
         for c in range(BLOCK):
             S[c] = A[c]
-        rows = Block()
-        for j in range(BLOCK):
-            pivot = S[j][j]
+        for j in range(n):
+            column = S[j]
+            pivot = column[j]
             if pivot <= T(NEGLIGIBLE) * wp.abs(given[j]):
                 pivot = wp.max(wp.abs(given[j]), T(1.0e-30))
             scale = T(1.0) / wp.sqrt(pivot)
-            column = scale * S[j]
-            for c in range(j + 1, BLOCK):
-                S[c] = S[c] - column[c] * column
             # rows of L^-1: what the rows above leave of e_j, over the pivot
             own = scale * rows[j]
             own[j] = scale
             rows[j] = own
-            for c in range(j + 1, BLOCK):
-                rows[c] = rows[c] - column[c] * own
-        return wp.transpose(rows)
+            for c in range(j + 1, n):
+                x = scale * column[c]
+                S[c] = S[c] - (scale * x) * column
+                rows[c] = rows[c] - x * own
+        inverse = Block()
+        for c in range(BLOCK):
+            inverse[c] = rows[c]
+        return wp.transpose(inverse)
 
     @wp.kernel(module=module)
     def factor(width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
@@ -118,7 +132,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                         for c in range(BLOCK):
                             R[c] = R[c] + d[c] * S[k]
                 else:
-                    R = inverse_factor(S, given)
+                    R = inverse_factor(S, given, band.shape[2] / (width + 1))
                 for c in range(BLOCK):
                     band[world, row, at + c] = R[c]
 
@@ -170,4 +184,4 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                     t[k] = t[k] - wp.dot(band[world, row, at + k], x)
                 y[world, other] = t
 
-    return _types.SimpleNamespace(module=module, fill=fill, factor=factor, solve=solve)
+    return _types.SimpleNamespace(module=module, clear=clear, fill=fill, factor=factor, solve=solve)

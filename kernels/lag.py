@@ -20,6 +20,8 @@ DECADES = 3.0
 """What an iteration of Newton's method gains with the matrix of its iterate, for the rule."""
 FADE = 0.8
 """A kept matrix that served badly at the start of a step is tried again after some steps."""
+AGEING = 0.25
+"""What a solve adds to `excess` where only D, which norms are measured with, is kept."""
 SHARE = 0.3
 """Residual of a linear solve over what the last iteration left, with a matrix that is not of the iterate."""
 
@@ -172,20 +174,22 @@ def lag_kernels(dtype: str) -> _types.SimpleNamespace:
                 lag.due[world] = 1
 
     @wp.kernel(module=module)
-    def judge(lag: Lag, newton: Newton, pcg: PCG):
-        """After a solve: what it cost."""
+    def judge(lag: Lag, newton: Newton, pcg: PCG, follows: int):
+        """After a solve: what it cost. `follows`: the preconditioner is made with the operator, only D grows old."""
         world = wp.tid()
         if newton.active[world] == 0 or pcg.iterations[world] == 0:
             return
         count = f64(pcg.iterations[world])
         gained = wp.max(pcg.first_norm[world] / wp.max(pcg.norm[world], f64(1.0e-300)), f64(2.0))
         decades = wp.log10(gained)
-        if lag.rate[world] == f64(0.0):
+        if follows != 0:
+            lag.excess[world] = lag.excess[world] + f64(AGEING)
+        elif lag.rate[world] == f64(0.0):
             lag.rate[world] = count / decades
         else:
             lag.excess[world] = lag.excess[world] + wp.max(count - lag.rate[world] * decades - f64(1.0), f64(0.0))
-            if lag.excess[world] > lag.limit:
-                lag.due[world] = 1
+        if lag.excess[world] > lag.limit:
+            lag.due[world] = 1
 
     @wp.kernel(module=module)
     def commit(lag: Lag, accepted: wp.array(dtype=wp.int32)):

@@ -124,12 +124,19 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         if active[world] == 0 or elem >= block.count:
             return
         U = load(block, u, world, elem)
-        e = shears(block, U, elem)
+        x1, x2 = TieVectors(), TieVectors()
+        e = Ties()
+        for t in range(NT):
+            da = line(block.first, U, t, elem)
+            db = line(block.second, U, t, elem)
+            x1[t] = block.X_first[t, elem] + da
+            x2[t] = block.X_second[t, elem] + db
+            e[t] = wp.dot(block.X_first[t, elem], db) + wp.dot(da, x2[t])
         s = stresses(block, e, world, elem)
         f = Local()
         for t in range(NT):
-            a = s[t] * (block.X_first[t, elem] + line(block.first, U, t, elem))
-            d = s[t] * (block.X_second[t, elem] + line(block.second, U, t, elem))
+            a = s[t] * x1[t]
+            d = s[t] * x2[t]
             for i in range(NS):
                 f[i] = f[i] + block.first[t, i, elem] * d + block.second[t, i, elem] * a
         for i in range(NS):

@@ -73,8 +73,10 @@ class BandFactor:
     def make(self, value: wp.array, active: wp.array) -> None:
         """Factor the blocks `value`, [world, entry]."""
         b, k = self.band, self.kernels
-        args = [self.pattern.data, value, b.slot_at, b.place_of, b.width, active, self.factors]
-        self.launch(k.fill, (self.worlds, b.rows), args)
+        slots = self.pattern.graph.shape[0]
+        self.launch(k.clear, (self.worlds, b.rows), [slots, b.width, active, self.factors])
+        args = [self.pattern.data, value, b.place_of, b.width, active, self.factors]
+        self.launch(k.fill, (self.worlds, slots), args)
         self.launch(k.factor, self.worlds, [b.width, active, self.factors])
 
     def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:

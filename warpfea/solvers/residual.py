@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -58,7 +59,12 @@ class Reducer:
 
 
 class Residual:
-    """Launches that evaluate g(v), Phi(v), the norms, and H p."""
+    """Launches that evaluate g(v), Phi(v), the norms, and H p.
+
+    Attributes:
+        by_matrix: H p goes by the assembled matrix.
+        on_matrix: called with that matrix and flags of the worlds, where it was made anew.
+    """
 
     def __init__(
         self, model: Model, work: Workspace, launch: Launcher, constraints: ConstraintSolver | None, *, viscous: bool,
@@ -92,6 +98,7 @@ class Residual:
             forms = [block.key.damping if viscous else None for block in model.blocks]
             self.products = [block.massive_product(model.dtype, form) for block, form in zip(model.blocks, forms)]
         self.keep, self.lasting = 0, False
+        self.on_matrix: Callable[[wp.array, wp.array], None] | None = None
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
             self.assembled = Assembled(model, work, launch, self.block_kernels)
@@ -170,6 +177,8 @@ class Residual:
         self.lag.carry()
         factors = (control.mass_factor, control.dq_dv)
         self.assembled.assemble(self.lag.place, factors, control.build, self.matrix, projected=False)
+        if self.on_matrix:
+            self.on_matrix(self.matrix, control.build)
         self.lag.made()
 
     def take(self, active: wp.array) -> None:
@@ -179,6 +188,8 @@ class Residual:
             assert self.assembled is not None
             factors = (w.step.mass_factor, w.step.dq_dv)
             self.assembled.assemble(w.u, factors, active, self.matrix, projected=False)
+            if self.on_matrix:
+                self.on_matrix(self.matrix, active)
 
     @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:

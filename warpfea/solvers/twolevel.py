@@ -117,12 +117,16 @@ class TwoLevel:
             model.cache[key] = make_levels(model, self.assembled.pattern, coarse=coarse, banded=banded)
         self.levels: list[Level] = model.cache[key]
         self.arrays = [LevelArrays(model, work, level, k, self.storage) for k, level in enumerate(self.levels)]
+        constraints = residual.constraints
         band, pattern = self.levels[0].band, self.assembled.pattern
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
+        # the factors of the operator's own matrix, where there is one, with all that belongs to H
+        self.follows = self.band is not None and residual.by_matrix and constraints is None
+        if self.follows:
+            residual.on_matrix = self._factor
         self.value = self.assembled.values("preconditioner matrix")
         self.lanes = LANES if model.device.is_cuda else 1
         self.by_row = 0 if model.device.is_cuda else 1
-        constraints = residual.constraints
         self.tied = constraints is not None and not self.levels[0].whole
         self.lag = Lag(model, work, launch, "preconditioner", REBUILD_COST)
         self.rebuild_cost = REBUILD_COST
@@ -191,7 +195,7 @@ class TwoLevel:
     @labelled("build")
     def judge(self, active: wp.array) -> None:
         """Count what the solve cost."""
-        args = [self.lag.control, self.work.newton, self.work.pcg]
+        args = [self.lag.control, self.work.newton, self.work.pcg, int(self.follows)]
         self.launch(self.lag.kernels.judge, self.model.worlds, args)
 
     @labelled("preconditioner")
@@ -291,7 +295,8 @@ class TwoLevel:
             self.assembled.add_constraints(*self.place_rows, lag.dq_dv, flags, self.value)
         self.lag.made()
         if self.band:
-            self.band.make(self.value, flags)
+            if not self.follows:
+                self._factor(self.value, flags)
             return
         for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
             value = arrays.value if depth else self.value
@@ -305,6 +310,11 @@ class TwoLevel:
             free = self.all_free if depth else m.topology.free
             args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
             launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+
+    @labelled("build")
+    def _factor(self, value: wp.array, flags: wp.array) -> None:
+        assert self.band is not None
+        self.band.make(value, flags)
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array, *, keep: bool) -> None:
         B, k = self.model.worlds, self.making
