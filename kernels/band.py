@@ -1,4 +1,4 @@
-"""Cholesky factors of a banded matrix, in blocks of 8 x 8 whose columns lie side by side; one thread per world.
+"""Cholesky factors of a banded matrix, in blocks of 4 x 4 whose columns lie side by side; one thread per world.
 
 Block row I of L holds the blocks J = I - width .. I one after the other, columns within, L_II as its inverse. For the
 CPU: a row after the other is what one core does well, its units of arithmetic take a column at once.
@@ -14,7 +14,7 @@ from .types import kernel_module, precision
 
 __all__ = ["BLOCK", "band_kernels", "column_type"]
 
-BLOCK = 8
+BLOCK = 4
 
 
 def column_type(dtype: str):
@@ -73,34 +73,27 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                             band[world, i / BLOCK, at][i % BLOCK] = A[a, b]
 
     @wp.func
-    def inverse_factor(A: Block, given: Column, n: int) -> Block:
-        """Columns of L^-1 of A = L L^T; n = BLOCK, which the compiler need not know: unrolled this is slower.
-
-        A pivot that is not safely positive, measured by the `given` diagonal, is replaced by that: A with something
-        added to its diagonal.
-        """
-        S = wp.zeros(shape=(BLOCK,), dtype=Column)
-        rows = wp.zeros(shape=(BLOCK,), dtype=Column)
+    def inverse_factor(A: Block, given: Column) -> Block:
+        """Columns of L^-1 of A = L L^T. A pivot that is not safely positive, measured by the `given` diagonal, is
+        replaced by that: A with something added to its diagonal."""
+        S = Block()
         for c in range(BLOCK):
             S[c] = A[c]
-        for j in range(n):
-            column = S[j]
-            pivot = column[j]
+        rows = Block()
+        for j in range(BLOCK):
+            pivot = S[j][j]
             if pivot <= T(NEGLIGIBLE) * wp.abs(given[j]):
                 pivot = wp.max(wp.abs(given[j]), T(1.0e-30))
             scale = T(1.0) / wp.sqrt(pivot)
+            column = scale * S[j]
             # rows of L^-1: what the rows above leave of e_j, over the pivot
             own = scale * rows[j]
             own[j] = scale
             rows[j] = own
-            for c in range(j + 1, n):
-                x = scale * column[c]
-                S[c] = S[c] - (scale * x) * column
-                rows[c] = rows[c] - x * own
-        inverse = Block()
-        for c in range(BLOCK):
-            inverse[c] = rows[c]
-        return wp.transpose(inverse)
+            for c in range(j + 1, BLOCK):
+                S[c] = S[c] - column[c] * column
+                rows[c] = rows[c] - column[c] * own
+        return wp.transpose(rows)
 
     @wp.kernel(module=module)
     def factor(width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
@@ -132,7 +125,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                         for c in range(BLOCK):
                             R[c] = R[c] + d[c] * S[k]
                 else:
-                    R = inverse_factor(S, given, band.shape[2] / (width + 1))
+                    R = inverse_factor(S, given)
                 for c in range(BLOCK):
                     band[world, row, at + c] = R[c]
 

@@ -89,14 +89,15 @@ def element_kernels(
             w = fn.weight_of(block, q, elem)
             J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
             local = fn.into_axes(block, G, q, elem)
-            P = fn.out_of_axes(block, m.stress(local, c), q, elem)
+            P = m.stress(local, c)
             psi += w * m.energy(local, c)
             if wp.static(damping == "incremental" or damping == "rate"):
-                rate = fn.strain_rate(block, G, fn.velocity_gradient(block, V, q, elem), history, dq, world, q, elem)
+                Fdot = fn.velocity_gradient(block, V, q, elem)
+                rate = fn.strain_rate(block, local, Fdot, history, dq, world, q, elem)
                 S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
-                P = P + S + G * S
+                P = P + S + local * S
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
-            f = fn.scatter(block, f, P, q, elem)
+            f = fn.scatter(block, f, fn.out_of_axes(block, P, q, elem), q, elem)
         for i in range(NS):
             f[i] = lane_sum(f[i], lanes)
         stored = row_sum(wp.float64(psi), lanes)

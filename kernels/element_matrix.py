@@ -86,17 +86,18 @@ def matrix_kernels(
     ):
         """F with columns along the law's axes, and the second Piola-Kirchhoff stress of `form` there."""
         G = fn.gradient_of(block, U, point, elem)
+        local = fn.into_axes(block, G, point, elem)
         F = t.identity() + G
         S = mat33()
         if wp.static(not needs_J):
-            S = m.stiffness(t.green(fn.into_axes(block, G, point, elem)), c)
+            S = m.stiffness(t.green(local), c)
             if form == 1:
                 S += compression(S) * t.identity()
         if wp.static(damping == "incremental" or damping == "rate"):
             if form == 0:
                 Fdot = fn.velocity_gradient(block, V, point, elem)
-                rate = fn.strain_rate(block, G, Fdot, history, T(dq_dv), world, point, elem)
-                S += fn.into_axes(block, t.isotropic(rate, c[LAMBDA_V], c[ETA]), point, elem)
+                rate = fn.strain_rate(block, local, Fdot, history, T(dq_dv), world, point, elem)
+                S += t.isotropic(rate, c[LAMBDA_V], c[ETA])
         if wp.static(framed):
             F = F * block.frame[point, elem]
         return F, S

@@ -36,15 +36,15 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         active: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
     ):
-        """a0 E(u0) - a1 E(u1) per point: what the incremental strain rate is measured from."""
+        """a0 E(u0) - a1 E(u1) per point, in the law's axes: what the incremental strain rate is measured from."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
         U0 = fn.load(block, u0, world, elem)
         U1 = fn.load(block, u1, world, elem)
         for q in range(NQ):
-            E = T(a0[world]) * t.green(fn.gradient_of(block, U0, q, elem))
-            E = E - T(a1[world]) * t.green(fn.gradient_of(block, U1, q, elem))
+            E = T(a0[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U0, q, elem), q, elem))
+            E = E - T(a1[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U1, q, elem), q, elem))
             history[world, fn.history_index(block, q, elem)] = fn.pack(E)
 
     @wp.kernel(module=viscous_module)

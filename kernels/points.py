@@ -163,9 +163,9 @@ def point_functions(
 
     @wp.func
     def velocity_gradient(block: Block, V: Local, point: int, elem: int) -> mat33:
-        """Fdot where the form of damping needs it."""
+        """Fdot in the law's axes, where the form of damping needs it."""
         if wp.static(damping == "rate"):
-            return gradient_of(block, V, point, elem)
+            return into_axes(block, gradient_of(block, V, point, elem), point, elem)
         else:
             return mat33()
 
@@ -173,7 +173,8 @@ def point_functions(
     def strain_rate(
         block: Block, G: mat33, Fdot: mat33, history: wp.array2d(dtype=sym6), dq: T, world: int, point: int, elem: int
     ) -> mat33:
-        """Edot at a point: (E - history)/dq (incremental), or Eq. (58) with F and Fdot at the new state (rate)."""
+        """Edot at a point: (E - history)/dq (incremental), or Eq. (58) with F and Fdot at the new state (rate); all in
+        the law's axes."""
         if wp.static(damping == "incremental"):
             past = unpack(history[world, history_index(block, point, elem)])
             return (T(1.0) / dq) * (t.green(G) - past)
@@ -210,14 +211,15 @@ def point_functions(
         elem: int,
     ) -> mat33:
         """dP at a point, with damping."""
-        dP = m.increment(into_axes(block, G, point, elem), into_axes(block, dG, point, elem), c)
-        dP = out_of_axes(block, dP, point, elem)
+        local = into_axes(block, G, point, elem)
+        change = into_axes(block, dG, point, elem)
+        dP = m.increment(local, change, c)
         if wp.static(damping == "incremental" or damping == "rate"):
-            F = t.identity() + G
-            S = t.isotropic(strain_rate(block, G, Fdot, history, dq, world, point, elem), c[LAMBDA_V], c[ETA])
-            dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[LAMBDA_V] / dq, c[ETA] / dq)
-            dP = dP + dG * S + F * dS
-        return dP
+            F = t.identity() + local
+            S = t.isotropic(strain_rate(block, local, Fdot, history, dq, world, point, elem), c[LAMBDA_V], c[ETA])
+            dS = t.isotropic(t.sym(wp.transpose(F) * change), c[LAMBDA_V] / dq, c[ETA] / dq)
+            dP = dP + change * S + F * dS
+        return out_of_axes(block, dP, point, elem)
 
     @wp.func
     def tangent_force(

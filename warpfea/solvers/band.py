@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Band", "BandFactor", "find_band"]
 
-WIDEST = 12
+WIDEST = 24
 """Blocks beside the diagonal of a band, at most: beyond, levels of tiles are cheaper."""
 
 
