@@ -19,8 +19,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Band", "BandFactor", "find_band"]
 
-WIDEST = 24
-"""Blocks beside the diagonal of a band, at most: beyond, levels of tiles are cheaper."""
+WIDEST = 112
+"""Blocks beside the diagonal of a band, at most, where it is chosen: beyond, levels of tiles are cheaper."""
+SMALL = 160
+"""Up to so many slots any band is."""
+ASSEMBLY, FACTORISATION = 1.9, 5.5e-5
+"""Times per unknown, us, on one core: making H of 3243 and T10 elements; a factorisation, per bandwidth squared."""
+PRODUCT, SOLUTION = 0.13, 5.4e-4
+"""H p; and a solution, per bandwidth."""
 
 
 @dataclass(eq=False)
@@ -37,15 +43,25 @@ class Band:
     rows: int
     width: int
 
+    @property
+    def rebuild_cost(self) -> float:
+        """Making it, in iterations of PCG."""
+        b = BLOCK * self.width
+        return (ASSEMBLY + FACTORISATION * b * b) / (PRODUCT + SOLUTION * b)
 
-def find_band(model: Model, pattern: Pattern) -> Band | None:
-    """The band of reverse Cuthill and McKee's order, on the CPU and if it is narrow."""
+    @property
+    def quick(self) -> bool:
+        """Whether a factorisation costs little beside the matrix."""
+        return FACTORISATION * (BLOCK * self.width) ** 2 < 0.2 * ASSEMBLY
+
+
+def find_band(model: Model, pattern: Pattern, *, any_width: bool = False) -> Band | None:
+    """The band in the order of reverse Cuthill and McKee, if it is narrow or the model small; or of `any_width`."""
     graph = pattern.graph
-    if model.device.is_cuda:
-        return None
     n = graph.shape[0]
+    free = any_width or n <= SMALL
     # no order makes a band narrower than half of a row's neighbours
-    if 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (WIDEST + 1):
+    if not free and 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (WIDEST + 1):
         return None
     order = sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True)
     place = np.empty(n, dtype=np.int64)
@@ -53,7 +69,7 @@ def find_band(model: Model, pattern: Pattern) -> Band | None:
     rows = np.repeat(place, np.diff(graph.indptr))
     columns = place[graph.indices]
     width = int(((3 * rows + 2) // BLOCK - (3 * columns) // BLOCK).max())
-    if width > WIDEST:
+    if not free and width > WIDEST:
         return None
     at, of = (model.array("band", values, wp.int32) for values in (order, place))
     return Band(at, of, -(-3 * n // BLOCK), width)

@@ -77,14 +77,8 @@ class Points:
     label: np.ndarray
 
 
-def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, banded: bool = True) -> list[Level]:
-    """The levels of a model, finest first; `pattern` is that of H. Without `coarse` the tiles of the first alone.
-
-    `banded`: where that is narrow, one level that is factored in a band.
-    """
-    band = find_band(model, pattern) if banded and coarse else None
-    if band is not None:
-        return [Level(pattern, pattern.graph.shape[0], False, level_struct(model.dtype)(), band=band)]
+def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[Level]:
+    """The levels of a model, finest first; `pattern` is that of H. Without `coarse` the tiles of the first alone."""
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
     place = model.reference + origin * position[:, None]

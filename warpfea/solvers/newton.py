@@ -43,8 +43,10 @@ class NewtonPCG:
         max_pcg: iterations per linear solve.
         max_halvings: how often a refused step may be halved.
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
-            serves), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
-            "block-jacobi" (the blocks alone), or "auto": the second for many small bodies on joints, else the first.
+            serves), "banded" (Cholesky factors of the whole, kept as well; on the CPU, for chains, strips and slender
+            or small bodies), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
+            "block-jacobi" (the blocks alone), or "auto": "deflated" for many small bodies on joints, "banded" where the
+            band is narrow, else "two-level".
         linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS where that is installed.
         preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
             model's. They are made in the model's precision; float32 halves what an application reads.
@@ -86,7 +88,7 @@ class NewtonPCG:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} is not for linear = 'direct'")
         if self.preconditioner not in ("auto", *NAMES):
             raise ModelError(
-                f"preconditioner {self.preconditioner!r} is unknown; there are auto, two-level, deflated, block-jacobi"
+                f"preconditioner {self.preconditioner!r} is unknown; there are auto, two-level, banded, deflated, block-jacobi"
             )
         if self.preconditioner_dtype not in (None, "float32", "float64"):
             raise ModelError(

@@ -96,22 +96,23 @@ class BlockJacobi:
             constraints.precondition(r, z, active)
 
 
-NAMES = ("two-level", "tiles", "deflated", "block-jacobi")
+NAMES = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
 SMALL_BODY = 64
 
 
 def choose(name: str, model: Model) -> str:
-    """What "auto" stands for: groups of nodes need bodies that hold several."""
+    """What "auto" stands for: "deflated" for small bodies on joints, as groups of nodes need bodies that hold several;
+    else it is left to `TwoLevel`."""
     if name == "auto":
         small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
-        return "deflated" if model.constraints and small and model.slots > WHOLE_SLOTS else "two-level"
+        return "deflated" if model.constraints and small and model.slots > WHOLE_SLOTS else "auto"
     return name
 
 
 def make(
     name: str, storage: str | None, model: Model, work: Workspace, launch: Launcher, residual: Residual
 ) -> Preconditioner:
-    """The preconditioner `name` of NAMES; "tiles" is the first without its coarse part."""
-    if name in ("two-level", "tiles"):
-        return TwoLevel(model, work, launch, residual, storage, coarse=name == "two-level")
-    return BlockJacobi(model, work, launch, residual)
+    """The preconditioner `name`, of NAMES or what `choose` makes of "auto"."""
+    if name == "block-jacobi" or name == "deflated":
+        return BlockJacobi(model, work, launch, residual)
+    return TwoLevel(model, work, launch, residual, storage, kind=name)

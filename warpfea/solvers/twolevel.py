@@ -25,12 +25,13 @@ import numpy as np
 import warp as wp
 
 from ..kernels.blocks import block_kernels
-from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels
+from ..errors import ModelError
+from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels, level_struct
 from ..kernels.levels_build import build_kernels
 from ..kernels.pcg import pcg_kernels
 from ..kernels.types import precision
 from ..launch import labelled
-from .band import BandFactor
+from .band import BandFactor, find_band
 from .lag import Lag
 from .levels import GROUP_SLOTS, Level, make_levels
 
@@ -100,7 +101,7 @@ class TwoLevel:
         residual: Residual,
         storage: str | None = None,
         *,
-        coarse: bool = True,
+        kind: str = "two-level",
     ) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
         self.storage = storage or model.dtype
@@ -111,27 +112,41 @@ class TwoLevel:
         self.blocks = block_kernels(model.dtype)
         self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
         self.dim = (model.worlds, model.slots)
-        banded = self.storage == model.dtype
-        key = "tiles" if not coarse else "levels" if banded else "levels without a band"
-        if key not in model.cache:
-            model.cache[key] = make_levels(model, self.assembled.pattern, coarse=coarse, banded=banded)
-        self.levels: list[Level] = model.cache[key]
+        self.levels = self._levels(kind)
         self.arrays = [LevelArrays(model, work, level, k, self.storage) for k, level in enumerate(self.levels)]
         constraints = residual.constraints
         band, pattern = self.levels[0].band, self.assembled.pattern
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
-        # the factors of the operator's own matrix, where there is one, with all that belongs to H
-        self.follows = self.band is not None and residual.by_matrix and constraints is None
+        # the factors of the operator's own matrix where they cost little; wider ones are kept for longer than that
+        self.follows = band is not None and band.quick and residual.by_matrix and constraints is None
         if self.follows:
             residual.on_matrix = self._factor
         self.value = self.assembled.values("preconditioner matrix")
         self.lanes = LANES if model.device.is_cuda else 1
         self.by_row = 0 if model.device.is_cuda else 1
         self.tied = constraints is not None and not self.levels[0].whole
-        self.lag = Lag(model, work, launch, "preconditioner", REBUILD_COST)
-        self.rebuild_cost = REBUILD_COST
+        self.rebuild_cost = band.rebuild_cost if band is not None and not self.follows else REBUILD_COST
+        self.lag = Lag(model, work, launch, "preconditioner", self.rebuild_cost)
         most = max([level.slots for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
+
+    def _levels(self, kind: str) -> list[Level]:
+        """Those of a kind: "two-level", "tiles" (without a coarse part), "banded", or "auto"."""
+        model, pattern = self.model, self.assembled.pattern
+        if kind in ("auto", "banded") and not model.device.is_cuda and self.storage == model.dtype:
+            if kind not in model.cache:
+                model.cache[kind] = find_band(model, pattern, any_width=kind == "banded")
+            if model.cache[kind] is not None:
+                return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=model.cache[kind])]
+        if kind == "banded":
+            raise ModelError(
+                f"NewtonPCG: preconditioner = 'banded' is for the CPU, in the model's precision; got {model.device} and "
+                f"{self.storage} for a model in {model.dtype}"
+            )
+        key = "tiles" if kind == "tiles" else "levels"
+        if key not in model.cache:
+            model.cache[key] = make_levels(model, pattern, coarse=kind != "tiles")
+        return model.cache[key]
 
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
