@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..model import Model
     from ..workspace import Workspace
 
-__all__ = ["Assembled", "Pattern", "make_pattern", "shaped"]
+__all__ = ["Assembled", "Pattern", "coupled_slots", "make_pattern", "shaped"]
 
 
 def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
@@ -72,6 +72,21 @@ def make_pattern(model: Model, graph: sp.csr_matrix, *, mirrored: bool = True) -
     return Pattern(graph, data, upper)
 
 
+def coupled_slots(model: Model) -> sp.csr_matrix:
+    """Which slots share an element or a row of the constraints, rows sorted."""
+    if "coupled slots" not in model.cache:
+        graph, con = model.graph(), model.constraints
+        if con is not None:
+            row = con.term_host // 3
+            touched = sp.csr_matrix((np.ones(len(row), dtype=np.int8), (row, con.slot_host)), (con.count, model.slots))
+            touched.data[:] = 1
+            graph = graph + sp.csr_matrix(touched.T.astype(np.int32) @ touched.astype(np.int32)).astype(np.int8)
+        graph = graph.tocsr()
+        graph.sort_indices()
+        model.cache["coupled slots"] = graph
+    return model.cache["coupled slots"]
+
+
 class Assembled:
     """Assembly of the elements' part of H, c_M M + (dq/dv) K, and on request of the penalties of the constraints.
 
@@ -98,12 +113,7 @@ class Assembled:
     def _make_tables(self) -> tuple[Pattern, wp.array, Any, int]:
         """Pattern, masses of its upper entries, and what constraints add."""
         model = self.model
-        graph = model.graph()
-        ties = self._tied_slots()
-        if ties is not None:
-            graph = (graph + ties).tocsr()
-        graph.sort_indices()
-        pattern = make_pattern(model, graph)
+        pattern = make_pattern(model, coupled_slots(model))
         mass = model.array("matrix pattern", self._mass_of(pattern), model.types.T)
         return pattern, mass, *(self._couple(pattern) if model.constraints else (None, 0))
 
@@ -172,17 +182,6 @@ class Assembled:
         wanted = upper[:, 2].astype(np.int64) * n + upper[:, 3]
         at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
         return np.where(key[at] == wanted, mass.data[at], 0.0)
-
-    def _tied_slots(self) -> sp.csr_matrix | None:
-        """Slots that a row of the constraints couples."""
-        con = self.model.constraints
-        if con is None:
-            return None
-        n = self.model.slots
-        row = con.term_host // 3
-        touched = sp.csr_matrix((np.ones(len(row), dtype=np.int8), (row, con.slot_host)), shape=(con.count, n))
-        touched.data[:] = 1
-        return sp.csr_matrix(touched.T.astype(np.int32) @ touched.astype(np.int32)).astype(np.int8)
 
     def _couple(self, pattern: Pattern) -> tuple[Any, int]:
         """Entries that constraints add to, with their pairs of vectors."""

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..kernels.band import BLOCK, band_kernels, column_type
+from .assembled import coupled_slots
 
 if TYPE_CHECKING:
     from ..launch import Launcher
@@ -55,9 +56,16 @@ class Band:
         return FACTORISATION * (BLOCK * self.width) ** 2 < 0.2 * ASSEMBLY
 
 
-def find_band(model: Model, pattern: Pattern, *, any_width: bool = False) -> Band | None:
+def find_band(model: Model, *, any_width: bool = False) -> Band | None:
     """The band in the order of reverse Cuthill and McKee, if it is narrow or the model small; or of `any_width`."""
-    graph = pattern.graph
+    name = "band" if any_width else "narrow band"
+    if name not in model.cache:
+        model.cache[name] = _find_band(model, any_width)
+    return model.cache[name]
+
+
+def _find_band(model: Model, any_width: bool) -> Band | None:
+    graph = coupled_slots(model)
     n = graph.shape[0]
     free = any_width or n <= SMALL
     # no order makes a band narrower than half of a row's neighbours

@@ -134,7 +134,7 @@ class NewtonLoop:
         self.max_outer = options.max_outer
         self.constraints: ConstraintSolver | None = None
         direct = options.linear == "direct"
-        kind = "direct" if direct else choose(options.preconditioner, model)
+        kind = "direct" if direct else choose(options.preconditioner, options.preconditioner_dtype, model)
         if constrained:
             deflate = kind != "block-jacobi" and not direct
             self.constraints = ConstraintSolver(

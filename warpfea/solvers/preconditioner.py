@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
+from ..errors import ModelError
 from ..kernels.pcg import pcg_kernels
 from ..launch import labelled
+from .band import find_band
 from .levels import WHOLE_SLOTS
 from .residual import Residual
 from .twolevel import TwoLevel
@@ -100,19 +102,31 @@ NAMES = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
 SMALL_BODY = 64
 
 
-def choose(name: str, model: Model) -> str:
-    """What "auto" stands for: "deflated" for small bodies on joints, as groups of nodes need bodies that hold several;
-    else it is left to `TwoLevel`."""
-    if name == "auto":
-        small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
-        return "deflated" if model.constraints and small and model.slots > WHOLE_SLOTS else "auto"
-    return name
+def choose(name: str, storage: str | None, model: Model) -> str:
+    """What a name of NAMES or "auto" stands for: factors where the band is narrow, and else block Jacobi where bodies
+    on joints are too small to hold several groups of nodes.
+
+    Raises:
+        ModelError: "banded" on a GPU, or with inverses in another precision than the model's.
+    """
+    banded = not model.device.is_cuda and storage in (None, model.dtype)
+    if name == "banded" and not banded:
+        raise ModelError(
+            f"NewtonPCG: preconditioner = 'banded' is for the CPU, in the model's precision; the model is on "
+            f"{model.device} in {model.dtype}, preconditioner_dtype = {storage!r}"
+        )
+    if name != "auto":
+        return name
+    if banded and find_band(model) is not None:
+        return "banded"
+    small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
+    return "deflated" if model.constraints and small and model.slots > WHOLE_SLOTS else "two-level"
 
 
 def make(
     name: str, storage: str | None, model: Model, work: Workspace, launch: Launcher, residual: Residual
 ) -> Preconditioner:
-    """The preconditioner `name`, of NAMES or what `choose` makes of "auto"."""
-    if name == "block-jacobi" or name == "deflated":
+    """The preconditioner `name` of NAMES."""
+    if name in ("block-jacobi", "deflated"):
         return BlockJacobi(model, work, launch, residual)
     return TwoLevel(model, work, launch, residual, storage, kind=name)

@@ -25,7 +25,6 @@ import numpy as np
 import warp as wp
 
 from ..kernels.blocks import block_kernels
-from ..errors import ModelError
 from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels, level_struct
 from ..kernels.levels_build import build_kernels
 from ..kernels.pcg import pcg_kernels
@@ -131,22 +130,14 @@ class TwoLevel:
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
     def _levels(self, kind: str) -> list[Level]:
-        """Those of a kind: "two-level", "tiles" (without a coarse part), "banded", or "auto"."""
+        """Those of a kind: "two-level", "tiles" (without a coarse part) or "banded"."""
         model, pattern = self.model, self.assembled.pattern
-        if kind in ("auto", "banded") and not model.device.is_cuda and self.storage == model.dtype:
-            if kind not in model.cache:
-                model.cache[kind] = find_band(model, pattern, any_width=kind == "banded")
-            if model.cache[kind] is not None:
-                return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=model.cache[kind])]
         if kind == "banded":
-            raise ModelError(
-                f"NewtonPCG: preconditioner = 'banded' is for the CPU, in the model's precision; got {model.device} and "
-                f"{self.storage} for a model in {model.dtype}"
-            )
-        key = "tiles" if kind == "tiles" else "levels"
-        if key not in model.cache:
-            model.cache[key] = make_levels(model, pattern, coarse=kind != "tiles")
-        return model.cache[key]
+            band = find_band(model) or find_band(model, any_width=True)
+            return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=band)]
+        if kind not in model.cache:
+            model.cache[kind] = make_levels(model, pattern, coarse=kind != "tiles")
+        return model.cache[kind]
 
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
