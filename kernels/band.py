@@ -15,6 +15,8 @@ from .types import kernel_module, precision
 __all__ = ["BLOCK", "band_kernels", "column_type"]
 
 BLOCK = 4
+FIRST_SHIFT, SHIFT_GROWTH, LARGEST_SHIFT = 0.01, 10.0, 0.99
+"""Shares of the diagonal that are added to a matrix that is not positive."""
 
 
 def column_type(dtype: str):
@@ -52,10 +54,11 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         value: wp.array2d(dtype=mat33),
         place_of: wp.array(dtype=wp.int32),
         width: int,
+        shift: wp.array(dtype=T),
         active: wp.array(dtype=wp.int32),
         band: wp.array3d(dtype=Column),
     ):
-        """The lower half of A with slots in the order of `place_of`, one thread per slot."""
+        """The lower half of A + shift D with slots in the order of `place_of`, one thread per slot."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -64,6 +67,9 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
             other = place_of[pattern.column[k]]
             if other <= place:
                 A = value[world, k]
+                if other == place:
+                    for a in range(3):
+                        A[a, a] = A[a, a] + shift[world] * wp.abs(A[a, a])
                 for a in range(3):
                     i = 3 * place + a
                     for b in range(3):
@@ -74,33 +80,42 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def inverse_factor(A: Block, given: Column) -> Block:
-        """Columns of L^-1 of A = L L^T. A pivot that is not safely positive, measured by the `given` diagonal, is
-        replaced by that: A with something added to its diagonal."""
+        """Columns of L^-1 of A = L L^T.
+
+        An unknown whose pivot is not safely positive, measured by the `given` diagonal, goes alone, with that: L L^T
+        is positive whatever A is. Its number on the diagonal is negative, for the blocks below to know.
+        """
         S = Block()
         for c in range(BLOCK):
             S[c] = A[c]
         rows = Block()
         for j in range(BLOCK):
             pivot = S[j][j]
-            if pivot <= T(NEGLIGIBLE) * wp.abs(given[j]):
-                pivot = wp.max(wp.abs(given[j]), T(1.0e-30))
-            scale = T(1.0) / wp.sqrt(pivot)
-            column = scale * S[j]
-            # rows of L^-1: what the rows above leave of e_j, over the pivot
-            own = scale * rows[j]
-            own[j] = scale
+            size = wp.abs(given[j])
+            own = Column()
+            if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
+                scale = T(1.0) / wp.sqrt(pivot)
+                column = scale * S[j]
+                # rows of L^-1: what the rows above leave of e_j, over the pivot
+                own = scale * rows[j]
+                own[j] = scale
+                for c in range(j + 1, BLOCK):
+                    S[c] = S[c] - column[c] * column
+                    rows[c] = rows[c] - column[c] * own
+            else:
+                own[j] = -T(1.0) / wp.sqrt(wp.max(size, T(1.0e-30)))
             rows[j] = own
-            for c in range(j + 1, BLOCK):
-                S[c] = S[c] - column[c] * column
-                rows[c] = rows[c] - column[c] * own
         return wp.transpose(rows)
 
     @wp.kernel(module=module)
-    def factor(width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
-        """L in place."""
+    def factor(
+        width: int, active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)
+    ):
+        """L in place; `bad`: unknowns that go alone."""
         world = wp.tid()
         if active[world] == 0:
             return
+        count = int(0)
         for row in range(band.shape[1]):
             first = wp.max(row - width, 0)
             for other in range(first, row + 1):
@@ -124,10 +139,42 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                         d = band[world, other, BLOCK * width + k]
                         for c in range(BLOCK):
                             R[c] = R[c] + d[c] * S[k]
+                    for c in range(BLOCK):
+                        if band[world, other, BLOCK * width + c][c] < T(0.0):
+                            R[c] = Column()
                 else:
                     R = inverse_factor(S, given)
+                    for c in range(BLOCK):
+                        if R[c][c] < T(0.0):
+                            count += 1
                 for c in range(BLOCK):
                     band[world, row, at + c] = R[c]
+        bad[world] = count
+
+    @wp.kernel(module=module)
+    def begin(flags: wp.array(dtype=wp.int32), doing: wp.array(dtype=wp.int32), shift: wp.array(dtype=T)):
+        """Which worlds are factored."""
+        world = wp.tid()
+        doing[world] = flags[world]
+        if flags[world] != 0:
+            shift[world] = T(0.0)
+
+    @wp.kernel(module=module)
+    def settle(
+        bad: wp.array(dtype=wp.int32),
+        doing: wp.array(dtype=wp.int32),
+        shift: wp.array(dtype=T),
+        again: wp.array(dtype=wp.int32),
+    ):
+        """Where A is not positive more of its diagonal is added, and it is factored again, up to A + D."""
+        world = wp.tid()
+        if doing[world] == 0:
+            return
+        if bad[world] != 0 and shift[world] < T(LARGEST_SHIFT):
+            shift[world] = wp.max(T(SHIFT_GROWTH) * shift[world], T(FIRST_SHIFT))
+            wp.atomic_max(again, 0, 1)
+        else:
+            doing[world] = 0
 
     @wp.kernel(module=module)
     def solve(
@@ -177,4 +224,6 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                     t[k] = t[k] - wp.dot(band[world, row, at + k], x)
                 y[world, other] = t
 
-    return _types.SimpleNamespace(module=module, clear=clear, fill=fill, factor=factor, solve=solve)
+    return _types.SimpleNamespace(
+        module=module, begin=begin, clear=clear, fill=fill, factor=factor, settle=settle, solve=solve
+    )

@@ -93,15 +93,25 @@ class BandFactor:
         B = model.worlds
         self.factors = work.array("band", (B, band.rows, BLOCK * (band.width + 1)), column)
         self.y = work.array("band vector", (B, band.rows), column)
+        self.shift = work.array("band shift", (B,), model.types.T)
+        self.bad, self.doing = (work.array(f"band {name}", (B,), wp.int32) for name in ("bad", "doing"))
+        self.again = work.array("band again", (1,), wp.int32)
 
     def make(self, value: wp.array, active: wp.array) -> None:
-        """Factor the blocks `value`, [world, entry]."""
-        b, k = self.band, self.kernels
+        """Factor the blocks `value`, [world, entry]; a matrix that is not positive with some of its diagonal added."""
+        self.launch(self.kernels.begin, self.worlds, [active, self.doing, self.shift])
+        self._factor(value)
+        wp.capture_while(self.again, self._factor, value=value)
+
+    def _factor(self, value: wp.array) -> None:
+        b, k, launch = self.band, self.kernels, self.launch
         slots = self.pattern.graph.shape[0]
-        self.launch(k.clear, (self.worlds, b.rows), [slots, b.width, active, self.factors])
-        args = [self.pattern.data, value, b.place_of, b.width, active, self.factors]
-        self.launch(k.fill, (self.worlds, slots), args)
-        self.launch(k.factor, self.worlds, [b.width, active, self.factors])
+        self.again.zero_()
+        launch(k.clear, (self.worlds, b.rows), [slots, b.width, self.doing, self.factors])
+        args = [self.pattern.data, value, b.place_of, b.width, self.shift, self.doing, self.factors]
+        launch(k.fill, (self.worlds, slots), args)
+        launch(k.factor, self.worlds, [b.width, self.doing, self.bad, self.factors])
+        launch(k.settle, self.worlds, [self.bad, self.doing, self.shift, self.again])
 
     def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = A^-1 r."""
