@@ -364,7 +364,9 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                             c = B[3 * (row + o) + i, n]
                             for j in range(3):
                                 R[3 * i + j] = R[3 * i + j] + c * AB[3 * t + j]
-                        G = stress[t] * (second[row + o, n] * first[NT * panel + t] + first[row + o, n] * second[NT * panel + t])
+                        G = stress[t] * (
+                            second[row + o, n] * first[NT * panel + t] + first[row + o, n] * second[NT * panel + t]
+                        )
                         for i in range(3):
                             R[4 * i] = R[4 * i] + G
                     matrix[world, elem, NS * panel + a] = R

@@ -126,8 +126,13 @@ class Model:
     def array(self, name: str, values: Any, dtype: Any) -> wp.array:
         """Upload a constant; its bytes are counted under `name`."""
         out: Any = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
-        self._memory[name] = self._memory.get(name, 0) + out.size * wp.types.type_size_in_bytes(out.dtype)
+        self.count(name, out)
         return out
+
+    def count(self, name: str, *arrays: wp.array) -> None:
+        """Count the bytes of arrays made on the device under `name`."""
+        for array in arrays:
+            self._memory[name] = self._memory.get(name, 0) + array.size * wp.types.type_size_in_bytes(array.dtype)
 
     def element_array(self, values: np.ndarray, dtype: Any) -> wp.array:
         """Upload a constant of elements, [..., element]: neighbours stand side by side on a GPU, where threads do

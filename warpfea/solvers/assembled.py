@@ -91,19 +91,25 @@ class Assembled:
     """Assembly of the elements' part of H, c_M M + (dq/dv) K, and on request of the penalties of the constraints.
 
     Prescribed components have rows and columns of zeros.
+
+    Attributes:
+        whole: a thread does the matrix of a whole element, as on the CPU; else one of its columns.
     """
 
-    def __init__(self, model: Model, work: Workspace, launch: Launcher, block_kernels_of: list[Any]) -> None:
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, block_kernels_of: list[Any], whole: bool | None = None
+    ) -> None:
         self.model, self.work, self.launch = model, work, launch
         self.element_kernels = block_kernels_of
-        self.whole = not model.device.is_cuda
+        self.whole = not model.device.is_cuda if whole is None else whole
         if "matrix" not in model.cache:
             model.cache["matrix"] = self._make_tables()
         self.pattern, self.mass, self.couplings, self.coupled = model.cache["matrix"]
         self.runs = self._runs()
-        if "contributions" not in model.cache:
-            model.cache["contributions"] = [self._contributions(parts[0][0]) for parts in self.runs]
-        self.contributions: list[tuple[wp.array, wp.array]] = model.cache["contributions"]
+        name = f"contributions to the matrix, {'whole elements' if self.whole else 'columns'}"
+        if name not in model.cache:
+            model.cache[name] = [self._contributions(parts[0][0]) for parts in self.runs]
+        self.contributions: list[tuple[wp.array, wp.array]] = model.cache[name]
         self.common = block_kernels(model.dtype)
         S = max(self._size(block) for block in model.blocks)
         points = 0 if self.whole else max(5 * block.points * block.count for block in model.blocks)
@@ -169,6 +175,7 @@ class Assembled:
         wp.utils.array_scan(start, start, inclusive=True)
         source = wp.empty(int(start[-1:].numpy()[0]), dtype=wp.int32, device=model.device)
         wp.launch(find, upper, inputs=[*args, 1, start, source], device=model.device)
+        model.count("matrix pattern", start, source)
         return start, source
 
     def _mass_of(self, pattern: Pattern) -> np.ndarray:

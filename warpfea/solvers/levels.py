@@ -12,7 +12,7 @@ import warp as wp
 from ..kernels.levels import TILE_SLOTS, level_struct
 from ..partition import bisect, connected_groups
 from .assembled import Pattern, make_pattern
-from .band import Band, find_band
+from .band import Band
 
 if TYPE_CHECKING:
     from ..model import Model

@@ -88,7 +88,8 @@ class NewtonPCG:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} is not for linear = 'direct'")
         if self.preconditioner not in ("auto", *NAMES):
             raise ModelError(
-                f"preconditioner {self.preconditioner!r} is unknown; there are auto, two-level, banded, deflated, block-jacobi"
+                f"preconditioner {self.preconditioner!r} is unknown; there are auto, two-level, banded, deflated, "
+                "block-jacobi"
             )
         if self.preconditioner_dtype not in (None, "float32", "float64"):
             raise ModelError(

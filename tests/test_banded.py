@@ -1,0 +1,210 @@
+"""The banded preconditioner: factors against scipy, matrices that are not positive, when it is chosen, resumed runs."""
+
+import numpy as np
+import pytest
+import scipy.sparse.linalg as spl
+import warp as wp
+from warpfea.kernels.band import BLOCK
+
+import warpfea as wf
+from warpfea.bench_problems import PROBLEMS
+from warpfea.checkpoint import save_checkpoint
+from warpfea.scene import find
+from warpfea.solvers.band import WIDEST, Band, find_band
+
+SIZES = {"bar": (12, 1, 1), "beam": 60, "plate": (12, 1)}
+
+
+def simulation(builder, *, dtype="float64", worlds=1, dt=1e-3, **options):
+    model = builder.finalize(device="cpu", dtype=dtype, worlds=worlds)
+    return wf.Simulation(model, dt=dt, solver=wf.NewtonPCG(**options), ledger=False, capture=False)
+
+
+def parts(sim):
+    """The factors, the assembly, and ones for all worlds."""
+    pre = sim.stepper.newton.preconditioner
+    return pre.band, pre.assembled, wp.ones(sim.model.worlds, dtype=wp.int32, device="cpu")
+
+
+def assembled(sim, u, *, projected):
+    _, matrix, on = parts(sim)
+    out, work = matrix.values("test"), sim.stepper.work
+    matrix.assemble(u, (work.step.mass_factor, work.step.dq_dv), on, out, projected=projected)
+    return out
+
+
+def solved(sim, r):
+    """B r of each world, (worlds, 3 slots)."""
+    band, _, on = parts(sim)
+    model = sim.model
+    given = wp.array(r.reshape(model.worlds, -1, 3), dtype=model.types.vec3, device="cpu")
+    z = wp.zeros_like(given)
+    band.solve(given, z, on)
+    return z.numpy().reshape(model.worlds, -1).astype(float)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("name", SIZES)
+def test_factors_against_scipy(name, dtype):
+    sim = simulation(PROBLEMS[name].build(SIZES[name]), dtype=dtype)
+    sim.step()
+    band, matrix, on = parts(sim)
+    value = assembled(sim, sim.stepper.work.u, projected=True)
+    band.make(value, on)
+    assert not band.shift.numpy().any()
+    H = matrix.matrix(value).tocsc().astype(float)
+    r = np.random.default_rng(0).standard_normal(H.shape[0]) * sim.model.free_host.ravel()
+    expected = spl.spsolve(H, r)
+    limit = {"float64": 1e-9, "float32": 2e-2}[dtype]
+    assert np.linalg.norm(solved(sim, r)[0] - expected) < limit * np.linalg.norm(expected)
+
+
+def test_the_band_holds_all_of_the_pattern():
+    for name, size in SIZES.items():
+        sim = simulation(PROBLEMS[name].build(size))
+        _, matrix, _ = parts(sim)
+        band = find_band(sim.model)
+        place = band.place_of.numpy()
+        np.testing.assert_array_equal(place[band.slot_at.numpy()], np.arange(sim.model.slots))
+        entries = matrix.pattern.graph.tocoo()
+        reach = (3 * place[entries.row] + 2) // BLOCK - (3 * place[entries.col]) // BLOCK
+        assert reach.max() == band.width
+        assert band.rows * BLOCK >= 3 * sim.model.slots
+
+
+def column(h=1.0):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    box = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(10, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1.0))
+    b.clamp(box.nodes("x-"))
+    return b
+
+
+def test_of_a_matrix_that_is_not_positive_they_still_are():
+    """A column pressed beyond its buckling load."""
+    sim = simulation(column(), dt=1.0)
+    sim.step()
+    u = sim.stepper.work.u.numpy()
+    u[0, :, 0] -= 0.3 * (sim.model.reference[:, 0] - sim.model.reference[:, 0].min())
+    band, matrix, on = parts(sim)
+    value = assembled(sim, wp.array(u, dtype=sim.model.types.vec3, device="cpu"), projected=False)
+    assert np.linalg.eigvalsh(matrix.matrix(value).toarray())[0] < 0.0
+    band.make(value, on)
+    assert 0.0 < band.shift.numpy()[0] <= 1.0
+    B = np.stack([solved(sim, e)[0] for e in np.eye(3 * sim.model.slots)])
+    assert np.all(np.isfinite(B))
+    np.testing.assert_allclose(B, B.T, rtol=0, atol=1e-10 * np.abs(B).max())
+    assert np.linalg.eigvalsh(0.5 * (B + B.T))[0] > 0.0
+
+
+def test_no_shift_makes_it_positive_and_unknowns_go_alone():
+    sim = simulation(column())
+    sim.step()
+    band, matrix, on = parts(sim)
+    value = assembled(sim, sim.stepper.work.u, projected=True)
+    blocks = value.numpy()
+    graph = matrix.pattern.graph
+    rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
+    blocks[0, rows != graph.indices] *= 30.0
+    value.assign(blocks)
+    band.make(value, on)
+    assert band.bad.numpy()[0] > 0
+    B = np.stack([solved(sim, e)[0] for e in np.eye(3 * sim.model.slots)])
+    assert np.all(np.isfinite(B))
+    assert np.linalg.eigvalsh(0.5 * (B + B.T))[0] > 0.0
+
+
+def test_worlds_that_are_not_flagged_keep_theirs():
+    sim = simulation(PROBLEMS["beam"].build(4), worlds=3)
+    sim.step()
+    band, _, on = parts(sim)
+    value = assembled(sim, sim.stepper.work.u, projected=True)
+    band.make(value, on)
+    before = band.factors.numpy().copy()
+    value.assign(2.0 * value.numpy())
+    band.make(value, wp.array([0, 1, 0], dtype=wp.int32, device="cpu"))
+    after = band.factors.numpy()
+    np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
+    assert not np.array_equal(after[1], before[1])
+
+
+def kind(sim):
+    return "banded" if sim.stepper.newton.preconditioner.band else "two-level"
+
+
+def test_auto_takes_it_where_the_band_is_narrow():
+    assert kind(simulation(PROBLEMS["bar"].build((30, 1, 1)))) == "banded"
+    assert kind(simulation(PROBLEMS["bar"].build((9, 6, 6)))) == "two-level"
+    assert kind(simulation(PROBLEMS["bar"].build((9, 6, 6)), preconditioner="banded")) == "banded"
+    assert kind(simulation(PROBLEMS["bar"].build((30, 1, 1)), preconditioner="two-level")) == "two-level"
+    # with inverses in another precision there are only levels
+    assert kind(simulation(PROBLEMS["bar"].build((30, 1, 1)), preconditioner_dtype="float32")) == "two-level"
+    with pytest.raises(wf.ModelError, match=r"'banded' is for the CPU, in the model's precision.*float64.*'float32'"):
+        simulation(PROBLEMS["bar"].build((3, 1, 1)), preconditioner="banded", preconditioner_dtype="float32")
+
+
+def test_wider_bands_are_kept_for_longer():
+    def band(width):
+        return Band(wp.zeros(0, dtype=wp.int32), wp.zeros(0, dtype=wp.int32), 100, width)
+
+    costs = [band(width).rebuild_cost for width in (5, 20, WIDEST)]
+    assert costs[2] > 2.0 * costs[0]
+    assert band(5).quick
+    assert not band(WIDEST).quick
+
+
+@pytest.mark.parametrize("links", [10, 40])
+def test_chains_of_joints_take_few_iterations(links):
+    scene = find("chain")
+    model = scene.build(scene.resolve({"links": links})).finalize(device="cpu")
+    counts, ends = {}, {}
+    for name in ("auto", "banded", "two-level"):
+        sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(preconditioner=name, tol=1e-11), ledger=False)
+        reports = [sim.step() for _ in range(5)]
+        counts[name] = sum(int(r.pcg[0]) for r in reports)
+        ends[name] = sim.state.displacement.numpy()
+    assert counts["auto"] == counts["banded"]
+    assert counts["banded"] <= 4 * sum(int(r.newton[0]) for r in reports)
+    assert counts["banded"] <= counts["two-level"]
+    np.testing.assert_allclose(ends["banded"], ends["two-level"], rtol=0, atol=1e-8 * model.size)
+
+
+def swinging(name, damping):
+    law = wf.SVK(E=1e7, nu=0.3, density=1000.0, damping=wf.KelvinVoigt(eta=500.0, lambda_v=700.0) if damping else None)
+    b = wf.ModelBuilder()
+    if name == "T10":
+        body = b.add_solid(wf.mesh.box((1.0, 0.1, 0.1), cells=(10, 1, 1)), material=law)
+        b.clamp(body.nodes("x-"))
+    else:
+        section = wf.Rectangle(0.05, 0.05)
+        body = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=12, section=section, normal=(0, 0, 1), material=law)
+        b.clamp(body.start)
+    return b
+
+
+@pytest.mark.parametrize("damping", [False, True])
+@pytest.mark.parametrize("name", ["T10", "3243"])
+def test_a_resumed_run_does_the_same(name, damping, tmp_path):
+    def run():
+        return wf.Simulation(swinging(name, damping).finalize(device="cpu"), dt=5e-3)
+
+    whole = run()
+    assert kind(whole) == "banded"
+    whole.step(6)
+    save_checkpoint(whole, tmp_path / "half.npz")
+    whole.step(6)
+    resumed = run()
+    resumed.resume(tmp_path / "half.npz")
+    resumed.step(6)
+    for field, values in whole.state.numpy().items():
+        np.testing.assert_array_equal(resumed.state.numpy()[field], values, err_msg=field)
+
+
+def test_all_preconditioners_end_in_one_place():
+    ends = []
+    for name in ("banded", "two-level", "block-jacobi"):
+        solver = wf.NewtonPCG(preconditioner=name, tol=1e-11)
+        sim = wf.Simulation(swinging("3243", True).finalize(device="cpu"), dt=2e-3, solver=solver, ledger=False)
+        sim.step(10)
+        ends.append(sim.state.displacement.numpy())
+    for other in ends[1:]:
+        np.testing.assert_allclose(ends[0], other, rtol=0, atol=1e-8 * np.abs(other).max())
