@@ -115,7 +115,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         world = wp.tid()
         if active[world] == 0:
             return
-        count = 0
+        count = wp.int32(0)
         for row in range(band.shape[1]):
             first = wp.max(row - width, 0)
             for other in range(first, row + 1):

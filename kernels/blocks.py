@@ -82,7 +82,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         `source`s from start[index] on, 2 (PLACES elem + place) + 1 where the block is to be transposed."""
         index = wp.tid()
         at = pattern.upper[index]
-        found = 0
+        found = wp.int32(0)
         for k in range(topo.start[at[2]], topo.start[at[2] + 1]):
             inside = topo.entry[k] - offset
             if inside >= 0 and inside < NS * count:

@@ -87,9 +87,8 @@ def askew(form):
 def bent():
     """A box whose middle nodes lie off the middle."""
     mesh = wf.mesh.box((3.0, 2.0, 1.0), cells=(1, 1, 1), element="T10")
-    points = mesh.points + 0.02 * np.sin(mesh.points[:, [1, 2, 0]]) * (mesh.points[:, :1] > 0) * (
-        mesh.points[:, :1] < 3
-    )
+    inside = (mesh.points[:, :1] > 0) & (mesh.points[:, :1] < 3)
+    points = mesh.points + 0.02 * inside * np.sin(mesh.points[:, [1, 2, 0]])
     return wf.mesh.Mesh(points, mesh.cells, mesh.cell_type)
 
 
