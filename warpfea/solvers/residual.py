@@ -28,7 +28,7 @@ __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
 """Slots per element up to which H p from the elements is cheaper than from their matrix, on a GPU."""
-MATRIX_COST = {False: 2.0, True: 0.5}
+MATRIX_COST = {False: 1.0, True: 0.5}
 """Iterations of Newton's method that the matrix costs, on the CPU and on CUDA."""
 SMALL_SLOTS = 16384
 """Slots up to which a GPU makes a matrix faster than it solves with one."""
@@ -83,11 +83,11 @@ class Residual:
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
         self.massive = all(block.massive for block in model.blocks)
-        # elements with many points per slot cost more than the matrix that they make. One core assembles a matrix in
-        # the time of 8 to 15 products of ANCF elements and of 65 of straight tetrahedra
+        # elements with many points per slot cost more than the matrix that they make; one core assembles one in
+        # the time of 2 to 7 products of ANCF elements and of 15 of straight tetrahedra
         many = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
         if not model.device.is_cuda:
-            many = assembled and not self.massive
+            many = assembled
         self.by_matrix = operator == "matrix" or (operator == "auto" and many)
         self.clusters: ModelClusters | None = None
         if self.massive and not self.by_matrix:
