@@ -282,7 +282,7 @@ def matrix_kernels(
         A is dP/dF at a point; a panel's A : (e_j h_b^T) are the rows of D, over b, and K_ab = h_a . D_b.
 
         Args:
-            matrix: [world, elem, NS panel + a] rows 3 i + j of K_ab over the slots b of the panel, for a up to its last.
+            matrix: [world, elem, NS panel + a] rows 3 i + j of K_ab over the slots b of a panel, for a up to its last.
             form, add: as of `element_matrix`.
         """
         world, elem = wp.tid()

@@ -232,14 +232,14 @@ def test_info_tells_features_and_costs(folder, capfd):
     words = ["info", "cantilever", "--set", "cells=2", "--device", "cpu"]
     code, out, err = run(capfd, *words)
     assert (code, err) == (0, "")
-    for word in ("12 T10 elements", "left out", "contact", "bytes per unknown", "launches", "massive_product"):
+    for word in ("12 T10 elements", "left out", "contact", "bytes per unknown", "launches", "matrix_product"):
         assert word.replace("bytes", "B") in out
     code, out, _ = run(capfd, *words, "--json", "-")
     info = json.loads(out)
     assert code == 0
     assert info["launches"] > 20
     assert "gravity" in info["features"]
-    assert any(k.endswith("massive_product") for k in info["kernels"])
+    assert any(k.endswith("matrix_product") for k in info["kernels"])
     assert info["bytes_per_unknown"] > 100
 
 

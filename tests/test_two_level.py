@@ -475,7 +475,10 @@ def test_a_tolerance_in_newtons():
 
 def test_forcing_is_the_relative_residual_of_a_solve():
     sim = wf.Simulation(
-        bar(1000).finalize(device="cpu"), dt=1e-3, solver=wf.NewtonPCG(forcing=1e-5, tol=1e-9), ledger=False
+        bar(1000).finalize(device="cpu"),
+        dt=1e-3,
+        solver=wf.NewtonPCG(forcing=1e-5, tol=1e-9, preconditioner="two-level"),
+        ledger=False,
     )
     sim.step()
     control = sim.stepper.work.pcg

@@ -28,7 +28,7 @@ __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
 """Slots per element up to which H p from the elements is cheaper than from their matrix, on a GPU."""
-MATRIX_COST = {False: 1.0, True: 0.5}
+MATRIX_COST = {False: 2.0, True: 0.5}
 """Iterations of Newton's method that the matrix costs, on the CPU and on CUDA."""
 SMALL_SLOTS = 16384
 """Slots up to which a GPU makes a matrix faster than it solves with one."""
