@@ -41,10 +41,11 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         if active[world] == 0:
             return
         U0 = fn.load(block, u0, world, elem)
-        U1 = fn.load(block, u1, world, elem)
         for q in range(NQ):
             E = T(a0[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U0, q, elem), q, elem))
-            E = E - T(a1[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U1, q, elem), q, elem))
+            if a1[world] != wp.float64(0.0):
+                U1 = fn.load(block, u1, world, elem)
+                E = E - T(a1[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U1, q, elem), q, elem))
             history[world, fn.history_index(block, q, elem)] = fn.pack(E)
 
     @wp.kernel(module=viscous_module)

@@ -11,6 +11,8 @@ place of 172 with nu = 0.49, but inverses 16 times as large), and the ten quadra
 statics 42 iterations in place of 105; 50k unknowns in dynamics on the CPU 32 for 48, but 8.6 ms for 3.0 each, 593 ms
 per step for 478; in groups of 160 slots, where they cost the same, statics gain a third and dynamics nothing).
 
+In a model whose unknowns have an order in which H is a narrow band the one level is that, factored as a whole (band.py).
+
 An odd number of Chebyshev steps keeps C positive whatever the largest eigenvalue is.
 
 Directions of constraints: tiles and coarse matrices hold the penalties, and (D + (dq/dv) J^T rho J)^-1 by Woodbury's
