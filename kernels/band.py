@@ -15,8 +15,7 @@ from .types import kernel_module, precision
 __all__ = ["BLOCK", "band_kernels", "column_type"]
 
 BLOCK = 4
-FIRST_SHIFT, SHIFT_GROWTH, LARGEST_SHIFT = 0.01, 10.0, 0.99
-"""Shares of the diagonal that are added to a matrix that is not positive."""
+SHIFT_GROWTH = 100.0
 
 
 def column_type(dtype: str):
@@ -33,7 +32,9 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     Column = column_type(dtype)
     Block = wp.types.matrix(shape=(BLOCK, BLOCK), dtype=T)
     # a pivot below this share of its diagonal is rounding, or the matrix is indefinite there
-    NEGLIGIBLE = {"float64": 1.0e-14, "float32": 1.0e-6}[dtype]
+    NEGLIGIBLE = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
+    # share of the diagonal that is added first where that comes up, of rounding or of an indefinite matrix
+    FIRST_SHIFT = {"float64": 1.0e-4, "float32": 1.0e-6}[dtype]
     module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
 
     @wp.kernel(module=module)
@@ -58,7 +59,8 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         band: wp.array3d(dtype=Column),
     ):
-        """The lower half of A + shift D with slots in the order of `place_of`, one thread per slot."""
+        """The lower half of A + shift D with slots in the order of `place_of`, one thread per slot. A negative number
+        on the diagonal, of an unknown under strong compression, takes the other sign."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -69,7 +71,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                 A = value[world, k]
                 if other == place:
                     for a in range(3):
-                        A[a, a] = A[a, a] + shift[world] * wp.abs(A[a, a])
+                        A[a, a] = (T(1.0) + shift[world]) * wp.abs(A[a, a])
                 for a in range(3):
                     i = 3 * place + a
                     for b in range(3):
@@ -82,8 +84,8 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     def inverse_factor(A: Block, given: Column) -> Block:
         """Columns of L^-1 of A = L L^T.
 
-        An unknown whose pivot is not safely positive, measured by the `given` diagonal, goes alone, with that: L L^T
-        is positive whatever A is. Its number on the diagonal is negative, for the blocks below to know.
+        An unknown whose pivot is not safely positive, measured by the `given` diagonal, takes that, and its column of
+        L ends there: L L^T is positive whatever A is. Its number on the diagonal is negative, for the blocks below.
         """
         S = Block()
         for c in range(BLOCK):
@@ -111,7 +113,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     def factor(
         width: int, active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)
     ):
-        """L in place; `bad`: unknowns that go alone."""
+        """L in place; `bad`: unknowns without a pivot of their own."""
         world = wp.tid()
         if active[world] == 0:
             return
@@ -166,12 +168,12 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         shift: wp.array(dtype=T),
         again: wp.array(dtype=wp.int32),
     ):
-        """Where A is not positive more of its diagonal is added, and it is factored again, up to A + D."""
+        """Where A is not positive, more of its diagonal is added and it is factored again, up to A + D."""
         world = wp.tid()
         if doing[world] == 0:
             return
-        if bad[world] != 0 and shift[world] < T(LARGEST_SHIFT):
-            shift[world] = wp.max(T(SHIFT_GROWTH) * shift[world], T(FIRST_SHIFT))
+        if bad[world] != 0 and shift[world] < T(1.0):
+            shift[world] = wp.min(wp.max(T(SHIFT_GROWTH) * shift[world], T(FIRST_SHIFT)), T(1.0))
             wp.atomic_max(again, 0, 1)
         else:
             doing[world] = 0

@@ -8,7 +8,7 @@ import types as _types
 
 import warp as wp
 
-from .element_matrix import panels_of
+from .element_matrix import panels_of, row_of
 from .gather import inverse_function
 from .structs import pattern_struct, topology_struct
 from .types import SMALL, kernel_module, precision
@@ -41,8 +41,8 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     NS = slots
-    PANELS, P = panels_of(slots)
-    PLACES = PANELS * P * NS if rows else NS * (NS + 1) // 2
+    _, P, ROWS = panels_of(slots)
+    PLACES = P * ROWS if rows else NS * (NS + 1) // 2
     Number = T if rows else vec3
     module = kernel_module(f"assembly_{dtype}_{slots}{'_rows' if rows else ''}", max_unroll=SMALL)
 
@@ -50,7 +50,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
     def place(low: int, high: int) -> int:
         """Of the block of two slots in an element's matrix."""
         if wp.static(rows):
-            return P * (NS * (high / P) + low) + high % P
+            return P * row_of(high / P, P, low) + high % P
         else:
             return low * NS - (low * (low - 1)) / 2 + high - low
 

@@ -13,7 +13,7 @@ from . import materials
 from .points import point_functions
 from .types import kernel_module, precision
 
-__all__ = ["UNROLL", "matrix_kernels", "panels_of", "rows_type"]
+__all__ = ["UNROLL", "matrix_kernels", "panels_of", "row_of", "rows_type"]
 
 WIDEST = 8
 """Most slots of a panel: eight numbers of 64 bits fill the widest registers there are."""
@@ -21,10 +21,17 @@ UNROLL = 9
 """`max_unroll` of modules that do panels: loops over components must not stand in the way of those over slots."""
 
 
-def panels_of(slots: int) -> tuple[int, int]:
-    """How many panels, and slots per panel."""
+def panels_of(slots: int) -> tuple[int, int, int]:
+    """How many panels, slots per panel, and rows of all: those of a panel are for slots up to its last."""
     panels = -(-slots // WIDEST)
-    return panels, -(-slots // panels)
+    width = -(-slots // panels)
+    return panels, width, width * panels * (panels - 1) // 2 + slots
+
+
+@wp.func
+def row_of(panel: int, width: int, a: int) -> int:
+    """Which row of an element's matrix is that of slot a and a panel of so many slots."""
+    return width * ((panel * (panel + 1)) / 2) + a
 
 
 def rows_type(dtype: str, slots: int):
@@ -46,7 +53,7 @@ def matrix_kernels(
     name = f"element_{dtype}_{law}_{slots}_{form}_{damping}"
     module = kernel_module(f"{name}_matrix", max_unroll=16)
     rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
-    PANELS, P = panels_of(NS)
+    PANELS, P, _ = panels_of(NS)
     Rows = rows_type(dtype, P)
     Slots = wp.types.matrix(shape=(3 * PANELS, P), dtype=T)
     Tensor = wp.types.matrix(shape=(9, 9), dtype=T)
@@ -282,7 +289,7 @@ def matrix_kernels(
         A is dP/dF at a point; a panel's A : (e_j h_b^T) are the rows of D, over b, and K_ab = h_a . D_b.
 
         Args:
-            matrix: [world, elem, NS panel + a] rows 3 i + j of K_ab over the slots b of a panel, for a up to its last.
+            matrix: [world, elem, row_of(panel, a)] rows 3 i + j of K_ab over the slots b of a panel.
             form, add: as of `element_matrix`.
         """
         world, elem = wp.tid()
@@ -317,7 +324,7 @@ def matrix_kernels(
                 for l in range(3):
                     H[3 * (a / P) + l, a % P] = h[a][l]
             A = elasticity(F, S, moduli, c, form, fn.weight_of(block, q, elem))
-            for panel in range((block.conn.shape[0] + P - 1) / P):
+            for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
                 D = Products()
                 for i in range(9):
                     for j in range(3):
@@ -328,12 +335,13 @@ def matrix_kernels(
                         )
                 for a in range(wp.min(NS, P * (panel + 1))):
                     g = h[a]
-                    R = matrix[world, elem, NS * panel + a]
+                    row = row_of(panel, P, a)
+                    R = matrix[world, elem, row]
                     for i in range(3):
                         for j in range(3):
                             k = 3 * i + j
                             R[k] = R[k] + g[0] * D[6 * i + k] + g[1] * D[6 * i + 3 + k] + g[2] * D[6 * i + 6 + k]
-                    matrix[world, elem, NS * panel + a] = R
+                    matrix[world, elem, row] = R
 
     return _types.SimpleNamespace(
         prepare_matrix=prepare_matrix, element_matrix=element_matrix, element_rows=element_rows

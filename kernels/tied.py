@@ -9,7 +9,7 @@ import types as _types
 
 import warp as wp
 
-from .element_matrix import UNROLL, panels_of, rows_type
+from .element_matrix import UNROLL, panels_of, row_of, rows_type
 from .types import kernel_module, precision
 
 __all__ = ["tied_kernels", "tied_struct"]
@@ -57,9 +57,9 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     Ties = wp.types.vector(length=ties, dtype=T)
     TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
     NS, NT, W = slots, ties, width
-    PANELS, P = panels_of(NS)
+    PANELS, P, _ = panels_of(NS)
     Row = wp.types.vector(length=P, dtype=T)
-    SOME = 4 if NT % 4 == 0 else 1
+    GROUP = 4 if NT % 4 == 0 else 1  # ties per loading and storing of a row of the matrix
     Rows = rows_type(dtype, P)
     Slots = wp.types.matrix(shape=(NT * PANELS, P), dtype=T)
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
@@ -83,14 +83,17 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         return out
 
     @wp.func
-    def shears(block: Block, U: Local, elem: int) -> Ties:
-        """x_a . x_b less its reference value, without cancellation."""
+    def kinematics(block: Block, U: Local, elem: int):
+        """x_a and x_b at the ties, and x_a . x_b less its reference value, without cancellation."""
+        first, second = TieVectors(), TieVectors()
         e = Ties()
         for t in range(NT):
             a = line(block.first, U, t, elem)
             d = line(block.second, U, t, elem)
-            e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, block.X_second[t, elem] + d)
-        return e
+            first[t] = block.X_first[t, elem] + a
+            second[t] = block.X_second[t, elem] + d
+            e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, second[t])
+        return first, second, e
 
     @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
@@ -124,14 +127,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         if active[world] == 0 or elem >= block.count:
             return
         U = load(block, u, world, elem)
-        x1, x2 = TieVectors(), TieVectors()
-        e = Ties()
-        for t in range(NT):
-            da = line(block.first, U, t, elem)
-            db = line(block.second, U, t, elem)
-            x1[t] = block.X_first[t, elem] + da
-            x2[t] = block.X_second[t, elem] + db
-            e[t] = wp.dot(block.X_first[t, elem], db) + wp.dot(da, x2[t])
+        x1, x2, e = kinematics(block, U, elem)
         s = stresses(block, e, world, elem)
         f = Local()
         for t in range(NT):
@@ -161,19 +157,16 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             return
         U = load(block, u, world, elem)
         P = load(block, direction, world, elem)
+        x1, x2, e = kinematics(block, U, elem)
         de = Ties()
         for t in range(NT):
-            a = block.X_first[t, elem] + line(block.first, U, t, elem)
-            d = block.X_second[t, elem] + line(block.second, U, t, elem)
-            de[t] = wp.dot(a, line(block.second, P, t, elem)) + wp.dot(d, line(block.first, P, t, elem))
-        s = stresses(block, shears(block, U, elem), world, elem)
+            de[t] = wp.dot(x1[t], line(block.second, P, t, elem)) + wp.dot(x2[t], line(block.first, P, t, elem))
+        s = stresses(block, e, world, elem)
         ds = stresses(block, de, world, elem)
         f = Local()
         for t in range(NT):
-            a = block.X_first[t, elem] + line(block.first, U, t, elem)
-            d = block.X_second[t, elem] + line(block.second, U, t, elem)
-            da = ds[t] * a + s[t] * line(block.first, P, t, elem)
-            dd = ds[t] * d + s[t] * line(block.second, P, t, elem)
+            da = ds[t] * x1[t] + s[t] * line(block.first, P, t, elem)
+            dd = ds[t] * x2[t] + s[t] * line(block.second, P, t, elem)
             for i in range(NS):
                 f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
         for i in range(NS):
@@ -318,14 +311,11 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             return
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         U = load(block, u, world, elem)
+        x1, x2, e = kinematics(block, U, elem)
         first, second, B = Slots(), Slots(), Changes()
-        e = Ties()
         for t in range(NT):
-            da = line(block.first, U, t, elem)
-            d1 = block.X_first[t, elem] + da
-            db = line(block.second, U, t, elem)
-            d2 = block.X_second[t, elem] + db
-            e[t] = wp.dot(block.X_first[t, elem], db) + wp.dot(da, d2)
+            d1 = x1[t]
+            d2 = x2[t]
             for a in range(NS):
                 f = block.first[t, a, elem]
                 s = block.second[t, a, elem]
@@ -340,7 +330,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         if add == 0:
             for k in range(matrix.shape[2]):
                 matrix[world, elem, k] = Rows()
-        for panel in range((block.conn.shape[0] + P - 1) / P):
+        for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
             AB = Products()
             for t in range(NT):
                 x, y, z = Row(), Row(), Row()
@@ -353,13 +343,14 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                 AB[3 * t] = x
                 AB[3 * t + 1] = y
                 AB[3 * t + 2] = z
-            for some in range(NT / SOME):
+            for group in range(NT / GROUP):
                 for a in range(wp.min(NS, P * (panel + 1))):
-                    R = matrix[world, elem, NS * panel + a]
-                    row = NT * (a / P) + SOME * some
+                    at = row_of(panel, P, a)
+                    R = matrix[world, elem, at]
+                    row = NT * (a / P) + GROUP * group
                     n = a % P
-                    for o in range(SOME):
-                        t = SOME * some + o
+                    for o in range(GROUP):
+                        t = GROUP * group + o
                         for i in range(3):
                             c = B[3 * (row + o) + i, n]
                             for j in range(3):
@@ -369,7 +360,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                         )
                         for i in range(3):
                             R[4 * i] = R[4 * i] + G
-                    matrix[world, elem, NS * panel + a] = R
+                    matrix[world, elem, at] = R
 
     return _types.SimpleNamespace(
         module=module,

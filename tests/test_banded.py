@@ -199,6 +199,73 @@ def test_a_resumed_run_does_the_same(name, damping, tmp_path):
         np.testing.assert_array_equal(resumed.state.numpy()[field], values, err_msg=field)
 
 
+def slender(dtype, elements=256):
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=2e11, nu=0.3, density=7800.0)
+    section = wf.Rectangle(0.01, 0.01)
+    body = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=elements, section=section, normal=(0, 0, 1), material=law)
+    b.clamp(body.start)
+    return b.finalize(device="cpu", dtype=dtype)
+
+
+def test_what_rounding_takes_is_given_back_and_no_more():
+    """A steel wire in float32: the last pivots are rounding."""
+    sim = wf.Simulation(slender("float32"), dt=1e-3, ledger=False)
+    for _ in range(3):
+        sim.step()
+    assert 0.0 <= sim.stepper.newton.preconditioner.band.shift.numpy()[0] < 1e-4
+    assert sim.totals["pcg"][0] < 2000
+    exact = wf.Simulation(slender("float64"), dt=1e-3, ledger=False)
+    exact.step(3)
+    assert exact.stepper.newton.preconditioner.band.shift.numpy()[0] == 0.0
+
+
+def test_what_another_preconditioner_remembers_is_not_taken_over(tmp_path):
+    def run(name):
+        solver = wf.NewtonPCG(preconditioner=name, operator="elements")
+        return wf.Simulation(swinging("T10", False).finalize(device="cpu"), dt=5e-3, solver=solver)
+
+    first = run("two-level")
+    first.step(4)
+    save_checkpoint(first, tmp_path / "levels.npz")
+    other = run("banded")
+    other.resume(tmp_path / "levels.npz")
+    np.testing.assert_array_equal(other.state.displacement.numpy(), first.state.displacement.numpy())
+    assert not other.state.preconditioner_banded.numpy()[0, 3:].any()  # iterations of the first solve, and since
+    other.step(2)
+    assert 0.0 < other.state.preconditioner_banded.numpy()[0, 3] < 1.5
+
+
+def test_factors_that_could_not_be_addressed_are_refused(monkeypatch):
+    monkeypatch.setattr("warpfea.solvers.band.LARGEST", 10000)
+    with pytest.raises(wf.ModelError, match=r"'banded': the factors of \d+ slots in a band of 68 unknowns take"):
+        simulation(PROBLEMS["bar"].build((12, 1, 1)), preconditioner="banded")
+    assert kind(simulation(PROBLEMS["bar"].build((12, 1, 1)))) == "two-level"
+
+
+def test_arrays_that_could_not_be_addressed_are_refused():
+    sim = simulation(PROBLEMS["bar"].build((2, 1, 1)))
+    with pytest.raises(wf.ModelError, match=r"big: an array of 2 x 300000000 items has 2.2 GiB between"):
+        sim.stepper.work.array("big", (2, 300000000), wp.float64)
+
+
+def test_negative_numbers_on_the_diagonal_take_the_other_sign():
+    sim = simulation(PROBLEMS["beam"].build(4))
+    sim.step()
+    band, matrix, on = parts(sim)
+    value = assembled(sim, sim.stepper.work.u, projected=True)
+    blocks = value.numpy()
+    graph = matrix.pattern.graph
+    rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
+    blocks[0, rows != graph.indices] = 0.0
+    blocks[0, rows == graph.indices] = np.diag([1.0, 2.0, -4.0])
+    value.assign(blocks)
+    band.make(value, on)
+    assert band.shift.numpy()[0] == 0.0
+    z = solved(sim, np.ones(3 * sim.model.slots))[0]
+    np.testing.assert_allclose(z.reshape(-1, 3), np.tile([1.0, 0.5, 0.25], (sim.model.slots, 1)), rtol=1e-12)
+
+
 def test_all_preconditioners_end_in_one_place():
     ends = []
     for name in ("banded", "two-level", "block-jacobi"):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from .errors import ModelError
 from .integrators import Integrator
 from .kernels.constraints import JOINT_COLUMNS, SUM_ROWS
 from .kernels.gather import RESIDUAL_ROWS
@@ -110,7 +111,15 @@ class Workspace:
             setattr(self.balance, name, getattr(self.step if of_step else self, name))
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Zeroed array; its bytes are counted."""
+        """Zeroed array; its bytes are counted. ModelError where it is too large to be addressed."""
+        step = wp.types.type_size_in_bytes(dtype)
+        for k in range(len(shape) - 1, 0, -1):
+            step *= shape[k]
+            if shape[k - 1] > 1 and step >= 2**31:
+                raise ModelError(
+                    f"{name}: an array of {' x '.join(map(str, shape))} items has {step / 2**30:.1f} GiB between two "
+                    "neighbours, and at most 2 can be addressed: take fewer worlds, or smaller bodies"
+                )
         out = wp.zeros(shape, dtype=dtype, device=self.device)
         self.bytes[name] = int(np.prod(shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
         return out

@@ -153,8 +153,8 @@ class Assembled:
     def _size(self, block: Any) -> int:
         """Vectors of three numbers in the matrices of a block's elements."""
         if self.whole:
-            panels, width = panels_of(block.slots)
-            return 3 * panels * width * block.slots * block.count
+            _, width, rows = panels_of(block.slots)
+            return 3 * width * rows * block.count
         return 3 * block.slots * (block.slots + 1) // 2 * block.count
 
     def _contributions(self, block: Any) -> tuple[wp.array, wp.array]:
@@ -236,12 +236,10 @@ class Assembled:
             for k, (block, elements) in enumerate(parts):
                 state = [block.data, u, w.v, w.history, dq_dv, int(projected), active]
                 if self.whole:
-                    panels, width = panels_of(block.slots)
-                    rows: Any = rows_type(m.dtype, width)
-                    matrix = shaped(self.scratch, (m.worlds, block.count, panels * block.slots), rows)
+                    _, width, rows = panels_of(block.slots)
+                    matrix = shaped(self.scratch, (m.worlds, block.count, rows), rows_type(m.dtype, width))
                     launch(elements.element_rows, (m.worlds, block.count), [*state, int(k > 0), matrix])
-                    numbers = 9 * width * panels * block.slots
-                    matrix = shaped(self.scratch, (m.worlds, block.count, numbers), m.types.T)
+                    matrix = shaped(self.scratch, (m.worlds, block.count, 9 * width * rows), m.types.T)
                     continue
                 pairs = 3 * block.slots * (block.slots + 1) // 2
                 matrix = shaped(self.scratch, (m.worlds, pairs, block.count))

@@ -1,9 +1,9 @@
 """A matrix of 3x3 blocks factored as a whole in a band, where one is narrow: chains of beams, strips, slender bars.
 
-Measured on one core, ms per step, levels of tiles and this: bars of T10 with 1 x 1, 2 x 2 and 3 x 3 cells across (bandwidth
-84, 208 and 392) 10.9 and 1.0, 38 and 4.4, 40 and 10.6; 100 links of E = 7e12 Pa on joints 43 and 5.2 (413 with 3x3 blocks);
-a square plate of 16 x 16 shells (404) 17.4 and 11.5 in vibration, but 29 and 41 where it turns and bends so fast that
-factors last for few steps. Wider bands lose more than that.
+Measured on one core, ms per step, levels of tiles and this: bars of T10 with 1 x 1, 2 x 2 and 3 x 3 cells across
+(bandwidth 84, 208 and 392) 10.9 and 1.0, 38 and 4.4, 40 and 10.6; 100 links of E = 7e12 Pa on joints 43 and 5.2 (413
+with 3x3 blocks); a square plate of 16 x 16 shells (404) 17.4 and 11.5 in vibration, but 29 and 41 where it turns and
+bends so fast that factors last for few steps. Wider bands lose more than that.
 
 A band that costs little beside its matrix is factored with every matrix that the operator takes, which leaves one
 iteration of PCG per solve; a wider one is kept by the rule of kernels/lag.py.
@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from ..errors import ModelError
 from ..kernels.band import BLOCK, band_kernels, column_type
 from .assembled import coupled_slots
 
@@ -31,8 +32,10 @@ __all__ = ["Band", "BandFactor", "find_band"]
 
 WIDEST = 112
 """Blocks beside the diagonal of a band, at most, where it is chosen: beyond, levels of tiles are cheaper."""
-SMALL = 160
-"""Up to so many slots any band is."""
+WHOLE_SLOTS = 160
+"""A model of up to so many slots is treated as a whole: here in a band of any width, without one as a dense matrix."""
+LARGEST = 2**31
+"""Bytes of the factors of a world from which they are not addressed."""
 ASSEMBLY, FACTORISATION = 1.0, 5.5e-5
 """Times per unknown, us, on one core: making H of 3243 and T10 elements; a factorisation, per bandwidth squared."""
 PRODUCT, SOLUTION = 0.06, 5.4e-4
@@ -76,7 +79,7 @@ def find_band(model: Model, *, any_width: bool = False) -> Band | None:
 def _find_band(model: Model, any_width: bool) -> Band | None:
     graph = coupled_slots(model)
     n = graph.shape[0]
-    free = any_width or n <= SMALL
+    free = any_width or n <= WHOLE_SLOTS
     # no order makes a band narrower than half of a row's neighbours
     if not free and 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (WIDEST + 1):
         return None
@@ -87,6 +90,14 @@ def _find_band(model: Model, any_width: bool) -> Band | None:
     columns = place[graph.indices]
     width = int(((3 * rows + 2) // BLOCK - (3 * columns) // BLOCK).max())
     if not free and width > WIDEST:
+        return None
+    size = -(-3 * n // BLOCK) * BLOCK**2 * (width + 1) * wp.types.type_size_in_bytes(model.types.T)
+    if size >= LARGEST:
+        if any_width:
+            raise ModelError(
+                f"preconditioner = 'banded': the factors of {n} slots in a band of {BLOCK * width} unknowns take "
+                f"{size / 2**30:.1f} GiB per world, more than {LARGEST / 2**30:.0f}: take 'two-level'"
+            )
         return None
     at, of = (model.array("band", values, wp.int32) for values in (order, place))
     return Band(at, of, -(-3 * n // BLOCK), width)

@@ -12,12 +12,12 @@ import warp as wp
 from ..kernels.levels import TILE_SLOTS, level_struct
 from ..partition import bisect, connected_groups
 from .assembled import Pattern, make_pattern
-from .band import Band
+from .band import WHOLE_SLOTS, Band
 
 if TYPE_CHECKING:
     from ..model import Model
 
-__all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "WHOLE_SLOTS", "Level", "make_levels"]
+__all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
 """Slots of a group whose affine motions are the coarse space: 16 unknowns of a level to one of the next."""
@@ -25,10 +25,9 @@ SMALL_GROUPS = (16, 32)
 SMALL_COARSE = 48
 """Groups of fewer slots where that gives a coarse level of up to so many: a small slender body has too few groups of 64
 to bend (a cantilever of 180 slots takes half of the iterations)."""
-WHOLE_SLOTS = 160
-"""A model of up to so many slots is inverted as one dense matrix: it needs no levels."""
 BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
-"""So is a coarse level; on CUDA it costs less than the launches of more levels would."""
+"""A coarse level of up to so many slots is inverted as one dense matrix; on CUDA that costs less than the launches of
+more levels would."""
 MAX_LEVELS = 12
 
 

@@ -45,11 +45,12 @@ class NewtonPCG:
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
             serves), "banded" (Cholesky factors of the whole, kept as well; on the CPU, for chains, strips and slender
             or small bodies), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
-            "block-jacobi" (the blocks alone), or "auto": "deflated" for many small bodies on joints, "banded" where the
-            band is narrow, else "two-level".
+            "block-jacobi" (the blocks alone), or "auto": on the CPU "banded" where the band is narrow or the model small,
+            else "deflated" for many small bodies on joints, else "two-level".
         linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS where that is installed.
         preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
-            model's. They are made in the model's precision; float32 halves what an application reads.
+            model's. They are made in the model's precision; float32 halves what an application reads. Another precision
+            than the model's excludes "banded".
         operator: H p from the "elements", from the "matrix" of 3x3 blocks, or "auto", by which is cheaper. In dynamics
             without constraints the matrix of an earlier iterate serves while Newton's method does not suffer.
         multipliers: how constraint forces are found: "newton", with every Newton step, or "outer", the classical
@@ -137,7 +138,7 @@ class NewtonLoop:
         direct = options.linear == "direct"
         kind = "direct" if direct else choose(options.preconditioner, options.preconditioner_dtype, model)
         if constrained:
-            deflate = kind != "block-jacobi" and not direct
+            deflate = kind not in ("block-jacobi", "banded") and not direct  # factors hold the penalties
             self.constraints = ConstraintSolver(
                 model, work, launch, classical=self.classical, kappa=options.penalty, deflate=deflate
             )

@@ -9,8 +9,7 @@ import warp as wp
 from ..errors import ModelError
 from ..kernels.pcg import pcg_kernels
 from ..launch import labelled
-from .band import find_band
-from .levels import WHOLE_SLOTS
+from .band import WHOLE_SLOTS, find_band
 from .residual import Residual
 from .twolevel import TwoLevel
 

@@ -11,7 +11,8 @@ place of 172 with nu = 0.49, but inverses 16 times as large), and the ten quadra
 statics 42 iterations in place of 105; 50k unknowns in dynamics on the CPU 32 for 48, but 8.6 ms for 3.0 each, 593 ms
 per step for 478; in groups of 160 slots, where they cost the same, statics gain a third and dynamics nothing).
 
-In a model whose unknowns have an order in which H is a narrow band the one level is that, factored as a whole (band.py).
+In a model whose unknowns have an order in which H is a narrow band the one level is that, factored as a whole
+(band.py).
 
 An odd number of Chebyshev steps keeps C positive whatever the largest eigenvalue is.
 
@@ -118,7 +119,8 @@ class TwoLevel:
         constraints = residual.constraints
         band, pattern = self.levels[0].band, self.assembled.pattern
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
-        # the factors of the operator's own matrix where they cost little; wider ones are kept for longer than that
+        # the factors of the operator's own matrix where they cost little (the matrix made here serves for D alone then);
+        # wider ones are kept for longer than that
         self.follows = band is not None and band.quick and residual.by_matrix and constraints is None
         if self.follows:
             residual.on_matrix = self._factor
@@ -127,7 +129,9 @@ class TwoLevel:
         self.by_row = 0 if model.device.is_cuda else 1
         self.tied = constraints is not None and not self.levels[0].whole
         self.rebuild_cost = band.rebuild_cost if band is not None and not self.follows else REBUILD_COST
-        self.lag = Lag(model, work, launch, "preconditioner", self.rebuild_cost)
+        # another name: iterations with factors and with levels have nothing to do with each other
+        name = "preconditioner" if band is None else "preconditioner_banded"
+        self.lag = Lag(model, work, launch, name, self.rebuild_cost)
         most = max([level.slots for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
