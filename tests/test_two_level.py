@@ -385,7 +385,8 @@ def spinner(**options):
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     box = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(6, 2, 2)), material=wf.SVK(E=1e7, nu=0.3, density=1000.0))
     b.set_initial(box, angular_velocity=(0, 0, 40.0))
-    return wf.Simulation(b.finalize(device="cpu"), dt=2e-3, solver=wf.NewtonPCG(**options), ledger=False)
+    solver = wf.NewtonPCG(**({"preconditioner": "two-level"} | options))
+    return wf.Simulation(b.finalize(device="cpu"), dt=2e-3, solver=solver, ledger=False)
 
 
 def test_it_is_kept_while_it_serves_and_made_anew_when_it_does_not():
@@ -436,12 +437,13 @@ def test_worlds_have_their_own():
     model = b.finalize(device="cpu", worlds=3)
     gravity = np.array([(0, 0, -1.0), (0, 0, -300.0), (50.0, 0, 0)])
     model.set_gravity(gravity)
-    sim = wf.Simulation(model, dt=5e-3, solver=wf.NewtonPCG(operator="matrix"))
+    solver = wf.NewtonPCG(operator="matrix", preconditioner="two-level")
+    sim = wf.Simulation(model, dt=5e-3, solver=solver)
     sim.step(6)
     for world in range(3):
         single = bar(1000).finalize(device="cpu")
         single.set_gravity(gravity[world])
-        own = wf.Simulation(single, dt=5e-3, solver=wf.NewtonPCG(operator="matrix"))
+        own = wf.Simulation(single, dt=5e-3, solver=solver)
         own.step(6)
         for name in ("displacement", "preconditioner_displacement", "operator", "operator_displacement"):
             row = getattr(sim.state, name).numpy()[world]

@@ -83,13 +83,13 @@ class Residual:
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
         self.massive = all(block.massive for block in model.blocks)
-        # elements with many points per slot cost more than the matrix that they make. On the CPU it is taken wherever the
-        # preconditioner wants one anyway: a core assembles H in the time of 2 to 7 products of ANCF elements, and of 15
-        # of straight tetrahedra
+        # elements with many points per slot cost more than the matrix that they make. On the CPU it is taken wherever
+        # the preconditioner wants one anyway: a core assembles H in the time of 2 to 7 products of ANCF elements, and
+        # of 15 of straight tetrahedra
         cheaper = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
         if not model.device.is_cuda:
             cheaper = assembled
-        self.by_matrix = operator == "matrix" or (operator == "auto" and cheaper)
+        self.by_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
         self.clusters: ModelClusters | None = None
         if self.massive and not self.by_matrix:
             if "clusters" not in model.cache:

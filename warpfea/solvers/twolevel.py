@@ -119,8 +119,8 @@ class TwoLevel:
         constraints = residual.constraints
         band, pattern = self.levels[0].band, self.assembled.pattern
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
-        # the factors of the operator's own matrix where they cost little (the matrix made here serves for D alone then);
-        # wider ones are kept for longer than that
+        # the factors of the operator's own matrix where they cost little (the matrix made here serves for D alone
+        # then); wider ones are kept for longer than that
         self.follows = band is not None and band.quick and residual.by_matrix and constraints is None
         if self.follows:
             residual.on_matrix = self._factor
