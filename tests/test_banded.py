@@ -128,7 +128,8 @@ def test_worlds_that_are_not_flagged_keep_theirs():
 
 
 def kind(sim):
-    return "banded" if sim.stepper.newton.preconditioner.band else "two-level"
+    assert (sim.methods["preconditioner"] == "banded") == (sim.stepper.newton.preconditioner.band is not None)
+    return sim.methods["preconditioner"]
 
 
 def test_auto_takes_it_where_the_band_is_narrow():
@@ -138,7 +139,7 @@ def test_auto_takes_it_where_the_band_is_narrow():
     assert kind(simulation(PROBLEMS["bar"].build((30, 1, 1)), preconditioner="two-level")) == "two-level"
     # with inverses in another precision there are only levels
     assert kind(simulation(PROBLEMS["bar"].build((30, 1, 1)), preconditioner_dtype="float32")) == "two-level"
-    with pytest.raises(wf.ModelError, match=r"'banded' is for the CPU, in the model's precision.*float64.*'float32'"):
+    with pytest.raises(wf.ModelError, match=r"'banded' keeps its factors in.*float64: leave out.*'float32', or take"):
         simulation(PROBLEMS["bar"].build((3, 1, 1)), preconditioner="banded", preconditioner_dtype="float32")
 
 

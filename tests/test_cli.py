@@ -232,7 +232,15 @@ def test_info_tells_features_and_costs(folder, capfd):
     words = ["info", "cantilever", "--set", "cells=2", "--device", "cpu"]
     code, out, err = run(capfd, *words)
     assert (code, err) == (0, "")
-    for word in ("12 T10 elements", "left out", "contact", "bytes per unknown", "launches", "matrix_product"):
+    for word in (
+        "12 T10 elements",
+        "left out",
+        "contact",
+        "bytes per unknown",
+        "launches",
+        "matrix_product",
+        "operator matrix, preconditioner banded",
+    ):
         assert word.replace("bytes", "B") in out
     code, out, _ = run(capfd, *words, "--json", "-")
     info = json.loads(out)

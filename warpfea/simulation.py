@@ -210,6 +210,11 @@ class Simulation(Results):
         return self.state.time.numpy().copy()
 
     @property
+    def methods(self) -> dict[str, str]:
+        """What "auto" stands for here: "solver", and of NewtonPCG "linear", "operator" and "preconditioner"."""
+        return dict(self.stepper.newton.methods)
+
+    @property
     def status(self) -> np.ndarray:
         """[world]: 0 running, 1 failed, 2 frozen."""
         return self.state.status.numpy().copy()

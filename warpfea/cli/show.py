@@ -62,6 +62,7 @@ def info(options: argparse.Namespace) -> int:
         launcher = sim.stepper.launch
         content = {"scene": source.label, "parameters": source.parameters} | model.info()
         content["integrator"] = sim.integrator.name
+        content["methods"] = sim.methods
         content["bytes"] = sim.bytes()
         content["bytes_per_unknown"] = sum(sim.bytes().values()) / max(content["unknowns"], 1)
         content["kernels"] = sorted(launcher.kernels)
@@ -80,6 +81,9 @@ def _info_table(content: dict[str, Any]) -> str:
     rows += _body_rows(c["bodies"])
     rows += _joint_rows(c["joints"])
     rows.append(["model", f"{c['unknowns']} unknowns, {number(c['mass'])} kg"])
+    methods = c["methods"]
+    details = [f"{name} {value}" for name, value in methods.items() if name != "solver"]
+    rows.append(["solver", ", ".join([methods["solver"], *details])])
     rows.append(["used", ", ".join(c["features"])])
     rows.append(["left out", ", ".join(c["left_out"])])
     groups: dict[str, int] = {}

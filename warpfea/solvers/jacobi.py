@@ -147,6 +147,7 @@ class JacobiLoop(NewtonLoop):
         constraint_tol: float,
     ) -> None:
         super().__init__(model, work, launch, options.newton, inertia=inertia, constraint_tol=constraint_tol)
+        self.methods = {"solver": "jacobi"}
         # the multipliers are changed once, when the step is accepted: no outer loop, and constraints count
         self.classical = False
         work.newton.constraint_tol = constraint_tol

@@ -161,6 +161,13 @@ class NewtonLoop:
         self.pcg = PCG(
             model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
         )
+        self.methods = {
+            "solver": "newton-pcg",
+            "linear": options.linear,
+            "operator": "matrix" if self.residual.by_matrix else "elements",
+        }
+        if not direct:
+            self.methods["preconditioner"] = kind
         self.dim = (model.worlds, model.slots)
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv

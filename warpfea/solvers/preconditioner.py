@@ -109,10 +109,14 @@ def choose(name: str, storage: str | None, model: Model) -> str:
         ModelError: "banded" on a GPU, or with inverses in another precision than the model's.
     """
     banded = not model.device.is_cuda and storage in (None, model.dtype)
+    if name == "banded" and model.device.is_cuda:
+        raise ModelError(
+            f"NewtonPCG: preconditioner = 'banded' is for the CPU; on {model.device} take 'auto' or 'two-level'"
+        )
     if name == "banded" and not banded:
         raise ModelError(
-            f"NewtonPCG: preconditioner = 'banded' is for the CPU, in the model's precision; the model is on "
-            f"{model.device} in {model.dtype}, preconditioner_dtype = {storage!r}"
+            f"NewtonPCG: preconditioner = 'banded' keeps its factors in the model's precision, {model.dtype}: leave "
+            f"out preconditioner_dtype = {storage!r}, or take 'two-level'"
         )
     if name != "auto":
         return name
