@@ -1,5 +1,7 @@
 """The banded preconditioner: factors against scipy, matrices that are not positive, when it is chosen, resumed runs."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scipy.sparse.linalg as spl
@@ -11,6 +13,7 @@ from warpfea.bench_problems import PROBLEMS
 from warpfea.checkpoint import save_checkpoint
 from warpfea.scene import find
 from warpfea.solvers.band import WIDEST, Band, find_band
+from warpfea.solvers.preconditioner import choose
 
 SIZES = {"bar": (12, 1, 1), "beam": 60, "plate": (12, 1)}
 
@@ -31,6 +34,12 @@ def assembled(sim, u, *, projected):
     out, work = matrix.values("test"), sim.stepper.work
     matrix.assemble(u, (work.step.mass_factor, work.step.dq_dv), on, out, projected=projected)
     return out
+
+
+def on_diagonal(matrix):
+    """Which entries of the pattern are diagonal blocks."""
+    graph = matrix.pattern.graph
+    return np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr)) == graph.indices
 
 
 def solved(sim, r):
@@ -101,10 +110,8 @@ def test_no_shift_makes_it_positive_and_unknowns_go_alone():
     sim.step()
     band, matrix, on = parts(sim)
     value = assembled(sim, sim.stepper.work.u, projected=True)
-    blocks = value.numpy()
-    graph = matrix.pattern.graph
-    rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
-    blocks[0, rows != graph.indices] *= 30.0
+    blocks, diagonal = value.numpy(), on_diagonal(matrix)
+    blocks[0, ~diagonal] *= 30.0
     value.assign(blocks)
     band.make(value, on)
     assert band.bad.numpy()[0] > 0
@@ -141,6 +148,9 @@ def test_auto_takes_it_where_the_band_is_narrow():
     assert kind(simulation(PROBLEMS["bar"].build((30, 1, 1)), preconditioner_dtype="float32")) == "two-level"
     with pytest.raises(wf.ModelError, match=r"'banded' keeps its factors in.*float64: leave out.*'float32', or take"):
         simulation(PROBLEMS["bar"].build((3, 1, 1)), preconditioner="banded", preconditioner_dtype="float32")
+    gpu = SimpleNamespace(device=SimpleNamespace(is_cuda=True), dtype="float64")
+    with pytest.raises(wf.ModelError, match=r"'banded' is for the CPU; on .* take 'auto' or 'two-level'"):
+        choose("banded", None, gpu)
 
 
 def test_wider_bands_are_kept_for_longer():
@@ -255,11 +265,9 @@ def test_negative_numbers_on_the_diagonal_take_the_other_sign():
     sim.step()
     band, matrix, on = parts(sim)
     value = assembled(sim, sim.stepper.work.u, projected=True)
-    blocks = value.numpy()
-    graph = matrix.pattern.graph
-    rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
-    blocks[0, rows != graph.indices] = 0.0
-    blocks[0, rows == graph.indices] = np.diag([1.0, 2.0, -4.0])
+    blocks, diagonal = value.numpy(), on_diagonal(matrix)
+    blocks[0, ~diagonal] = 0.0
+    blocks[0, diagonal] = np.diag([1.0, 2.0, -4.0])
     value.assign(blocks)
     band.make(value, on)
     assert band.shift.numpy()[0] == 0.0
