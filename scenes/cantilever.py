@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=2.5e-3, t_end=0.5, fps=120.0, speed=0.2, picture=0.2)

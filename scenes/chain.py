@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=0.02, t_end=2.0, integrator="bdf2", tol=1e-5, fps=60.0, speed=0.5, picture=0.3)

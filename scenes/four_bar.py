@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=1.25e-3, t_end=0.5, integrator="bdf2", tol=1e-5, fps=240.0, speed=0.08, picture=0.36)

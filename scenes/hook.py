@@ -5,7 +5,7 @@ from __future__ import annotations
 import pathlib
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 MESH = pathlib.Path(__file__).with_name("hook.msh")
 

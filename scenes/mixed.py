@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=5e-3, t_end=0.44, integrator="bdf2", tol=1e-4, fps=120.0, speed=0.15, picture=0.2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=1.25e-3, t_end=1.5, integrator="bdf2", tol=1e-6, speed=0.3, picture=0.7)

@@ -6,7 +6,7 @@ import math
 from typing import Literal
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=0.02, t_end=2.25, tol=1e-5, speed=0.8, picture=1.6)

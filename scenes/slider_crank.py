@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=2e-4, t_end=0.085, integrator="bdf2", tol=1e-5, fps=1200.0, speed=0.01, picture=0.0546)

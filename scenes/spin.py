@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=4e-3, t_end=1.6, integrator="bdf2", tol=1e-5, speed=0.4, picture=0.4)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import warpfea as wf
-from warpfea.scene import scene
+from warpfea.builder.scene import scene
 
 
 @scene(dt=1.0 / 60.0, t_end=1.1, tol=1e-6, speed=0.5)

@@ -21,7 +21,7 @@ import scipy.sparse.linalg as linalg
 import warp as wp
 
 import warpfea as wf
-from warpfea.bench import _commit, _versions, machine
+from warpfea.base.provenance import commit, machine, versions
 
 DATA = pathlib.Path(__file__).with_name("data")
 X, Z = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -346,7 +346,7 @@ def _order_row(element, integration, n, solved, exact, last):
 
 
 def _mean_square_error(body, state):
-    from warpfea.assembly import geometry
+    from warpfea.model.assembly import geometry
 
     rule = body.family.curved_mass_rule
     every = np.arange(len(body.mesh.cells))
@@ -393,8 +393,8 @@ def main():
         rows = PARTS[name](options.device, options.quick)
         content["parts"][name] = {
             "about": PARTS[name].__doc__, "rows": rows, "wall_s": clock.perf_counter() - began,
-            "command": shlex.join(["python", "tests/ancf_report.py", *sys.argv[1:]]), "commit": _commit(),
-            "machine": machine(options.device), "versions": _versions(),
+            "command": shlex.join(["python", "tests/ancf_report.py", *sys.argv[1:]]), "commit": commit(),
+            "machine": machine(options.device), "versions": versions(),
         }  # fmt: skip
         print(f"{name}: {clock.perf_counter() - began:.0f} s")
         for row in rows:

@@ -23,8 +23,8 @@ import numpy as np
 import warp as wp
 
 import warpfea as wf
-from warpfea.bench import _commit, _versions, machine
-from warpfea.scene import find
+from warpfea.base.provenance import commit, machine, versions
+from warpfea.builder.scene import find
 from warpfea.solvers.jacobi import ACCELERATIONS
 
 wp.config.log_level = 30
@@ -133,9 +133,9 @@ def main(arguments: list[str]) -> int:
     content = {
         "schema": 1,
         "command": shlex.join(["python", "tests/jacobi_report.py", *arguments]),
-        "commit": _commit(),
+        "commit": commit(),
         "machine": machine(o.device),
-        "versions": _versions(),
+        "versions": versions(),
         "settings": {"steps": o.steps, "integrator": "backward_euler", "reference": "newton-pcg, tol 1e-10"},
         "rows": measure(o.device, o.steps),
     }

@@ -24,7 +24,7 @@ import numpy as np
 import warp as wp
 
 import warpfea as wf
-from warpfea.bench import _commit, _versions, machine
+from warpfea.base.provenance import commit, machine, versions
 
 wp.config.log_level = 30
 
@@ -207,9 +207,9 @@ def main(arguments: list[str]) -> int:
     content: dict[str, Any] = {
         "schema": 1,
         "command": shlex.join(["python", "tests/joint_report.py", *arguments]),
-        "commit": _commit(),
+        "commit": commit(),
         "machine": machine(o.device),
-        "versions": _versions(),
+        "versions": versions(),
         "settings": {"steps": o.steps, "integrator": "bdf2", "constraint_tol": 1e-8, "cost_dt": 1e-3},
     }
     if o.only != "stability":

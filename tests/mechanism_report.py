@@ -24,7 +24,7 @@ import numpy as np
 import warp as wp
 
 import warpfea as wf
-from warpfea.bench import _commit, _versions, machine
+from warpfea.base.provenance import commit, machine, versions
 
 HERE = pathlib.Path(__file__).resolve().parent
 spec = importlib.util.spec_from_file_location("mechanism_models", HERE / "mechanism_models.py")
@@ -651,7 +651,7 @@ def main():
     to.add_argument("--only", action="append", choices=PARTS, help="parts; the others stay as they are in the file")
     options = to.parse_args()
     wp.config.log_level = 30
-    path, commit = pathlib.Path(options.out), _commit()
+    path, revision = pathlib.Path(options.out), commit()
     content = json.loads(path.read_text()) if options.only and path.exists() else {"schema": 1, "parts": {}}
     for name in options.only or PARTS:
         print(f"{name} ...", flush=True)
@@ -663,8 +663,8 @@ def main():
         rows = PARTS[name](options.device, options.quick, **more)
         content["parts"][name] = {
             "about": PARTS[name].__doc__, "rows": rows, "wall_s": clock.perf_counter() - began,
-            "command": shlex.join(["python", "tests/mechanism_report.py", *sys.argv[1:]]), "commit": commit,
-            "machine": machine(options.device), "versions": _versions(),
+            "command": shlex.join(["python", "tests/mechanism_report.py", *sys.argv[1:]]), "commit": revision,
+            "machine": machine(options.device), "versions": versions(),
         }  # fmt: skip
         print(f"{name}: {clock.perf_counter() - began:.0f} s")
         for row in rows:

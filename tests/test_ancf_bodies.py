@@ -11,8 +11,9 @@ import pytest
 import warp as wp
 
 import warpfea as wf
-from warpfea import assembly
-from warpfea.surfaces import element_functions, reference_points
+from warpfea.model.discretisation import element_functions
+from warpfea.model.model import assembly
+from warpfea.model.surfaces import reference_points
 
 E_MODULUS, NU, RHO = 1e6, 0.3, 7.0
 SVK = wf.SVK(E=E_MODULUS, nu=NU, density=RHO)
@@ -450,12 +451,12 @@ def test_named_surfaces(name):
         assert total == pytest.approx(area, rel=1e-12 if name in FLAT else 6e-3), side
         center = load.weights @ body.reference[load.slots] / total + body.origin
         model = finalize(b)
-        pushed = follower_force(model, model.state())
+        nonpotential = follower_force(model, model.state())
         if name in FLAT:
             outward = center - placed(np.array([0.5, 0.0 if name == "beam" else 0.4, 0.3 * (name == "ENMC")])[None])[0]
-            pushed = pushed[body.slot_kind == 0].sum(axis=0)
-            assert np.linalg.norm(pushed) == pytest.approx(5.0 * area, rel=1e-10)
-            assert pushed @ outward < -0.99 * 5.0 * area * np.linalg.norm(outward)
+            nonpotential = nonpotential[body.slot_kind == 0].sum(axis=0)
+            assert np.linalg.norm(nonpotential) == pytest.approx(5.0 * area, rel=1e-10)
+            assert nonpotential @ outward < -0.99 * 5.0 * area * np.linalg.norm(outward)
     with pytest.raises((wf.ModelError, wf.MeshError), match="named 'left'"):
         body.surface("left")
 
@@ -488,13 +489,13 @@ def _launched(model, state, what, *fields):
     values = np.array([law.values[-1] for law in loads._laws.laws])[None]
     values = wp.array(values, dtype=wp.vec3d, device="cpu")
     active = wp.ones(1, dtype=wp.int32, device="cpu")
-    out = wp.zeros((1, loads.pushed_entries), dtype=vec3, device="cpu")
+    out = wp.zeros((1, loads.nonpotential_entries), dtype=vec3, device="cpu")
     extra = [wp.array(f[None], dtype=vec3, device="cpu") for f in fields]
     for part in loads.followers:
         args = [part.data, state.displacement, values, active, *extra, out]
         wp.launch(getattr(part, what), dim=(1, part.count), inputs=args, device="cpu")
     force = np.zeros((model.slots, 3))
-    start, entry = loads.pushed_topology.start.numpy(), loads.pushed_topology.entry.numpy()
+    start, entry = loads.nonpotential_topology.start.numpy(), loads.nonpotential_topology.entry.numpy()
     np.add.at(force, np.repeat(np.arange(model.slots), np.diff(start)), out.numpy()[0][entry])
     return force
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import warpfea as wf
-from warpfea.scene import find
-from warpfea.usd import validate_usd
+from warpfea.builder.scene import find
+from warpfea.outputs.usd import validate_usd
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 COARSE = {

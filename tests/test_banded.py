@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import scipy.sparse.linalg as spl
 import warp as wp
-from warpfea.kernels.band import BLOCK
+from warpfea.kernels.solvers.band import BLOCK
 
 import warpfea as wf
-from warpfea.bench_problems import PROBLEMS
-from warpfea.checkpoint import save_checkpoint
-from warpfea.scene import find
+from warpfea.builder.scene import find
+from warpfea.simulation.checkpoint import save_checkpoint
 from warpfea.solvers.band import WIDEST, Band, find_band
 from warpfea.solvers.preconditioner import choose
+from warpfea.studies.bench.problems import PROBLEMS
 
 SIZES = {"bar": (12, 1, 1), "beam": 60, "plate": (12, 1)}
 

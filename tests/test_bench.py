@@ -6,9 +6,11 @@ import pathlib
 import numpy as np
 import pytest
 
-from warpfea import bench_cpu, bench_growth, bench_peer
-from warpfea.bench_problems import PROBLEMS
 from warpfea.cli import main
+from warpfea.studies.bench import cpu as bench_cpu
+from warpfea.studies.bench import growth as bench_growth
+from warpfea.studies.bench import peer as bench_peer
+from warpfea.studies.bench.problems import PROBLEMS
 
 DATA = pathlib.Path(__file__).resolve().parent / "data"
 

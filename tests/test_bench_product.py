@@ -6,10 +6,10 @@ import types
 import numpy as np
 import pytest
 
-from warpfea import bench_product
-from warpfea.bench_cost import cost
-from warpfea.bench_problems import LAW, PROBLEMS
 from warpfea.cli import main
+from warpfea.studies.bench import product as bench_product
+from warpfea.studies.bench.cost import cost
+from warpfea.studies.bench.problems import LAW, PROBLEMS
 
 SIZES = {"bar": (2, 1, 1), "beam": 2, "plate": 1, "ENMC": (1, 1, 1), "FN18": (1, 1, 1)}
 

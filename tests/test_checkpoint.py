@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import warpfea as wf
-from warpfea.checkpoint import Checkpoint, load_checkpoint, read_meta, save_checkpoint
+from warpfea.simulation.checkpoint import Checkpoint, load_checkpoint, read_meta, save_checkpoint
 
 DAMPED = wf.KelvinVoigt(eta=2e4, lambda_v=1e4)
 
@@ -144,7 +144,7 @@ def test_registered_arrays_are_kept(tmp_path):
 def test_the_output_writes_every_n_steps_and_at_the_end(tmp_path, monkeypatch):
     path = tmp_path / "bar.npz"
     steps = []
-    monkeypatch.setattr("warpfea.checkpoint.save_checkpoint", lambda sim, p: steps.append(sim.steps))
+    monkeypatch.setattr("warpfea.simulation.checkpoint.save_checkpoint", lambda sim, p: steps.append(sim.steps))
     wf.Simulation(bar(), dt=2e-3).run(0.014, outputs=[Checkpoint(path, every=3)])
     assert steps == [3, 6, 7]
     steps.clear()

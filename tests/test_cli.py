@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 import warpfea as wf
+from warpfea.base.console import compile_bar
+from warpfea.base.errors import UsageError
+from warpfea.builder.scene import find
 from warpfea.cli import main
-from warpfea.cli.console import compile_bar
-from warpfea.cli.parser import UsageError
 from warpfea.cli.part import parse_material
 from warpfea.cli.summary import KEYS
-from warpfea.scene import find
-from warpfea.usd import validate_usd
+from warpfea.outputs.usd import validate_usd
 
 HERE = pathlib.Path(__file__).resolve().parent
 SHORT = ["run", "cantilever", "--device", "cpu", "--set", "cells=2", "--dt", "0.002", "--t-end", "0.01"]
@@ -292,7 +292,7 @@ def test_the_bar_of_the_compilation_goes_to_stderr(capfd):
     wf.Simulation(model, dt=1e-3, on_compile=lambda *news: ready.append(news))
     done, total, names = zip(*ready)
     assert done == tuple(range(1, total[0] + 1))
-    assert "warpfea.kernels.reduce" in names
+    assert "warpfea.kernels.common.reduce" in names
     capfd.readouterr()
     with compile_bar(True) as update:
         for news in ready:

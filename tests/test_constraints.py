@@ -7,7 +7,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation as Turn
 
 import warpfea as wf
-from warpfea.assembly import rigid_modes
+from warpfea.model.assembly import rigid_modes
 
 LAW = wf.SVK(E=1e7, nu=0.3, density=1000.0)
 ANCHOR = np.array([1.0, 0.05, 0.1])

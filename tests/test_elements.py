@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import warpfea as wf
-from warpfea import assembly, elements
+from warpfea import elements
 from warpfea.elements import quadrature
+from warpfea.model.model import assembly
 
 RHO = 7.0
 LAWS = {

@@ -11,9 +11,9 @@ import pytest
 import warp as wp
 
 import warpfea as wf
-from warpfea.checkpoint import load_checkpoint, save_checkpoint
+from warpfea.builder.scene import find
 from warpfea.cli import main
-from warpfea.scene import find
+from warpfea.simulation.checkpoint import load_checkpoint, save_checkpoint
 from warpfea.solvers import SOLVERS
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "jacobi_cpu.json"

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import warpfea as wf
+from warpfea.builder.scene import find
 from warpfea.cli import main
 from warpfea.cli.summary import KEYS, MANY
-from warpfea.scene import find
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SMALL = {

@@ -105,7 +105,7 @@ def test_follower_pressure_turns_with_the_body():
     model = b.finalize(device="cpu")
     sim = wf.Simulation(model, dt=1e-6)
     sim.step()
-    force = sim.stepper.work.pushed.numpy()[0]
+    force = sim.stepper.work.nonpotential.numpy()[0]
     area = 4 * np.pi * 0.6**2
     assert np.abs(force.sum(axis=0)).max() < 1e-12 * 1e3 * area
     # virtual work of a uniform growth: p dV

@@ -12,8 +12,16 @@ import numpy as np
 import pytest
 
 import warpfea
-from warpfea.errors import MeshError
-from warpfea.mesh import CELL_TYPES, Mesh, box, check, cylinder, read, sphere
+from warpfea.base.errors import MeshError
+from warpfea.mesh import (
+    CELL_TYPES,
+    Mesh,
+    box,
+    check,
+    cylinder,
+    read,
+    sphere,
+)
 
 HERE = Path(__file__).parent
 SCENES = Path(warpfea.__file__).parent.parent / "scenes"

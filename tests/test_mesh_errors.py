@@ -9,8 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warpfea.errors import MeshError, MeshWarning
-from warpfea.mesh import Mesh, box, check, cylinder, read, sphere
+from warpfea.base.errors import MeshError, MeshWarning
+from warpfea.mesh import (
+    Mesh,
+    box,
+    check,
+    cylinder,
+    read,
+    sphere,
+)
 
 
 def _load(name):

@@ -13,13 +13,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from warpfea.colormap import TABLE, map_colors, to_linear, to_srgb
-from warpfea.errors import OutputError
-from warpfea.outputs import FrameClock, Surface, grid_offsets, vertex_normals
-from warpfea.raycaster import Camera, Renderer, nice_number, smooth_corners
-from warpfea.render import GIFWriter, PNGWriter, render_usd
-from warpfea.usd import USDWriter, validate_usd
-from warpfea.vtk import VTUWriter
+from warpfea.base.errors import OutputError
+from warpfea.outputs.colormap import TABLE, map_colors, to_linear, to_srgb
+from warpfea.outputs.frames import FrameClock, Surface, grid_offsets, vertex_normals
+from warpfea.outputs.raycaster import Camera, Renderer, nice_number, smooth_corners
+from warpfea.outputs.render import GIFWriter, PNGWriter, render_usd
+from warpfea.outputs.usd import USDWriter, validate_usd
+from warpfea.outputs.vtk import VTUWriter
 
 FAR = np.array([1.0e4, -2.0e4, 3.0e3])
 
@@ -332,10 +332,10 @@ def test_usd_large_runs_go_to_disk(tmp_path, monkeypatch):
     """Saving in between gives the same file content as saving once."""
     from pxr import Usd
 
-    import warpfea.usd
+    import warpfea.outputs.usd
 
     for name, limit in (("one.usdc", 1 << 40), ("many.usdc", 1 << 10)):
-        monkeypatch.setattr(warpfea.usd, "_SAVE_BYTES", limit)
+        monkeypatch.setattr(warpfea.outputs.usd, "_SAVE_BYTES", limit)
         drive(StubSim(worlds=2), USDWriter(tmp_path / name, fps=50), 10)
     stages = [Usd.Stage.Open(str(tmp_path / name)) for name in ("one.usdc", "many.usdc")]
     texts = [stage.GetRootLayer().ExportToString() for stage in stages]
@@ -649,7 +649,7 @@ def test_positions_that_are_not_finite(tmp_path):
 def test_import_is_lazy():
     """Importing the writers loads neither USD, meshio nor Pillow."""
     code = (
-        "import sys, warpfea.usd, warpfea.vtk, warpfea.render;"
+        "import sys, warpfea.outputs.usd, warpfea.outputs.vtk, warpfea.outputs.render;"
         "assert not {'pxr', 'meshio', 'PIL', 'tqdm'} & set(sys.modules), 'loaded'"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=pathlib.Path(__file__).parent.parent)

@@ -37,7 +37,7 @@ def test_an_unrelated_kernels_package_is_left_alone(tmp_path):
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").write_text("WHOSE = 'theirs'")
     code = (
-        "import kernels, warpfea, warpfea.kernels.types, sys;"
+        "import kernels, warpfea, warpfea.kernels.common.types, sys;"
         "assert kernels.WHOSE == 'theirs';"
         "assert warpfea.kernels is not kernels;"
         "print(sorted(m for m in sys.modules if m == 'scenes' or m.startswith('kernels.')))"

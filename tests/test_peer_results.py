@@ -5,7 +5,7 @@ import pathlib
 
 import pytest
 
-from warpfea.bench_peer import LARGE, PEER, required
+from warpfea.studies.bench.peer import LARGE, PEER, required
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 

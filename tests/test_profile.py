@@ -8,15 +8,15 @@ import types
 import numpy as np
 import pytest
 import warp as wp
-from warpfea.kernels.state import state_kernels
+from warpfea.kernels.common.state import state_kernels
 
 import warpfea as wf
-from warpfea import profiling
+from warpfea.base.launch import PARTS, Launcher, labelled
+from warpfea.builder.scene import find
 from warpfea.cli import main
 from warpfea.cli.profile import KEYS
-from warpfea.launch import PARTS, Launcher, labelled
-from warpfea.profiling import Recorder, launch_bytes, profile
-from warpfea.scene import find
+from warpfea.studies.profile import profiling
+from warpfea.studies.profile.profiling import Recorder, launch_bytes, profile
 
 WORDS = ["profile", "cantilever", "--set", "cells=2", "--device", "cpu", "--steps", "2"]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import warpfea as wf
-from warpfea.scene import Scene, find, load_file, names
+from warpfea.builder.scene import Scene, find, load_file, names
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 BUILTIN = [
@@ -199,8 +199,8 @@ def test_bad_files_are_named_with_the_line(tmp_path, text, words):
 
 def test_the_registry_lists_without_importing():
     code = (
-        "import sys, warpfea, warpfea.scene as s\n"
-        "import importlib; m = importlib.import_module('warpfea.scene')\n"
+        "import sys, warpfea, warpfea.builder.scene as s\n"
+        "import importlib; m = importlib.import_module('warpfea.builder.scene')\n"
         f"assert m.names() == {BUILTIN!r}, m.names()\n"
         "assert not [k for k in sys.modules if k.startswith('warpfea.scenes.')]\n"
         "assert not {'pxr', 'meshio', 'PIL', 'tqdm'} & set(sys.modules)\n"

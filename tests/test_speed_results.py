@@ -5,7 +5,7 @@ import pathlib
 
 import pytest
 
-from warpfea.bench_cpu import CASES
+from warpfea.studies.bench.cpu import CASES
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 

@@ -10,9 +10,9 @@ import pytest
 
 import warpfea as wf
 from warpfea.cli import main
-from warpfea.study import ancf_tets, problems
-from warpfea.study.rigid import exact_tip, stepped_tip
-from warpfea.study.tets import observed_order
+from warpfea.studies.ancf_tets import ancf_tets, problems
+from warpfea.studies.ancf_tets.comparison import observed_order
+from warpfea.studies.ancf_tets.rigid import exact_tip, stepped_tip
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 CONVERGING = ("T10", "FN18", "ENMC", "H3843")

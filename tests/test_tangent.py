@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from warpfea.kernels.massive import massive_kernel
+from warpfea.kernels.elements.with_mass import with_mass_kernel
 
 import warpfea as wf
 from warpfea.mesh.cells import TET_EDGES
@@ -134,7 +134,7 @@ def fields_of(model, u, v, p, mass_factor):
     return u, v, history, mass, dq, wp.ones(2, dtype=wp.int32, device="cpu"), p
 
 
-def massive_product(model, kernel, u, v, p, mass_factor=1e3):
+def with_mass_product(model, kernel, u, v, p, mass_factor=1e3):
     """Sums [world, slot] of what the clusters give in both worlds."""
     (block,) = model.blocks
     clusters = make_clusters(model)
@@ -179,14 +179,14 @@ def test_both_forms_of_the_product_agree(material, form, dtype, rule, data):
     body, model = massive_model(material, form, dtype, rule)
     (block,) = model.blocks
     assert block.key.vertex
-    general = massive_kernel(dtype, material, 10, block.points, form, False, block.cluster)
-    kernels = [general, block.massive_product(dtype, form)]
+    general = with_mass_kernel(dtype, material, 10, block.points, form, False, block.cluster)
+    kernels = [general, block.with_mass_product(dtype, form)]
     u = np.stack([deformed(body), deformed(body, seed=1)])
     v, p = np.random.default_rng(2).uniform(-1, 1, (2, *u.shape))
     for mass_factor in (0.0, 1e3):  # 1e3: mass and stiffness are of one size
         expected = separate_product(model, u, v, p, mass_factor)
         for kernel in kernels:
-            got = massive_product(model, kernel, u, v, p, mass_factor)
+            got = with_mass_product(model, kernel, u, v, p, mass_factor)
             for world in range(2):
                 assert data.error(got[world], expected[world]) < (1e-13 if dtype == "float64" else 1e-5)
 
@@ -195,9 +195,9 @@ def test_the_size_of_clusters_changes_nothing(data):
     body, model = massive_model("svk", None, "float64", "tet4")
     (block,) = model.blocks
     u, v, p = np.random.default_rng(2).uniform(-0.1, 0.1, (3, 2, *body.reference.shape))
-    expected = massive_product(model, block.massive_product("float64", None), u, v, p)
+    expected = with_mass_product(model, block.with_mass_product("float64", None), u, v, p)
     block.cluster = 32
-    got = massive_product(model, block.massive_product("float64", None), u, v, p)
+    got = with_mass_product(model, block.with_mass_product("float64", None), u, v, p)
     assert data.error(got, expected) < 1e-14
 
 
@@ -207,10 +207,10 @@ def test_a_translation_strains_no_straight_element():
     shape = (2, *body.reference.shape)
     u, far = np.zeros(shape), np.broadcast_to([1e6 / 3, -1e5 / 7, 1e3 / 11], shape)
     p = np.random.default_rng(2).uniform(-1, 1, shape)
-    kernel = block.massive_product("float64", None)
-    assert np.all(massive_product(model, kernel, p, u, far, 0.0) == 0.0)
-    at_rest = massive_product(model, kernel, u, u, p)
-    np.testing.assert_array_equal(massive_product(model, kernel, far, u, p), at_rest)
+    kernel = block.with_mass_product("float64", None)
+    assert np.all(with_mass_product(model, kernel, p, u, far, 0.0) == 0.0)
+    at_rest = with_mass_product(model, kernel, u, u, p)
+    np.testing.assert_array_equal(with_mass_product(model, kernel, far, u, p), at_rest)
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,10 @@ import scipy.sparse as sp
 import warp as wp
 
 import warpfea as wf
-from warpfea.bench_problems import PROBLEMS
-from warpfea.partition import bisect, connected_groups, morton_order
+from warpfea.model.partition import bisect, connected_groups, morton_order
 from warpfea.solvers.assembled import Assembled
 from warpfea.solvers.preconditioner import choose
+from warpfea.studies.bench.problems import PROBLEMS
 
 
 def simulation(builder, *, device="cpu", dtype="float64", dt=1e-3, shake=0.0, **options):
@@ -152,7 +152,7 @@ def test_mortons_curve_keeps_neighbours_together():
 def test_large_bodies_are_numbered_by_place_and_report_in_file_order(monkeypatch):
     ends = []
     for limit in (10**9, 0):
-        monkeypatch.setattr("warpfea.bodies.LARGE", limit)
+        monkeypatch.setattr("warpfea.model.discretisation.LARGE", limit)
         b = bar(1000)
         model = b.finalize(device="cpu")
         sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(tol=1e-11))
@@ -240,7 +240,7 @@ def test_a_small_model_is_inverted_as_a_whole(scene):
     sim = simulation(SCENES[scene]())
     assert sim.stepper.newton.preconditioner.levels[0].dense
     free = sim.model.free_host.ravel() > 0
-    place = sim.stepper.newton.preconditioner.lag.place
+    place = sim.stepper.newton.preconditioner.reuse.place
     sim.stepper.work.u.assign(place)
     H = assembled(sim, projected=True).toarray()[free][:, free]
     B = dense_apply(sim)[free][:, free]
@@ -266,7 +266,7 @@ def test_tiles_and_coarse_space_against_numpy(name, size):
     assert below.dense
     model = sim.model
     free = model.free_host.ravel()
-    sim.stepper.work.u.assign(pre.lag.place)
+    sim.stepper.work.u.assign(pre.reuse.place)
     H = assembled(sim, projected=True)
     # any affine motion of the whole body is one of the coarse space: it moves gradient slots by B E
     P = coarse_functions(sim)
@@ -308,8 +308,8 @@ def test_it_is_symmetric_and_positive_through_all_levels(name, size, options):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_functions_that_depend_on_each_other_are_dropped(dtype):
     """A tile inverse of a singular matrix: positive semi-definite, exact on what is left, and finite."""
-    from warpfea.kernels.levels import LANES, TILE
-    from warpfea.kernels.levels_build import build_kernels
+    from warpfea.kernels.solvers.levels import LANES, TILE
+    from warpfea.kernels.solvers.levels_build import build_kernels
 
     rng = np.random.default_rng(0)
     half = rng.standard_normal((TILE, TILE - 5))
@@ -334,8 +334,8 @@ def test_functions_that_depend_on_each_other_are_dropped(dtype):
 
 
 def test_a_negative_row_gets_its_diagonal():
-    from warpfea.kernels.levels import LANES, TILE
-    from warpfea.kernels.levels_build import build_kernels
+    from warpfea.kernels.solvers.levels import LANES, TILE
+    from warpfea.kernels.solvers.levels_build import build_kernels
 
     A = np.eye(TILE)
     A[3, 3] = -2.0
@@ -511,7 +511,7 @@ def test_an_unknown_preconditioner_lists_those_there_are():
 
 @pytest.mark.parametrize(("links", "kind"), [(10, "two-level"), (40, "deflated")])
 def test_many_small_bodies_on_joints_take_the_deflated_blocks(links, kind):
-    from warpfea.scene import find
+    from warpfea.builder.scene import find
 
     scene = find("chain")
     model = scene.build(scene.resolve({"links": links})).finalize(device="cpu")

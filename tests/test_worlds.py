@@ -92,7 +92,7 @@ def test_a_registered_array_is_known_everywhere(tmp_path):
     assert sizes["backup.dummy"] == 24
     state.dummy.fill_(1.0)
     sim.step()
-    from warpfea.checkpoint import load_checkpoint, save_checkpoint
+    from warpfea.simulation.checkpoint import load_checkpoint, save_checkpoint
 
     save_checkpoint(sim, tmp_path / "c.npz")
     assert np.all(np.load(tmp_path / "c.npz", allow_pickle=False)["state.dummy"] == 1.0)

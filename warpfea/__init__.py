@@ -9,8 +9,6 @@ import importlib.util
 import pathlib
 import sys
 
-__version__ = "0.1.0.dev0"
-
 
 def _map_checkout() -> None:
     """In a source checkout `kernels/` and `scenes/` lie beside this package: bind just these two names."""
@@ -34,13 +32,7 @@ def _map_checkout() -> None:
 _map_checkout()
 
 from . import mesh  # noqa: E402
-from .beams import Rectangle, spline  # noqa: E402
-from .bodies import Body, ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noqa: E402
-from .builder import ModelBuilder  # noqa: E402
-from .checkpoint import Checkpoint  # noqa: E402
-from .constraints import Joint  # noqa: E402
-from .description import Rotation  # noqa: E402
-from .errors import (  # noqa: E402
+from .base.errors import (  # noqa: E402
     CapacityError,
     CheckpointError,
     ConstraintError,
@@ -52,17 +44,26 @@ from .errors import (  # noqa: E402
     OutputError,
     PenetrationError,
 )
-from .joints import GROUND  # noqa: E402
+from .base.version import __version__  # noqa: E402
+from .builder.beams import spline  # noqa: E402
+from .builder.builder import ModelBuilder  # noqa: E402
+from .builder.joints import GROUND  # noqa: E402
+from .builder.scene import scene  # noqa: E402
+from .elements.sections import Rectangle  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
-from .model import Model  # noqa: E402
-from .render import GIFWriter, PNGWriter  # noqa: E402
-from .scene import scene  # noqa: E402
-from .simulation import Simulation, StepReport  # noqa: E402
+from .model.bodies import Body  # noqa: E402
+from .model.description import Rotation  # noqa: E402
+from .model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noqa: E402
+from .model.joints import Joint  # noqa: E402
+from .model.model import Model  # noqa: E402
+from .model.state import State  # noqa: E402
+from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
+from .outputs.usd import USDWriter  # noqa: E402
+from .outputs.vtk import VTUWriter  # noqa: E402
+from .simulation.checkpoint import Checkpoint  # noqa: E402
+from .simulation.simulation import Simulation, StepReport  # noqa: E402
+from .simulation.statics import solve_static  # noqa: E402
 from .solvers import Jacobi, NewtonPCG  # noqa: E402
-from .state import State  # noqa: E402
-from .statics import solve_static  # noqa: E402
-from .usd import USDWriter  # noqa: E402
-from .vtk import VTUWriter  # noqa: E402
 
 __all__ = [
     "GROUND",
@@ -100,6 +101,7 @@ __all__ = [
     "SurfaceSet",
     "USDWriter",
     "VTUWriter",
+    "__version__",
     "mesh",
     "scene",
     "solve_static",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .errors import ModelError
+from .base.errors import ModelError
 
 __all__ = ["TimeLaw", "time_law"]
 

@@ -1,4 +1,4 @@
-"""Constitutive laws and damping as immutable values (DESIGN 4; device side in kernels/materials.py)."""
+"""Constitutive laws and damping as immutable values (DESIGN 4; device side in kernels/elements/materials.py)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .errors import ModelError
+from .base.errors import ModelError
 
 __all__ = ["SVK", "KelvinVoigt", "Material", "MooneyRivlin", "NeoHookean"]
 

@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from ..errors import ConstraintError, ConvergenceError, Error, OutputError
+from ..base.errors import ConstraintError, ConvergenceError, Error, OutputError
 
 __all__ = ["main"]
 

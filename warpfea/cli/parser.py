@@ -8,9 +8,9 @@ import re
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from ..errors import Error
+from ..base.errors import UsageError
 
-__all__ = ["UsageError", "parse"]
+__all__ = ["parse"]
 
 EXAMPLES = """\
 examples:
@@ -76,10 +76,6 @@ LATER = {
     "sweep": "sweeps over parameters on many devices",
 }
 MATERIAL_HINT = "e.g. svk:E=7e8,nu=0.33,density=2700"
-
-
-class UsageError(Error):
-    """The command line is wrong."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -189,7 +185,7 @@ def _join_negative(words: Sequence[str]) -> list[str]:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from ..bench import bench
+    from ..studies.bench.bench import bench
 
     return bench(arguments)
 
@@ -393,7 +389,7 @@ def _add_study(commands: Any) -> None:
 
 
 def _add_profile(commands: Any) -> None:
-    from ..launch import PARTS
+    from ..base.launch import PARTS
 
     parts = "\n".join(f"  {name:14}  {text}" for name, text in PARTS.items())
     to = commands.add_parser(

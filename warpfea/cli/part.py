@@ -13,11 +13,11 @@ from typing import Any
 
 from .. import materials
 from .. import mesh as meshes
-from ..bodies import Body
-from ..builder import ModelBuilder
-from ..errors import Error
-from ..scene import Scene
-from .parser import MATERIAL_HINT, UsageError, numbers
+from ..base.errors import Error, UsageError
+from ..builder.builder import ModelBuilder
+from ..builder.scene import Scene
+from ..model.bodies import Body
+from .parser import MATERIAL_HINT, numbers
 
 __all__ = ["OPTIONS", "SUFFIXES", "parse_material", "part_scene"]
 

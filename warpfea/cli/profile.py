@@ -10,17 +10,16 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..bench import machine
-from ..launch import PARTS
-from ..outputs import write_whole
-from ..profiling import WARM_UP, KernelTime, Profile
-from ..profiling import profile as measure
-from ..simulation import Simulation
+from ..base.console import number, plain, quiet_warp, table, write_json
+from ..base.launch import PARTS
+from ..base.provenance import machine, versions
+from ..base.writer import write_whole
+from ..simulation.simulation import Simulation
+from ..studies.profile.profiling import WARM_UP, KernelTime, Profile
+from ..studies.profile.profiling import profile as measure
 from . import DONE
-from .console import number, quiet_warp, table, write_json
 from .run import check_targets
 from .source import Source, progress, resolve
-from .summary import plain, versions
 
 __all__ = ["KEYS", "SCHEMA", "profile"]
 
@@ -60,7 +59,7 @@ def profile(options: argparse.Namespace) -> int:
     """Do `warpfea profile SCENE`."""
     check_targets(options)
     if options.png:  # before any work
-        from ..study.plots import require_matplotlib
+        from ..studies.ancf_tets.plots import require_matplotlib
 
         require_matplotlib()
     source = resolve(options)
@@ -74,7 +73,7 @@ def profile(options: argparse.Namespace) -> int:
     if options.json:
         write_json(options.json, content)
     if options.png:
-        from ..profile_plot import draw
+        from ..studies.profile.plot import draw
 
         title = f"{source.label}: {content['unknowns']} unknowns, {content['device']}, {content['dtype']}, "
         title += f"{content['step_ms']['median']:.3g} ms per step"

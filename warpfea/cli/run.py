@@ -9,14 +9,13 @@ import time as clock
 from collections.abc import Sequence
 from typing import Any
 
-from ..checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
-from ..checkpoint import Checkpoint, load_checkpoint, read_meta
-from ..errors import ConstraintError, ConvergenceError, OutputError
-from ..outputs import Output, check_folder, check_target
-from ..simulation import Simulation
+from ..base.console import quiet_warp, write_json
+from ..base.errors import ConstraintError, ConvergenceError, OutputError, UsageError
+from ..base.writer import Output, check_folder, check_target
+from ..simulation.checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
+from ..simulation.checkpoint import Checkpoint, load_checkpoint, read_meta
+from ..simulation.simulation import Simulation
 from . import DONE
-from .console import quiet_warp, write_json
-from .parser import UsageError
 from .source import Source, progress, resolve
 from .summary import human, summarize
 
@@ -101,20 +100,20 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
     out: list[Output] = []
     fps = options.fps or source.scene.fps
     if options.usd:
-        from ..usd import USDWriter
+        from ..outputs.usd import USDWriter
 
         out.append(USDWriter(options.usd, fps=fps))
     if options.vtu:
-        from ..vtk import VTUWriter
+        from ..outputs.vtk import VTUWriter
 
         out.append(VTUWriter(options.vtu, fps=fps))
     if options.png:
-        from ..render import PNGWriter
+        from ..outputs.render import PNGWriter
 
         time = source.scene.picture if options.png_time is None else options.png_time
         out.append(PNGWriter(options.png, time=None if time is not None and time > t_end else time))
     if options.gif:
-        from ..render import GIFWriter
+        from ..outputs.render import GIFWriter
 
         out.append(GIFWriter(options.gif, speed=options.speed or source.scene.speed, progress=progress(options)))
     if options.checkpoint:

@@ -7,13 +7,13 @@ import pathlib
 import sys
 from typing import Any
 
-from ..scene import Scene, find, load_file, names
+from ..base.console import number, plain, quiet_warp, size, table, write_json
+from ..base.errors import UsageError
+from ..builder.scene import Scene, find, load_file, names
 from . import DONE
-from .console import number, quiet_warp, size, table, write_json
-from .parser import UsageError
 from .run import check_targets
 from .source import find_scene, progress, resolve
-from .summary import MANY, plain
+from .summary import MANY
 
 __all__ = ["info", "render", "scenes"]
 
@@ -131,7 +131,7 @@ def _joint_rows(joints: list[dict[str, Any]]) -> list[list[str]]:
 
 def render(options: argparse.Namespace) -> int:
     """Do `warpfea render`."""
-    from ..render import render_usd
+    from ..outputs.render import render_usd
 
     suffix = pathlib.Path(options.output).suffix.lower()
     if suffix not in (".png", ".gif"):

@@ -8,13 +8,12 @@ import traceback
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import Error, ModelError
-from ..model import Model
-from ..scene import Scene, find, load_file
-from ..simulation import Simulation
+from ..base.console import compile_bar
+from ..base.errors import Error, ModelError, UsageError
+from ..builder.scene import Scene, find, load_file
+from ..model.model import Model
+from ..simulation.simulation import Simulation
 from ..solvers import SOLVERS
-from .console import compile_bar
-from .parser import UsageError
 from .part import OPTIONS, SUFFIXES, part_scene
 
 __all__ = ["Source", "find_scene", "progress", "resolve"]

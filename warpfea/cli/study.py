@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import shlex
 
-from .console import quiet_warp
-from .parser import UsageError
+from ..base.console import quiet_warp
+from ..base.errors import UsageError
 from .source import progress
 
 __all__ = ["STUDIES", "study"]
@@ -18,9 +18,9 @@ def study(options: argparse.Namespace) -> int:
     """Do `warpfea study STUDY`."""
     from tqdm import tqdm
 
-    from ..study import ancf_tets
-    from ..study.plots import require_matplotlib
-    from ..study.report import prepare
+    from ..studies.ancf_tets import ancf_tets
+    from ..studies.ancf_tets.plots import require_matplotlib
+    from ..studies.ancf_tets.report import prepare
     from . import DONE
 
     if options.what not in STUDIES:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
-import platform
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ..simulation import Simulation
+from ..base.console import number, plain, table
+from ..base.provenance import versions
+from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
-from .console import number, table
 from .source import Source
 
-__all__ = ["KEYS", "SCHEMA", "human", "summarize", "versions"]
+__all__ = ["KEYS", "SCHEMA", "human", "summarize"]
 
 SCHEMA = 1
 KEYS = (
@@ -82,39 +81,6 @@ def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wal
     }
     assert tuple(content) == KEYS
     return {name: plain(value) for name, value in content.items()}
-
-
-def versions() -> dict[str, str]:
-    """Versions of what made the numbers."""
-    import scipy
-    import warp as wp
-
-    from .. import __version__
-
-    return {
-        "warpfea": __version__,
-        "warp": wp.config.version,
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "python": platform.python_version(),
-    }
-
-
-def plain(value: Any) -> Any:
-    """The value as JSON can hold it: lists for arrays and tuples, null for numbers that are not finite."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (bool, int, str)):
-        return value
-    return str(value)
 
 
 def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str:

@@ -1,7 +1,14 @@
 """Element families as tables. Adding one is a file that calls `register`."""
 
 from . import ancf_beam, ancf_shell, ancf_solid, lagrange
-from .family import Family, Part, families, for_cell, get, register
+from .family import (
+    Family,
+    Part,
+    families,
+    for_cell,
+    get,
+    register,
+)
 from .quadrature import TET_RULES, Rule
 
 __all__ = [

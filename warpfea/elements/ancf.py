@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 
 __all__ = ["fold", "monomials", "nodal_basis", "nodal_functions"]
 

@@ -31,14 +31,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from ..materials import SVK, Material
 from .ancf import fold
-from .family import Family, Lattice, Parent, Part, Tying, register
+from .family import (
+    Family,
+    Lattice,
+    Parent,
+    Part,
+    Tying,
+    register,
+)
 from .quadrature import Rule, box_rule, square_rule
 
 if TYPE_CHECKING:
-    from ..beams import Rectangle
+    from .sections import Rectangle
 
 __all__ = ["BEAM", "parent_functions", "svk_only"]
 

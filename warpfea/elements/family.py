@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .quadrature import Rule
 
 __all__ = ["Family", "Lattice", "Parent", "Part", "Tying", "families", "for_cell", "get", "register"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MeshError
+from ..base.errors import MeshError
 from .assemble import RawMesh
 from .cells import CELL_TYPES, Ints, cell_dimension
 

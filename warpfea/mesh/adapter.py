@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MeshError
+from ..base.errors import MeshError
 from . import abaqus
 from .assemble import RawMesh, assemble
 from .cells import FILE_CELLS, cell_dimension

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MeshError
+from ..base.errors import MeshError
 from .cells import ELEMENT_CELLS, Floats
 
 __all__ = ["PointMap", "cell_type_of", "counts", "even", "finite", "mapped", "positive"]

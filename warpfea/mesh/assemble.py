@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MeshError
+from ..base.errors import MeshError
 from .cells import FILE_CELLS, Floats, Ints, cell_dimension, row_keys
 from .checks import check_topology
 from .mesh import Mesh, check_range

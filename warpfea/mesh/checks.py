@@ -6,8 +6,15 @@ import warnings
 
 import numpy as np
 
-from ..errors import MeshError, MeshWarning
-from .cells import CELL_TYPES, CellType, Floats, Ints, det_j0, row_keys
+from ..base.errors import MeshError, MeshWarning
+from .cells import (
+    CELL_TYPES,
+    CellType,
+    Floats,
+    Ints,
+    det_j0,
+    row_keys,
+)
 from .mesh import Mesh
 
 __all__ = ["COINCIDENT", "check", "check_topology", "check_volumes"]

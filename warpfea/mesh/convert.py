@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import MeshError
+from ..base.errors import MeshError
 from .cells import CELL_TYPES, Floats, Ints
 from .checks import check_volumes
 from .mesh import Mesh

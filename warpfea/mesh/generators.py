@@ -13,8 +13,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..errors import MeshError
-from .arguments import PointMap, cell_type_of, counts, even, finite, mapped, positive
+from ..base.errors import MeshError
+from .arguments import (
+    PointMap,
+    cell_type_of,
+    counts,
+    even,
+    finite,
+    mapped,
+    positive,
+)
 from .cells import CELL_TYPES, Floats, Ints
 from .checks import check
 from .mesh import Mesh

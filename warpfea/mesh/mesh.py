@@ -9,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MeshError
-from .cells import CELL_TYPES, CellType, Floats, Ints, element_volumes, row_keys
+from ..base.errors import MeshError
+from .cells import (
+    CELL_TYPES,
+    CellType,
+    Floats,
+    Ints,
+    element_volumes,
+    row_keys,
+)
 
 __all__ = ["Mesh", "Selection", "check_range", "transformation"]
 

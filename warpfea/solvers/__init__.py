@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
 

@@ -13,15 +13,15 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..errors import ModelError
-from ..kernels.blocks import assembly_kernels, block_kernels, coupling_struct
-from ..kernels.element_matrix import panels_of, rows_type
-from ..kernels.structs import pattern_struct
+from ..base.errors import ModelError
+from ..kernels.common.structs import pattern_struct
+from ..kernels.elements.matrix import panels_of, rows_type
+from ..kernels.solvers.blocks import assembly_kernels, block_kernels, coupling_struct
 
 if TYPE_CHECKING:
-    from ..launch import Launcher
-    from ..model import Model
-    from ..workspace import Workspace
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
 
 __all__ = ["Assembled", "Pattern", "coupled_slots", "make_pattern", "shaped"]
 

@@ -6,7 +6,7 @@ with 3x3 blocks); a square plate of 16 x 16 shells (404) 17.4 and 11.5 in vibrat
 bends so fast that factors last for few steps. Wider bands lose more than that.
 
 A band that costs little beside its matrix is factored with every matrix that the operator takes, which leaves one
-iteration of PCG per solve; a wider one is kept by the rule of kernels/lag.py.
+iteration of PCG per solve; a wider one is kept by the rule of kernels/solvers/reuse.py.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..errors import ModelError
-from ..kernels.band import BLOCK, band_kernels, column_type
+from ..base.errors import ModelError
+from ..kernels.solvers.band import BLOCK, band_kernels, column_type
 from .assembled import coupled_slots
 
 if TYPE_CHECKING:
-    from ..launch import Launcher
-    from ..model import Model
-    from ..workspace import Workspace
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
     from .assembled import Pattern
 
 __all__ = ["Band", "BandFactor", "find_band"]

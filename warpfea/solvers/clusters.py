@@ -1,4 +1,4 @@
-"""Clusters of straight elements on the host: the tables of kernels/cluster.py, and who sums what they give."""
+"""Clusters of straight elements on the host: the tables of kernels/elements/cluster.py, and who sums what they give."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from .. import assembly
-from ..kernels.cluster import cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
-from ..kernels.structs import topology_struct
+from ..kernels.common.structs import topology_struct
+from ..kernels.elements.cluster import cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
+from ..model import assembly
 
 if TYPE_CHECKING:
-    from ..model import Model
-    from ..workspace import Workspace
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
 
 __all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_clusters", "make_pool"]
 
 
 @dataclass(eq=False)
 class ClusterTables:
-    """Clusters of elements with connectivity `conn`, see kernels/cluster.py.
+    """Clusters of elements with connectivity `conn`, see kernels/elements/cluster.py.
 
     Slots of a cluster come by falling number of elements, so that threads of a warp sum about as many.
     """
@@ -82,7 +82,7 @@ class ModelClusters:
 
 
 def make_clusters(model: Model) -> ModelClusters:
-    """Those of a model whose blocks are all massive."""
+    """Those of a model whose blocks are all with_mass."""
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
         tables = cluster_tables(block.connectivity, block.cluster)

@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.direct import direct_kernels, followed_struct
-from ..kernels.follower import follower_struct
-from ..launch import labelled
+from ..base.launch import labelled
+from ..kernels.solvers.direct import direct_kernels, followed_struct
+from ..kernels.terms.followers import follower_struct
 from .assembled import Pattern
 from .factor import Singular, make_factors
 
 if TYPE_CHECKING:
-    from ..launch import Launcher
-    from ..loads import FollowerPart
-    from ..model import Model
-    from ..state import State
-    from ..workspace import Workspace
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..model.state import State
+    from ..terms.loads import FollowerPart
+    from ..terms.workspace import Workspace
     from .residual import Residual
 
 __all__ = ["Direct"]
@@ -92,7 +92,7 @@ class Direct:
         """Factorise H of the active worlds."""
         residual = self.residual
         own = self.alone and residual.by_matrix
-        worlds = np.flatnonzero((residual.lag.control.build if own and residual.keep else active).numpy())
+        worlds = np.flatnonzero((residual.reuse.control.build if own and residual.keep else active).numpy())
         if not len(worlds):
             return
         if own:

@@ -12,10 +12,10 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 import warp as wp
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 
 if TYPE_CHECKING:
-    from ..model import Model
+    from ..model.model import Model
 
 __all__ = ["CuDSS", "Factors", "FreeMatrix", "Singular", "SuperLU", "make_factors"]
 

@@ -2,7 +2,7 @@
 
 An iteration is one evaluation of the residual and one application of B, the tile inverses of H of the preconditioner,
 with its coarse space or without: v += p, p from z = B r, r = -g, and from the moves before. B is kept while it serves,
-by the rule of kernels/lag.py. Accelerations:
+by the rule of kernels/solvers/reuse.py. Accelerations:
 
 - "secants": with S the last moves and Y what they did to r, p = S c + 0.7 z, where S c is the Galerkin solution on the
   moves, (S^T Y) c = S^T r, z = B (r - Y c), and p is made conjugate to the moves. That is a block BFGS update of B
@@ -30,17 +30,17 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..errors import ModelError
-from ..kernels.jacobi import PAIRS, jacobi_kernels, jacobi_struct
-from ..launch import labelled
-from .checks import is_count, is_number
+from ..base.checks import is_count, is_number
+from ..base.errors import ModelError
+from ..base.launch import labelled
+from ..kernels.solvers.jacobi import PAIRS, jacobi_kernels, jacobi_struct
 from .newton import NewtonLoop, NewtonPCG
 from .twolevel import TwoLevel
 
 if TYPE_CHECKING:
-    from ..launch import Launcher
-    from ..model import Model
-    from ..workspace import Workspace
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
 
 __all__ = ["Jacobi", "JacobiLoop"]
 

@@ -9,13 +9,13 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..kernels.levels import TILE_SLOTS, level_struct
-from ..partition import bisect, connected_groups
+from ..kernels.solvers.levels import TILE_SLOTS, level_struct
+from ..model.partition import bisect, connected_groups
 from .assembled import Pattern, make_pattern
 from .band import WHOLE_SLOTS, Band
 
 if TYPE_CHECKING:
-    from ..model import Model
+    from ..model.model import Model
 
 __all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
 

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..errors import ModelError
-from ..kernels.newton import newton_kernels
-from .alm import ConstraintSolver
-from .checks import is_count, is_number
+from ..base.checks import is_count, is_number
+from ..base.errors import ModelError
+from ..kernels.solvers.newton import newton_kernels
+from ..terms.multipliers import ConstraintSolver
 from .direct import Direct
 from .pcg import PCG
 from .preconditioner import NAMES, choose, make
 from .residual import Residual
 
 if TYPE_CHECKING:
-    from ..launch import Launcher
-    from ..model import Model
-    from ..state import State
-    from ..workspace import Workspace
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..model.state import State
+    from ..terms.workspace import Workspace
 
 __all__ = ["NewtonLoop", "NewtonPCG"]
 
@@ -256,8 +256,8 @@ class NewtonLoop:
         active = w.newton.active
         self.residual.linearise(active)
         self.pcg.solve(active)
-        self.residual.hold_pushed(active)
-        self.residual.push_curvature(active)
+        self.residual.hold_nonpotential(active)
+        self.residual.follower_curvature(active)
         if self.constraints:
             self.constraints.predict(active)
         launch(k.copy_active, self.dim, [w.v, active, w.base])

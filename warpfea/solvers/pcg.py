@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..kernels.pcg import LANES, pcg_kernels
-from ..launch import Launcher, labelled
+from ..base.launch import Launcher, labelled
+from ..kernels.solvers.pcg import LANES, pcg_kernels
 from .preconditioner import Preconditioner
 from .residual import Residual
 
 if TYPE_CHECKING:
-    from ..model import Model
-    from ..workspace import Workspace
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
 
 __all__ = ["PCG"]
 

@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
-from ..errors import ModelError
-from ..kernels.pcg import pcg_kernels
-from ..launch import labelled
+from ..base.errors import ModelError
+from ..base.launch import labelled
+from ..kernels.solvers.pcg import pcg_kernels
 from .band import WHOLE_SLOTS, find_band
 from .residual import Residual
 from .twolevel import TwoLevel
 
 if TYPE_CHECKING:
-    from ..launch import Launcher
-    from ..model import Model
-    from ..state import State
-    from ..workspace import Workspace
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..model.state import State
+    from ..terms.workspace import Workspace
 
 __all__ = ["NAMES", "BlockJacobi", "Preconditioner", "choose", "make"]
 

@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..kernels.constraints import SUM_ROWS, constraint_struct
-from ..kernels.gather import RESIDUAL_ROWS
-from ..kernels.newton import COMPONENT_ROWS, LANES, newton_kernels
-from ..kernels.reduce import CHUNK, reduce_kernels
-from ..kernels.structs import additions_struct
-from ..launch import labelled
+from ..base.launch import labelled
+from ..kernels.common.reduce import CHUNK, reduce_kernels
+from ..kernels.common.structs import additions_struct
+from ..kernels.solvers.newton import COMPONENT_ROWS, LANES, newton_kernels
+from ..kernels.step.gather import RESIDUAL_ROWS
+from ..kernels.terms.constraints import SUM_ROWS, constraint_struct
 from .assembled import Assembled, shaped
 from .clusters import ModelClusters, make_clusters, make_pool
-from .lag import Lag
+from .reuse import Reuse
 
 if TYPE_CHECKING:
-    from ..launch import Launcher
-    from ..model import Model
-    from ..state import State
-    from ..workspace import Workspace
-    from .alm import ConstraintSolver
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..model.state import State
+    from ..terms.multipliers import ConstraintSolver
+    from ..terms.workspace import Workspace
 
 __all__ = ["Reducer", "Residual"]
 
@@ -82,7 +82,7 @@ class Residual:
         self.con = model.constraints.data if model.constraints else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
-        self.massive = all(block.massive for block in model.blocks)
+        self.with_mass = all(block.with_mass for block in model.blocks)
         # elements with many points per slot cost more than the matrix that they make. On the CPU it is taken wherever
         # the preconditioner wants one anyway: a core assembles H in the time of 2 to 7 products of ANCF elements, and
         # of 15 of straight tetrahedra
@@ -91,13 +91,13 @@ class Residual:
             cheaper = assembled
         self.by_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
         self.clusters: ModelClusters | None = None
-        if self.massive and not self.by_matrix:
+        if self.with_mass and not self.by_matrix:
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
             self.pool = make_pool(model, work)
             forms = [block.key.damping if viscous else None for block in model.blocks]
-            self.products = [block.massive_product(model.dtype, form) for block, form in zip(model.blocks, forms)]
+            self.products = [block.with_mass_product(model.dtype, form) for block, form in zip(model.blocks, forms)]
         self.keep, self.lasting = 0, False
         self.on_matrix: Callable[[wp.array, wp.array], None] | None = None
         self.assembled: Assembled | None = None
@@ -116,14 +116,14 @@ class Residual:
                 self.keep = 0
             self.lasting = self.keep == 2
             if self.keep:
-                self.lag = Lag(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
+                self.reuse = Reuse(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
 
     def _additions(self) -> Any:
         """What products need besides the elements' part."""
         m, w = self.model, self.work
         out = additions_struct(m.dtype)()
-        of = m.loads.pushed_topology if m.loads.followers else m.topology
-        out.start, out.entry, out.contribution = of.start, of.entry, w.pushed_tangent
+        of = m.loads.nonpotential_topology if m.loads.followers else m.topology
+        out.start, out.entry, out.contribution = of.start, of.entry, w.nonpotential_tangent
         out.mass_factor, out.dq_dv, out.warp = w.step.mass_factor, w.step.dq_dv, w.warp
         return out
 
@@ -133,7 +133,7 @@ class Residual:
         if self.by_matrix:
             assert self.assembled is not None
             out |= {self.gather.matrix_module} | self.assembled.modules()
-            out |= {self.lag.kernels.module} if self.keep else set()
+            out |= {self.reuse.kernels.module} if self.keep else set()
         elif self.clusters:
             out |= {kernel.module for kernel in self.products}
         return out
@@ -141,20 +141,20 @@ class Residual:
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know of the operator's matrix."""
         if self.lasting:
-            self.lag.register(state)
+            self.reuse.register(state)
 
     def forget(self, flags: wp.array) -> None:
         """The state of flagged worlds was set from elsewhere."""
         if self.lasting:
-            self.lag.forget(flags)
+            self.reuse.forget(flags)
 
     def commit(self, accepted: wp.array) -> None:
         """The step was accepted: tell the state."""
         if self.lasting:
-            args = [self.lag.control, self.work.newton, accepted]
-            self.launch(self.lag.kernels.count_step, self.model.worlds, args)
-            self.lag.carry(accepted)
-            self.lag.commit(accepted)
+            args = [self.reuse.control, self.work.newton, accepted]
+            self.launch(self.reuse.kernels.count_step, self.model.worlds, args)
+            self.reuse.carry(accepted)
+            self.reuse.commit(accepted)
 
     @labelled("assembly")
     def linearise(self, active: wp.array) -> None:
@@ -164,23 +164,23 @@ class Residual:
         if self.keep == 0:
             self.take(active)
             return
-        control = self.lag.control
+        control = self.reuse.control
         args = [control, self.work.newton, self.keep]
-        self.launch(self.lag.kernels.judge_matrix, self.model.worlds, args)
-        self.lag.decide(active)
-        self.launch(self.lag.kernels.loosen, self.model.worlds, [control, self.work.newton])
+        self.launch(self.reuse.kernels.judge_matrix, self.model.worlds, args)
+        self.reuse.decide(active)
+        self.launch(self.reuse.kernels.loosen, self.model.worlds, [control, self.work.newton])
         wp.capture_if(control.any_build, self._assemble)
 
     @labelled("assembly")
     def _assemble(self) -> None:
         assert self.assembled is not None
-        control = self.lag.control
-        self.lag.carry()
+        control = self.reuse.control
+        self.reuse.carry()
         factors = (control.mass_factor, control.dq_dv)
-        self.assembled.assemble(self.lag.place, factors, control.build, self.matrix, projected=False)
+        self.assembled.assemble(self.reuse.place, factors, control.build, self.matrix, projected=False)
         if self.on_matrix:
             self.on_matrix(self.matrix, control.build)
-        self.lag.made()
+        self.reuse.made()
 
     def take(self, active: wp.array) -> None:
         """Set the operator to the iterate, whatever the matrix's rule says."""
@@ -203,9 +203,9 @@ class Residual:
             args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, lanes, w.contribution, w.energy_rows]
             dim = (m.worlds, launch.padded(block.count * lanes))
             launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
-        self.push(active)
+        self.nonpotential(active)
         if hold:
-            self.hold_pushed(active)
+            self.hold_nonpotential(active)
         if self.constraints:
             self.constraints.evaluate(active)
             self.reduce(w.multipliers.rows, SUM_ROWS, active, w.newton.constraint_sums)
@@ -219,26 +219,30 @@ class Residual:
             sums = (COMPONENT_ROWS, m.worlds, m.component_count)
             launch(self.newton.component_sum, sums, [w.component_partial, active, w.newton.component_sums])
 
-    def push(self, active: wp.array) -> None:
+    def nonpotential(self, active: wp.array) -> None:
         """Forces without a potential at the iterate: fields b(r, t) and follower pressure."""
         m, w, launch = self.model, self.work, self.launch
         loads = m.loads
         if not loads.nonpotential:
             return
         for part in loads.followers:
-            args = [part.data, w.u, w.law_value, active, w.pushed_contribution]
+            args = [part.data, w.u, w.law_value, active, w.nonpotential_contribution]
             launch(part.force, (m.worlds, part.count), args)
         for field in loads.fields:
             args = [field.block.data, field.members, m.reference_device, field.origin, w.u, w.step.new_time]
-            args += [w.step.ramp, active, field.offset, w.pushed_contribution]
+            args += [w.step.ramp, active, field.offset, w.nonpotential_contribution]
             launch(field.kernel, (m.worlds, field.count), args)
-        launch(self.gather.gather_force, self.dim, [loads.pushed_topology, w.pushed_contribution, active, w.pushed])
+        launch(
+            self.gather.gather_force,
+            self.dim,
+            [loads.nonpotential_topology, w.nonpotential_contribution, active, w.nonpotential],
+        )
 
     @labelled("loads")
-    def hold_pushed(self, active: wp.array) -> None:
+    def hold_nonpotential(self, active: wp.array) -> None:
         """From here on Phi holds the non-potential forces of this iterate."""
         if self.model.loads.nonpotential:
-            args = [self.work.pushed, active, self.work.pushed_held]
+            args = [self.work.nonpotential, active, self.work.nonpotential_held]
             self.launch(self.newton.copy_active, self.dim, args)
 
     @labelled("build")
@@ -266,7 +270,7 @@ class Residual:
                 args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
                 launch(kernels.tangent_product, (m.worlds, block.count), args)
         if m.loads.followers:
-            self._push_product(p, active)
+            self._follower_product(p, active)
         if self.constraints:
             self.constraints.product(p, active)
         rest = [self.additions, p, active, self.con, w.multipliers]
@@ -281,25 +285,25 @@ class Residual:
         else:
             self.curvature_rows = w.warp_rows
             topology = self.clusters.topology if self.clusters else m.topology
-            total = self.gather.massive_sum if self.clusters else self.gather.product
+            total = self.gather.with_mass_sum if self.clusters else self.gather.product
             args = [topology, w.contribution, *rest, out, w.warp_rows]
             launch(total, (m.worlds, launch.padded(m.slots)), args)
 
-    def _push_product(self, p: wp.array, active: wp.array) -> None:
+    def _follower_product(self, p: wp.array, active: wp.array) -> None:
         """Contributions of the follower loads' symmetric tangent times p."""
         m, w, launch = self.model, self.work, self.launch
         for part in m.loads.followers:
-            args = [part.data, w.u, w.law_value, active, p, w.pushed_tangent]
+            args = [part.data, w.u, w.law_value, active, p, w.nonpotential_tangent]
             launch(part.product, (m.worlds, part.count), args)
 
     @labelled("loads")
-    def push_curvature(self, active: wp.array) -> None:
+    def follower_curvature(self, active: wp.array) -> None:
         """p.K p of the follower loads along the direction p, into the Newton control."""
         m, w, launch = self.model, self.work, self.launch
         if not m.loads.followers:
             return
-        self._push_product(w.direction, active)
-        args = [m.loads.pushed_topology, w.pushed_tangent, active, w.Hp]
+        self._follower_product(w.direction, active)
+        args = [m.loads.nonpotential_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather.gather_force, self.dim, args)
         launch(self.newton.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
-        self.reduce(w.rows, 1, active, w.newton.push_sum)
+        self.reduce(w.rows, 1, active, w.newton.follower_sum)

@@ -27,21 +27,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.blocks import block_kernels
-from ..kernels.levels import LANES, TILE, TILE_SLOTS, level_kernels, level_struct
-from ..kernels.levels_build import build_kernels
-from ..kernels.pcg import pcg_kernels
-from ..kernels.types import precision
-from ..launch import labelled
+from ..base.launch import labelled
+from ..kernels.common.types import precision
+from ..kernels.solvers.blocks import block_kernels
+from ..kernels.solvers.levels import LANES, TILE, TILE_SLOTS, level_kernels, level_struct
+from ..kernels.solvers.levels_build import build_kernels
+from ..kernels.solvers.pcg import pcg_kernels
 from .band import BandFactor, find_band
-from .lag import Lag
 from .levels import GROUP_SLOTS, Level, make_levels
+from .reuse import Reuse
 
 if TYPE_CHECKING:
-    from ..launch import Launcher
-    from ..model import Model
-    from ..state import State
-    from ..workspace import Workspace
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..model.state import State
+    from ..terms.workspace import Workspace
     from .residual import Residual
 
 __all__ = ["TwoLevel"]
@@ -93,7 +93,7 @@ class LevelArrays:
 
 
 class TwoLevel:
-    """See the module; it is made anew when the rule of kernels/lag.py says so."""
+    """See the module; it is made anew when the rule of kernels/solvers/reuse.py says so."""
 
     def __init__(
         self,
@@ -131,7 +131,7 @@ class TwoLevel:
         self.rebuild_cost = band.rebuild_cost if band is not None and not self.follows else REBUILD_COST
         # another name: iterations with factors and with levels have nothing to do with each other
         name = "preconditioner" if band is None else "preconditioner_banded"
-        self.lag = Lag(model, work, launch, name, self.rebuild_cost)
+        self.reuse = Reuse(model, work, launch, name, self.rebuild_cost)
         most = max([level.slots for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
@@ -148,8 +148,8 @@ class TwoLevel:
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
         m = self.model
-        self.lag.control.limit = self.rebuild_cost
-        self.lag.register(state)
+        self.reuse.control.limit = self.rebuild_cost
+        self.reuse.register(state)
         if m.constraints:
             rows = m.constraints.count
             self.place_rows = (
@@ -162,19 +162,19 @@ class TwoLevel:
             )
 
     def _carry(self, accepted: wp.array | None = None) -> None:
-        m, lag = self.model, self.lag
-        lag.carry(accepted)
+        m, reuse = self.model, self.reuse
+        reuse.carry(accepted)
         if m.constraints:
             mul = self.work.multipliers
-            args = [lag.control, lag.none if accepted is None else accepted, mul.gradient, mul.stiffness]
+            args = [reuse.control, reuse.none if accepted is None else accepted, mul.gradient, mul.stiffness]
             self.launch(
-                lag.kernels.carry_rows, (m.worlds, m.constraints.count), [*args, *self.kept_rows, *self.place_rows]
+                reuse.kernels.carry_rows, (m.worlds, m.constraints.count), [*args, *self.kept_rows, *self.place_rows]
             )
 
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
         k = self.kernels
-        out = {k.module, self.lag.kernels.module, self.blocks.module} | self.assembled.modules()
+        out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules()
         return out | {self.band.kernels.module if self.band else self.making.module}
 
     # the seam
@@ -185,30 +185,30 @@ class TwoLevel:
     @labelled("build")
     def forget(self, flags: wp.array) -> None:
         """The state of flagged worlds was set from elsewhere."""
-        self.lag.forget(flags)
+        self.reuse.forget(flags)
 
     def commit(self, accepted: wp.array) -> None:
         """The step was accepted: tell the state."""
         self._carry(accepted)
-        self.lag.commit(accepted)
+        self.reuse.commit(accepted)
 
     @labelled("build")
     def start(self, active: wp.array) -> None:
         """Make it anew where it is due, and D with it; penalties follow from D here."""
-        self.lag.decide(active)
-        wp.capture_if(self.lag.control.any_build, self._build_first)
+        self.reuse.decide(active)
+        wp.capture_if(self.reuse.control.any_build, self._build_first)
 
     @labelled("build")
     def prepare(self, active: wp.array) -> None:
         """Make it anew where it is due. The penalties of constraints stay those of the step."""
-        self.lag.decide(active)
-        wp.capture_if(self.lag.control.any_build, self._build)
+        self.reuse.decide(active)
+        wp.capture_if(self.reuse.control.any_build, self._build)
 
     @labelled("build")
     def judge(self, active: wp.array) -> None:
         """Count what the solve cost."""
-        args = [self.lag.control, self.work.newton, self.work.pcg, int(self.follows)]
-        self.launch(self.lag.kernels.judge, self.model.worlds, args)
+        args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.follows)]
+        self.launch(self.reuse.kernels.judge, self.model.worlds, args)
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
@@ -291,11 +291,11 @@ class TwoLevel:
         self._build(penalty=True)
 
     def _build(self, *, penalty: bool = False) -> None:
-        m, w, launch, lag = self.model, self.work, self.launch, self.lag.control
-        flags, factors = lag.build, (lag.mass_factor, lag.dq_dv)
+        m, w, launch, reuse = self.model, self.work, self.launch, self.reuse.control
+        flags, factors = reuse.build, (reuse.mass_factor, reuse.dq_dv)
         # the rows follow once the penalties are known
-        self.lag.carry()
-        self.assembled.assemble(self.lag.place, factors, flags, self.value, projected=True)
+        self.reuse.carry()
+        self.assembled.assemble(self.reuse.place, factors, flags, self.value, projected=True)
         args = [m.topology, self.assembled.pattern.data, self.value, flags, w.diagonal, w.inverse]
         launch(self.blocks.take_diagonal, self.dim, args)
         if m.constraints:
@@ -304,8 +304,8 @@ class TwoLevel:
             if penalty:
                 constraints.build(flags, penalty=True)
             self._carry()
-            self.assembled.add_constraints(*self.place_rows, lag.dq_dv, flags, self.value)
-        self.lag.made()
+            self.assembled.add_constraints(*self.place_rows, reuse.dq_dv, flags, self.value)
+        self.reuse.made()
         if self.band:
             if not self.follows:
                 self._factor(self.value, flags)

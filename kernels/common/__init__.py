@@ -1,0 +1,1 @@
+"""What kernels share: types, structs, lanes, sums."""

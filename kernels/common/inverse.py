@@ -1,0 +1,46 @@
+"""Inverses of 3x3 diagonal blocks."""
+
+import functools
+
+import warp as wp
+
+from .types import precision
+
+__all__ = ["inverse_function"]
+
+
+@functools.cache
+def inverse_function(dtype: str):
+    """Inverse of a diagonal block on its free components; where it is not safely positive, of its diagonal."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+
+    @wp.func
+    def positive_inverse(A: mat33, least: T) -> mat33:
+        d1 = A[0, 0]
+        d2 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+        d3 = wp.determinant(A)
+        tol = T(1.0e-6)
+        size = wp.trace(A)
+        if d1 > tol * size and d2 > tol * size * size and d3 > tol * size * size * size * T(0.01):
+            return wp.inverse(A)
+        B = mat33()
+        for k in range(3):
+            B[k, k] = T(1.0) / wp.max(wp.abs(A[k, k]), wp.max(least, tol * wp.abs(size)))
+        return B
+
+    @wp.func
+    def free_inverse(A: mat33, least: T, free: vec3) -> mat33:
+        M = A
+        for i in range(3):
+            for j in range(3):
+                M[i, j] = A[i, j] * free[i] * free[j]
+            if free[i] == T(0.0):
+                M[i, i] = wp.max(wp.abs(A[i, i]), T(1.0e-30))
+        B = positive_inverse(M, least)
+        for i in range(3):
+            for j in range(3):
+                B[i, j] = B[i, j] * free[i] * free[j]
+        return B
+
+    return free_inverse

@@ -1,0 +1,1 @@
+"""Elements and materials on the device."""

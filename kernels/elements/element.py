@@ -1,0 +1,186 @@
+"""Element kernels: internal force Eq. (32), energy, tangent product and diagonal blocks, for any table element.
+
+One thread does one element of one world, with the functions of points.py.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.lanes import lane_functions
+from ..common.types import kernel_module
+from . import materials
+from .matrix import matrix_kernels
+from .output import output_kernels
+from .points import point_functions
+
+__all__ = ["element_kernels"]
+
+
+@functools.cache
+def element_kernels(
+    dtype: str,
+    law: str,
+    slots: int,
+    points: int,
+    affine: bool,
+    damping: str | None,
+    framed: bool = False,
+) -> _types.SimpleNamespace:
+    """Kernels of one kind of element block.
+
+    Args:
+        dtype: precision.
+        law: name in `materials.LAWS`.
+        slots, points: slots and quadrature points per element.
+        affine: parent gradients and one J0 per element, or a table of h.
+        damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
+        framed: the law has axes of its own at each point.
+    """
+    fn = point_functions(dtype, law, slots, affine, damping, framed)
+    T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
+    t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
+    NS, needs_J = fn.slots, fn.needs_J
+    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
+    viscous = materials.svk(dtype)
+    lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
+    form = "affine" if affine else "framed" if framed else "table"
+    name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
+    module = kernel_module(name)
+
+    @wp.kernel(module=module)
+    def internal_force(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        lanes: int,
+        contribution: wp.array2d(dtype=vec3),
+        energy: wp.array3d(dtype=wp.float64),
+        min_J: wp.array(dtype=wp.float64),
+        domain_J: wp.array(dtype=wp.float64),
+    ):
+        """Internal force contributions, Eqs. (32) and (70), strain energy and viscous potential of each element.
+
+        So many lanes share the points of an element.
+        """
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        lane = index % lanes
+        elem = wp.min(index / lanes, block.count - 1)
+        c = fn.coefficients(block, world, elem)
+        U = fn.load(block, u, world, elem)
+        f = Local()
+        psi = T(0.0)
+        psi_v = T(0.0)
+        J_low = T(1.0e30)
+        if wp.static(needs_J):
+            J_low = fn.vertex_jacobian(block, U, elem)
+        V = Local()
+        if wp.static(damping == "rate"):
+            V = fn.load(block, v, world, elem)
+        dq = T(dq_dv[world])
+        for q in range(lane, block.gradient.shape[0], lanes):
+            G = fn.gradient_of(block, U, q, elem)
+            w = fn.weight_of(block, q, elem)
+            J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
+            local = fn.into_axes(block, G, q, elem)
+            P = m.stress(local, c)
+            psi += w * m.energy(local, c)
+            if wp.static(damping == "incremental" or damping == "rate"):
+                Fdot = fn.velocity_gradient(block, V, q, elem)
+                rate = fn.strain_rate(block, local, Fdot, history, dq, world, q, elem)
+                S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
+                P = P + S + local * S
+                psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
+            f = fn.scatter(block, f, fn.out_of_axes(block, P, q, elem), q, elem)
+        for i in range(NS):
+            f[i] = lane_sum(f[i], lanes)
+        stored = row_sum(wp.float64(psi), lanes)
+        lost = row_sum(wp.float64(psi_v), lanes)
+        low = wp.float64(J_low)
+        if low < min_J[world]:
+            wp.atomic_min(min_J, world, low)
+        if wp.static(needs_J):
+            if low < domain_J[world]:
+                wp.atomic_min(domain_J, world, low)
+        if lane == 0 and index < block.count * lanes:
+            for i in range(NS):
+                contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+            energy[0, world, block.element_offset + elem] = stored
+            energy[1, world, block.element_offset + elem] = lost
+
+    @wp.kernel(module=module)
+    def tangent_product(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """K p, with K = df_int/dq at u (of the rate form only its symmetric part)."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = fn.load(block, u, world, elem)
+        dU = fn.load(block, direction, world, elem)
+        V = Local()
+        if wp.static(damping == "rate"):
+            V = fn.load(block, v, world, elem)
+        f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), world, elem)
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+
+    @wp.kernel(module=module)
+    def diagonal_blocks(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=sym6),
+    ):
+        """The 3x3 diagonal blocks of K, made positive at each point, in Voigt order."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        c = fn.coefficients(block, world, elem)
+        cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
+        U = fn.load(block, u, world, elem)
+        for i in range(NS):
+            B = sym6()
+            contribution[world, block.contribution_offset + i * block.count + elem] = B
+        for q in range(block.gradient.shape[0]):
+            G = fn.gradient_of(block, U, q, elem)
+            w = fn.weight_of(block, q, elem)
+            for i in range(NS):
+                a = vec3()
+                if wp.static(affine):
+                    a = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[q, i, 0]
+                else:
+                    a = block.gradient[q, i, elem]
+                K = mat33()
+                if wp.static(framed):
+                    R = block.frame[q, elem]
+                    K = fn.out_of_axes(block, m.block(fn.into_axes(block, G, q, elem), wp.transpose(R) * a, c), q, elem)
+                else:
+                    K = m.block(G, a, c)
+                if wp.static(damping == "incremental" or damping == "rate"):
+                    K = K + viscous.block(mat33() + G, a, cv)
+                entry = block.contribution_offset + i * block.count + elem
+                contribution[world, entry] = contribution[world, entry] + w * fn.pack(K)
+
+    return _types.SimpleNamespace(
+        module=module,
+        internal_force=internal_force,
+        tangent_product=tangent_product,
+        diagonal_blocks=diagonal_blocks,
+        **vars(matrix_kernels(dtype, law, slots, affine, damping, framed)),
+        **vars(output_kernels(fn, name, points)),
+    )

@@ -1,0 +1,323 @@
+"""Constitutive laws on the device: energy, first Piola-Kirchhoff stress and its increment per point.
+
+Every law is a function of the displacement gradient G = F - I, not of F: strains are then formed without
+subtracting nearly equal numbers, which float32 needs. A law is four functions
+
+    energy(G, c)            Psi (J/m^3)
+    stress(G, c)            P = dPsi/dF (Pa)
+    increment(G, dG, c)     dP = d2Psi/dF2 : dF (Pa)
+    block(G, a, c)          symmetric 3x3 matrix B with d.B d = d2Psi along the rank-one dF = d a^T, projected to be
+                            positive semi-definite where the exact one need not be (for preconditioners)
+
+of the law's coefficients c. Laws whose S is linear in E have two more, stiffness(E, c), that linear function, and
+moduli(c), its numbers: (D11, D22, D33, D23, D13, D12, G23, G13, G12) with S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
+Kelvin-Voigt damping adds to any of them and is made of the same St. Venant-Kirchhoff form.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import precision
+
+__all__ = ["LAWS", "law"]
+
+NCOEF = 11
+"""Coefficients per material: up to nine of the law, then eta and lambda_v of Kelvin-Voigt damping."""
+ETA = NCOEF - 2
+LAMBDA_V = NCOEF - 1
+
+
+@functools.cache
+def tensors(dtype: str) -> _types.SimpleNamespace:
+    """Small tensor functions shared by the laws."""
+    p = precision(dtype)
+    T, mat33, vec3 = p.T, p.mat33, p.vec3
+    moduli9 = wp.types.vector(length=9, dtype=T)
+
+    @wp.func
+    def identity() -> mat33:
+        return wp.identity(n=3, dtype=T)
+
+    @wp.func
+    def green(G: mat33) -> mat33:
+        """Green-Lagrange strain E = (G + G^T + G^T G)/2."""
+        Gt = wp.transpose(G)
+        return T(0.5) * (G + Gt + Gt * G)
+
+    @wp.func
+    def sym(A: mat33) -> mat33:
+        return T(0.5) * (A + wp.transpose(A))
+
+    @wp.func
+    def volume_change(G: mat33) -> T:
+        """J - 1 = tr G + (tr^2 G - tr G^2)/2 + det G, without cancellation."""
+        tr = wp.trace(G)
+        return tr + T(0.5) * (tr * tr - wp.trace(G * G)) + wp.determinant(G)
+
+    @wp.func
+    def isotropic(E: mat33, lam: T, mu: T) -> mat33:
+        """lambda tr(E) I + 2 mu E."""
+        return lam * wp.trace(E) * identity() + T(2.0) * mu * E
+
+    @wp.func
+    def isotropic_moduli(lam: T, mu: T) -> moduli9:
+        """The numbers of `isotropic`, see `moduli` of laws."""
+        d = lam + T(2.0) * mu
+        return moduli9(d, d, d, lam, lam, lam, mu, mu, mu)
+
+    return _types.SimpleNamespace(
+        identity=identity, green=green, sym=sym, volume_change=volume_change, isotropic=isotropic,
+        isotropic_moduli=isotropic_moduli, moduli9=moduli9, vec3=vec3,
+    )  # fmt: skip
+
+
+@functools.cache
+def svk(dtype: str) -> _types.SimpleNamespace:
+    """St. Venant-Kirchhoff, Eqs. (25)-(28); c = (lambda, mu)."""
+    p, t = precision(dtype), tensors(dtype)
+    T, mat33, vec3 = p.T, p.mat33, p.vec3
+    moduli9 = t.moduli9
+    coef = wp.types.vector(length=NCOEF, dtype=T)
+
+    @wp.func
+    def stiffness(E: mat33, c: coef) -> mat33:
+        return t.isotropic(E, c[0], c[1])
+
+    @wp.func
+    def moduli(c: coef) -> moduli9:
+        return t.isotropic_moduli(c[0], c[1])
+
+    @wp.func
+    def energy(G: mat33, c: coef) -> T:
+        E = t.green(G)
+        tr = wp.trace(E)
+        return T(0.5) * c[0] * tr * tr + c[1] * wp.ddot(E, E)
+
+    @wp.func
+    def stress(G: mat33, c: coef) -> mat33:
+        S = t.isotropic(t.green(G), c[0], c[1])
+        return S + G * S
+
+    @wp.func
+    def increment(G: mat33, dG: mat33, c: coef) -> mat33:
+        F = t.identity() + G
+        S = t.isotropic(t.green(G), c[0], c[1])
+        dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[0], c[1])
+        return dG * S + F * dS
+
+    @wp.func
+    def block(G: mat33, a: vec3, c: coef) -> mat33:
+        F = t.identity() + G
+        Fa = F * a
+        S = t.isotropic(t.green(G), c[0], c[1])
+        geometric = wp.max(T(0.0), wp.dot(a, S * a))
+        return (c[0] + c[1]) * wp.outer(Fa, Fa) + c[1] * wp.dot(a, a) * (F * wp.transpose(F)) + geometric * t.identity()
+
+    return _types.SimpleNamespace(
+        energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness, moduli=moduli
+    )
+
+
+@functools.cache
+def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNamespace:
+    """Mooney-Rivlin, Eqs. (36)-(52), or with `second_invariant=False` neo-Hookean; c = (mu10, k, mu01).
+
+    Written with the Kirchhoff stress, P = tau F^-T. With b = (F F^T - I)/2 and t = tr b,
+    tau = 2 mu10 J^-2/3 dev(2 b) + 2 mu01 J^-4/3 dev((2 + 4 t) b - 4 b^2) + k (J - 1) J I,
+    where no term is a difference of nearly equal ones at small strain.
+    """
+    p, t = precision(dtype), tensors(dtype)
+    T, mat33, vec3 = p.T, p.mat33, p.vec3
+    coef = wp.types.vector(length=NCOEF, dtype=T)
+    # captured in the precision itself: an expression of literals would be float32
+    third = T(1.0 / 3.0)
+    two_thirds = T(2.0 / 3.0)
+    four_thirds = T(4.0 / 3.0)
+    eight_thirds = T(8.0 / 3.0)
+    ten_ninths = T(10.0 / 9.0)
+    rank_one_2 = T(28.0 / 9.0)
+
+    @wp.func
+    def dev(A: mat33) -> mat33:
+        return A - third * wp.trace(A) * t.identity()
+
+    @wp.func
+    def power_change(j1: T) -> T:
+        """J^(-2/3) - 1 from J - 1, to relative accuracy: one Newton step on (1+d)^3 (1+j)^2 = 1."""
+        J = T(1.0) + j1
+        d = wp.pow(J, -two_thirds) - T(1.0)
+        e = T(1.0) + d
+        f = d * (T(3.0) + d * (T(3.0) + d)) + j1 * (T(2.0) + j1) * e * e * e
+        return d - f / (T(3.0) * e * e * J * J)
+
+    @wp.func
+    def half_left_strain(G: mat33) -> mat33:
+        Gt = wp.transpose(G)
+        return T(0.5) * (G + Gt + G * Gt)
+
+    @wp.func
+    def kirchhoff(G: mat33, c: coef) -> mat33:
+        b = half_left_strain(G)
+        j1 = t.volume_change(G)
+        J = T(1.0) + j1
+        Jm = wp.pow(J, -two_thirds)
+        tau = c[1] * j1 * J * t.identity() + T(4.0) * c[0] * Jm * dev(b)
+        if wp.static(second_invariant):
+            tr = wp.trace(b)
+            tau = tau + T(2.0) * c[2] * Jm * Jm * dev((T(2.0) + T(4.0) * tr) * b - T(4.0) * (b * b))
+        return tau
+
+    @wp.func
+    def energy(G: mat33, c: coef) -> T:
+        # A = J^(-2/3) C - I has det(I + A) = 1, which gives its first invariant x = I1bar - 3 from terms of second
+        # order, without subtracting equal numbers; and then I2bar - 3 = x - det A
+        j1 = t.volume_change(G)
+        d = power_change(j1)
+        A = T(2.0) * (T(1.0) + d) * t.green(G) + d * t.identity()
+        q = T(0.5) * wp.ddot(A, A) - wp.determinant(A)
+        x = T(2.0) * q / (T(1.0) + wp.sqrt(wp.max(T(0.0), T(1.0) + T(2.0) * q)))
+        psi = T(0.5) * c[1] * j1 * j1 + c[0] * x
+        if wp.static(second_invariant):
+            psi = psi + c[2] * (x - wp.determinant(A))
+        return psi
+
+    @wp.func
+    def stress(G: mat33, c: coef) -> mat33:
+        F = t.identity() + G
+        return kirchhoff(G, c) * wp.transpose(wp.inverse(F))
+
+    @wp.func
+    def increment(G: mat33, dG: mat33, c: coef) -> mat33:
+        F = t.identity() + G
+        Fi = wp.inverse(F)
+        b = half_left_strain(G)
+        j1 = t.volume_change(G)
+        J = T(1.0) + j1
+        L = dG * Fi
+        trL = wp.trace(L)
+        db = t.sym(dG * wp.transpose(F))
+        Jm = wp.pow(J, -two_thirds)
+        c1 = T(4.0) * c[0] * Jm
+        tau = c[1] * j1 * J * t.identity() + c1 * dev(b)
+        dtau = c[1] * (T(2.0) * J - T(1.0)) * J * trL * t.identity() + c1 * (dev(db) - two_thirds * trL * dev(b))
+        if wp.static(second_invariant):
+            c2 = T(2.0) * c[2] * Jm * Jm
+            s = T(2.0) + T(4.0) * wp.trace(b)
+            A = dev(s * b - T(4.0) * (b * b))
+            dA = dev(T(4.0) * wp.trace(db) * b + s * db - T(4.0) * (db * b + b * db))
+            tau = tau + c2 * A
+            dtau = dtau + c2 * (dA - four_thirds * trL * A)
+        return (dtau - tau * wp.transpose(L)) * wp.transpose(Fi)
+
+    @wp.func
+    def block(G: mat33, a: vec3, c: coef) -> mat33:
+        # det and cof are affine along a rank-one change, so the second derivative is short
+        F = t.identity() + G
+        B = F * wp.transpose(F)
+        J = wp.determinant(F)
+        f = wp.transpose(wp.inverse(F)) * a
+        Fa = F * a
+        aa = wp.dot(a, a)
+        I1 = wp.trace(B)
+        Jm = wp.pow(wp.abs(J), -two_thirds)
+        H = (
+            c[1] * J * J * wp.outer(f, f)
+            + T(2.0) * c[0] * Jm * aa * t.identity()
+            + c[0] * Jm * ten_ninths * I1 * wp.outer(f, f)
+            - c[0] * Jm * four_thirds * (wp.outer(Fa, f) + wp.outer(f, Fa))
+        )
+        if wp.static(second_invariant):
+            I2 = T(0.5) * (I1 * I1 - wp.ddot(B, B))
+            Q = wp.outer(Fa, Fa) + (I1 * aa - wp.dot(Fa, Fa)) * t.identity() - aa * B
+            d = I1 * Fa - B * Fa
+            H = H + c[2] * Jm * Jm * (
+                T(2.0) * Q - eight_thirds * (wp.outer(d, f) + wp.outer(f, d)) + rank_one_2 * I2 * wp.outer(f, f)
+            )
+        return H
+
+    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block)
+
+
+@functools.cache
+def neo_hookean(dtype: str) -> _types.SimpleNamespace:
+    """Neo-Hookean: Mooney-Rivlin without the second invariant; c = (mu/2, k)."""
+    return mooney_rivlin(dtype, second_invariant=False)
+
+
+@functools.cache
+def orthotropic(dtype: str) -> _types.SimpleNamespace:
+    """Psi = E : D : E / 2 with D orthotropic in the axes of G; parts of the SVK law that an element integrates apart.
+
+    c = (D11, D22, D33, D23, D13, D12, G23, G13, G12): S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
+    """
+    p, t = precision(dtype), tensors(dtype)
+    T, mat33, vec3 = p.T, p.mat33, p.vec3
+    moduli9 = t.moduli9
+    coef = wp.types.vector(length=NCOEF, dtype=T)
+
+    @wp.func
+    def stiffness(E: mat33, c: coef) -> mat33:
+        s1 = c[0] * E[0, 0] + c[5] * E[1, 1] + c[4] * E[2, 2]
+        s2 = c[5] * E[0, 0] + c[1] * E[1, 1] + c[3] * E[2, 2]
+        s3 = c[4] * E[0, 0] + c[3] * E[1, 1] + c[2] * E[2, 2]
+        t23 = T(2.0) * c[6] * E[1, 2]
+        t13 = T(2.0) * c[7] * E[0, 2]
+        t12 = T(2.0) * c[8] * E[0, 1]
+        return mat33(s1, t12, t13, t12, s2, t23, t13, t23, s3)
+
+    @wp.func
+    def moduli(c: coef) -> moduli9:
+        return moduli9(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
+
+    @wp.func
+    def energy(G: mat33, c: coef) -> T:
+        E = t.green(G)
+        return T(0.5) * wp.ddot(E, stiffness(E, c))
+
+    @wp.func
+    def stress(G: mat33, c: coef) -> mat33:
+        S = stiffness(t.green(G), c)
+        return S + G * S
+
+    @wp.func
+    def increment(G: mat33, dG: mat33, c: coef) -> mat33:
+        F = t.identity() + G
+        return dG * stiffness(t.green(G), c) + F * stiffness(t.sym(wp.transpose(F) * dG), c)
+
+    @wp.func
+    def block(G: mat33, a: vec3, c: coef) -> mat33:
+        # without the couplings D_ij, which may be indefinite alone, and without geometric stiffness
+        F = t.identity() + G
+        x = a[0] * a[0]
+        y = a[1] * a[1]
+        z = a[2] * a[2]
+        M = mat33()
+        M[0, 0] = c[0] * x + c[8] * y + c[7] * z
+        M[1, 1] = c[1] * y + c[8] * x + c[6] * z
+        M[2, 2] = c[2] * z + c[7] * x + c[6] * y
+        M[0, 1] = c[8] * a[0] * a[1]
+        M[0, 2] = c[7] * a[0] * a[2]
+        M[1, 2] = c[6] * a[1] * a[2]
+        M[1, 0] = M[0, 1]
+        M[2, 0] = M[0, 2]
+        M[2, 1] = M[1, 2]
+        return F * M * wp.transpose(F)
+
+    return _types.SimpleNamespace(
+        energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness, moduli=moduli
+    )
+
+
+LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, "neo_hookean": neo_hookean}
+"""Device laws by name. A new law is one entry here and one class in warpfea/materials.py."""
+
+
+ANY_J = ("svk", "orthotropic", "assumed_strain")
+"""Laws that are defined for any F; the others need J > 0."""
+
+
+def law(name: str, dtype: str) -> _types.SimpleNamespace:
+    """The device functions of the law `name` in one precision."""
+    return LAWS[name](dtype)

@@ -1,0 +1,348 @@
+"""Matrices of table elements: column by column, or a whole element at a time.
+
+Columns are for a GPU, where threads are many and registers few. A processor's core does whole elements: at a point it
+makes dP/dF once, and its units of arithmetic take the numbers of several slots, a panel, side by side.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module, precision
+from . import materials
+from .points import point_functions
+
+__all__ = ["UNROLL", "matrix_kernels", "panels_of", "row_of", "rows_type"]
+
+WIDEST = 8
+"""Most slots of a panel: eight numbers of 64 bits fill the widest registers there are."""
+UNROLL = 9
+"""`max_unroll` of modules that do panels: loops over components must not stand in the way of those over slots."""
+
+
+def panels_of(slots: int) -> tuple[int, int, int]:
+    """How many panels, slots per panel, and rows of all: those of a panel are for slots up to its last."""
+    panels = -(-slots // WIDEST)
+    width = -(-slots // panels)
+    return panels, width, width * panels * (panels - 1) // 2 + slots
+
+
+@wp.func
+def row_of(panel: int, width: int, a: int) -> int:
+    """Which row of an element's matrix is that of slot a and a panel of so many slots."""
+    return width * ((panel * (panel + 1)) / 2) + a
+
+
+def rows_type(dtype: str, slots: int):
+    """K_ab of one slot and a panel of so many: rows 3 i + j over b."""
+    return wp.types.matrix(shape=(9, slots), dtype=precision(dtype).T)
+
+
+@functools.cache
+def matrix_kernels(
+    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool
+) -> _types.SimpleNamespace:
+    """`prepare_matrix`, `element_matrix` and `element_rows` of a kind of element block, arguments as of its kernels."""
+    fn = point_functions(dtype, law, slots, affine, damping, framed)
+    T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
+    t, m, Block, Local, coef = fn.tensors, fn.law, fn.Block, fn.Local, fn.coef
+    NS, needs_J = fn.slots, fn.needs_J
+    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
+    form = "affine" if affine else "framed" if framed else "table"
+    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}"
+    module = kernel_module(f"{name}_matrix", max_unroll=16)
+    rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
+    PANELS, P, _ = panels_of(NS)
+    Rows = rows_type(dtype, P)
+    Slots = wp.types.matrix(shape=(3 * PANELS, P), dtype=T)
+    Tensor = wp.types.matrix(shape=(9, 9), dtype=T)
+    moduli9 = t.moduli9
+    Products = wp.types.matrix(shape=(27, P), dtype=T)
+
+    @wp.func
+    def compression(S: mat33) -> T:
+        """A bound of the largest compressive principal value of S (Gershgorin), 0 in tension."""
+        low = T(0.0)
+        for i in range(3):
+            low = wp.max(low, wp.abs(S[i, 0]) + wp.abs(S[i, 1]) + wp.abs(S[i, 2]) - wp.abs(S[i, i]) - S[i, i])
+        return low
+
+    @wp.func
+    def stand_in(F: mat33, dF: mat33, c: coef) -> mat33:
+        """For laws whose tangent is indefinite far from rest: the stiffness at rest, turned with F and of its shape.
+
+        c = (mu10, k, mu01), with mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3.
+        """
+        A = wp.sqrt(T(3.0) / wp.ddot(F, F)) * F
+        mu = T(2.0) * (c[0] + c[2])
+        return A * t.isotropic(t.sym(wp.transpose(A) * dF), wp.max(c[1] - mu * T(2.0) / T(3.0), T(0.0)), mu)
+
+    @wp.func
+    def point_state(
+        block: Block,
+        U: Local,
+        V: Local,
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.float64,
+        c: coef,
+        form: int,
+        world: int,
+        point: int,
+        elem: int,
+    ):
+        """F with columns along the law's axes, and the second Piola-Kirchhoff stress of `form` there."""
+        G = fn.gradient_of(block, U, point, elem)
+        local = fn.into_axes(block, G, point, elem)
+        F = t.identity() + G
+        S = mat33()
+        if wp.static(not needs_J):
+            S = m.stiffness(t.green(local), c)
+            if form == 1:
+                S += compression(S) * t.identity()
+        if wp.static(damping == "incremental" or damping == "rate"):
+            if form == 0:
+                Fdot = fn.velocity_gradient(block, V, point, elem)
+                rate = fn.strain_rate(block, local, Fdot, history, T(dq_dv), world, point, elem)
+                S += t.isotropic(rate, c[LAMBDA_V], c[ETA])
+        if wp.static(framed):
+            F = F * block.frame[point, elem]
+        return F, S
+
+    @wp.func
+    def velocities(block: Block, v: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+        """Those of the slots, where damping needs them."""
+        if wp.static(damping == "rate"):
+            return fn.load(block, v, world, elem)
+        else:
+            return Local()
+
+    @wp.kernel(module=module)
+    def prepare_matrix(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        form: int,
+        active: wp.array(dtype=wp.int32),
+        lines: wp.array3d(dtype=vec3),
+    ):
+        """What all columns of an element's matrix need of a point, [world, 5 point + row, elem].
+
+        Three rows of F with columns along the law's axes, and the second Piola-Kirchhoff stress of `element_matrix`'s
+        `form` there, its diagonal and (23, 13, 12).
+        """
+        world, q, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
+        c = fn.coefficients(block, world, elem)
+        F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, q, elem)
+        for i in range(3):
+            lines[world, 5 * q + i, elem] = F[i]
+        lines[world, 5 * q + 3, elem] = vec3(S[0, 0], S[1, 1], S[2, 2])
+        lines[world, 5 * q + 4, elem] = vec3(S[1, 2], S[0, 2], S[0, 1])
+
+    @wp.kernel(module=module)
+    def element_matrix(
+        block: Block,
+        dq_dv: wp.array(dtype=wp.float64),
+        lines: wp.array3d(dtype=vec3),
+        form: int,
+        add: int,
+        active: wp.array(dtype=wp.int32),
+        matrix: wp.array3d(dtype=vec3),
+    ):
+        """K of each element as the columns of the 3x3 blocks of slots a <= b, row by row; one thread does one column.
+
+        Args:
+            form: 0: K; 1: without what can make it indefinite at a point, compression and stress of the viscosity, and
+                with a stand-in for laws that need J > 0, a function of u.
+            add: to what is there, of another part of the energy.
+        """
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        column = index / block.count
+        elem = index % block.count
+        b = column / 3
+        axis = column % 3
+        c = fn.coefficients(block, world, elem)
+        cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
+        unit = vec3()
+        unit[axis] = T(1.0)
+        out = Local()
+        for q in range(block.gradient.shape[0]):
+            F = wp.matrix_from_rows(
+                lines[world, 5 * q, elem], lines[world, 5 * q + 1, elem], lines[world, 5 * q + 2, elem]
+            )
+            d = lines[world, 5 * q + 3, elem]
+            o = lines[world, 5 * q + 4, elem]
+            S = mat33(d[0], o[2], o[1], o[2], d[1], o[0], o[1], o[0], d[2])
+            h = vec3()
+            if wp.static(affine):
+                h = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[q, b, 0]
+            else:
+                h = block.gradient[q, b, elem]
+            if wp.static(framed):
+                h = wp.transpose(block.frame[q, elem]) * h
+            # dF = unit h^T, so that F^T dF is the outer product of a row of F and h
+            B = t.sym(wp.outer(wp.transpose(F) * unit, h))
+            dP = wp.outer(unit, S * h)
+            if wp.static(not needs_J):
+                dS = m.stiffness(B, c)
+                if wp.static(damping == "incremental" or damping == "rate"):
+                    dS += t.isotropic(B, cv[0], cv[1])
+                dP += F * dS
+            else:
+                if wp.static(damping == "incremental" or damping == "rate"):
+                    dP += F * t.isotropic(B, cv[0], cv[1])
+                if form == 1:
+                    dP += stand_in(F, wp.outer(unit, h), c)
+                else:
+                    dP += m.increment(F - t.identity(), wp.outer(unit, h), c)
+            if wp.static(framed):
+                dP = dP * wp.transpose(block.frame[q, elem])
+            dP = fn.weight_of(block, q, elem) * dP
+            if wp.static(affine):
+                dP = dP * wp.transpose(fn.inverse_jacobian(block, elem))
+            for a in range(NS):
+                if a <= b:
+                    if wp.static(affine):
+                        out[a] = out[a] + dP * block.gradient[q, a, 0]
+                    else:
+                        out[a] = out[a] + dP * block.gradient[q, a, elem]
+        for a in range(NS):
+            if a <= b:
+                pair = a * NS - (a * (a - 1)) / 2 + b - a
+                if add != 0:
+                    out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
+                matrix[world, 3 * pair + axis, elem] = out[a]
+
+    @wp.func
+    def elasticity(F: mat33, S: mat33, moduli: moduli9, c: coef, form: int, w: T) -> Tensor:
+        """w dP_ik/dF_jl, [3 i + k, 3 j + l]: the linear part, of S = `moduli` : E and of viscosity, and the rest.
+
+        With the shears G and the other moduli D of pairs k, l: for k != l it is
+        S_kl delta_ij + D_kl F_ik F_jl + G_kl F_il F_jk, and for k = l S_kk delta_ij + D_kk F_ik F_jk + the sum over the
+        other m of G_mk F_im F_jm.
+        """
+        A = Tensor()
+        for k in range(3):
+            for l in range(k, 3):
+                shear = vec3()
+                if k == l:
+                    for o in range(3):
+                        if o != k:
+                            shear[o] = w * moduli[9 - k - o]
+                for i in range(3):
+                    x = T(0.0)
+                    y = T(0.0)
+                    if k == l:
+                        x = w * moduli[k] * F[i, k]
+                    else:
+                        x = w * moduli[6 - k - l] * F[i, k]
+                        y = w * moduli[9 - k - l] * F[i, l]
+                    for j in range(3):
+                        a = x * F[j, l]
+                        if k != l:
+                            a += y * F[j, k]
+                        else:
+                            for o in range(3):
+                                if o != k:
+                                    a += shear[o] * F[i, o] * F[j, o]
+                        if i == j:
+                            a += w * S[k, l]
+                        A[3 * i + k, 3 * j + l] = a
+                        if k != l:
+                            A[3 * j + l, 3 * i + k] = a
+        if wp.static(needs_J):
+            for j in range(3):
+                for l in range(3):
+                    dF = mat33()
+                    dF[j, l] = w
+                    dP = mat33()
+                    if form == 1:
+                        dP = stand_in(F, dF, c)
+                    else:
+                        dP = m.increment(F - t.identity(), dF, c)
+                    for i in range(3):
+                        for k in range(3):
+                            A[3 * i + k, 3 * j + l] = A[3 * i + k, 3 * j + l] + dP[i, k]
+        return A
+
+    @wp.kernel(module=rows_module)
+    def element_rows(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        form: int,
+        active: wp.array(dtype=wp.int32),
+        add: int,
+        matrix: wp.array3d(dtype=Rows),
+    ):
+        """K of an element by one thread, what `prepare_matrix` does included.
+
+        A is dP/dF at a point; a panel's A : (e_j h_b^T) are the rows of D, over b, and K_ab = h_a . D_b.
+
+        Args:
+            matrix: [world, elem, row_of(panel, a)] rows 3 i + j of K_ab over the slots b of a panel.
+            form, add: as of `element_matrix`.
+        """
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        c = fn.coefficients(block, world, elem)
+        cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
+        moduli = t.moduli9()
+        if wp.static(not needs_J):
+            moduli = m.moduli(c)
+        if wp.static(damping == "incremental" or damping == "rate"):
+            moduli += t.isotropic_moduli(cv[0], cv[1])
+        U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
+        if add == 0:
+            for k in range(matrix.shape[2]):
+                matrix[world, elem, k] = Rows()
+        h, H = Local(), Slots()
+        for q in range(block.gradient.shape[0]):
+            F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, q, elem)
+            into = t.identity()
+            if wp.static(framed):
+                into = wp.transpose(block.frame[q, elem])
+            if wp.static(affine):
+                into = into * wp.transpose(fn.inverse_jacobian(block, elem))
+            for a in range(NS):
+                if wp.static(affine):
+                    h[a] = into * block.gradient[q, a, 0]
+                elif wp.static(framed):
+                    h[a] = into * block.gradient[q, a, elem]
+                else:
+                    h[a] = block.gradient[q, a, elem]
+                for l in range(3):
+                    H[3 * (a / P) + l, a % P] = h[a][l]
+            A = elasticity(F, S, moduli, c, form, fn.weight_of(block, q, elem))
+            for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
+                D = Products()
+                for i in range(9):
+                    for j in range(3):
+                        D[3 * i + j] = (
+                            A[i, 3 * j] * H[3 * panel]
+                            + A[i, 3 * j + 1] * H[3 * panel + 1]
+                            + A[i, 3 * j + 2] * H[3 * panel + 2]
+                        )
+                for a in range(wp.min(NS, P * (panel + 1))):
+                    g = h[a]
+                    row = row_of(panel, P, a)
+                    R = matrix[world, elem, row]
+                    for i in range(3):
+                        for j in range(3):
+                            k = 3 * i + j
+                            R[k] = R[k] + g[0] * D[6 * i + k] + g[1] * D[6 * i + 3 + k] + g[2] * D[6 * i + 6 + k]
+                    matrix[world, elem, row] = R
+
+    return _types.SimpleNamespace(
+        prepare_matrix=prepare_matrix, element_matrix=element_matrix, element_rows=element_rows
+    )

@@ -1,0 +1,98 @@
+"""What only some scenes or outputs launch of table elements, each compiled apart: history, viscous force, stress."""
+
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module
+from . import materials
+
+__all__ = ["output_kernels"]
+
+
+def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types.SimpleNamespace:
+    """Kernels of the block with the functions fn of points.py.
+
+    Args:
+        name: what names of modules begin with.
+        points: quadrature points.
+    """
+    NQ = points
+    history_module = kernel_module(f"{name}_history")
+    viscous_module = kernel_module(f"{name}_viscous")
+    stress_module = kernel_module(f"{name}_stress")
+    T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
+    t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
+    NS = fn.slots
+    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
+
+    @wp.kernel(module=history_module)
+    def strain_history(
+        block: Block,
+        u0: wp.array2d(dtype=vec3),
+        u1: wp.array2d(dtype=vec3),
+        a0: wp.array(dtype=wp.float64),
+        a1: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        history: wp.array2d(dtype=sym6),
+    ):
+        """a0 E(u0) - a1 E(u1) per point, in the law's axes: what the incremental strain rate is measured from."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U0 = fn.load(block, u0, world, elem)
+        for q in range(NQ):
+            E = T(a0[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U0, q, elem), q, elem))
+            if a1[world] != wp.float64(0.0):
+                U1 = fn.load(block, u1, world, elem)
+                E = E - T(a1[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U1, q, elem), q, elem))
+            history[world, fn.history_index(block, q, elem)] = fn.pack(E)
+
+    @wp.kernel(module=viscous_module)
+    def viscous_force(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=vec3),
+        power: wp.array2d(dtype=wp.float64),
+    ):
+        """Kelvin-Voigt force, Eqs. (58)-(70), at a given state, and its dissipation rate S_vis : Edot (W)."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        c = fn.coefficients(block, world, elem)
+        U = fn.load(block, u, world, elem)
+        V = fn.load(block, v, world, elem)
+        f = Local()
+        rate_of_work = T(0.0)
+        for q in range(NQ):
+            G = fn.gradient_of(block, U, q, elem)
+            F = t.identity() + G
+            rate = t.sym(wp.transpose(F) * fn.gradient_of(block, V, q, elem))
+            S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
+            rate_of_work += fn.weight_of(block, q, elem) * wp.ddot(S, rate)
+            f = fn.scatter(block, f, F * S, q, elem)
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        power[world, block.element_offset + elem] = wp.float64(rate_of_work)
+
+    @wp.kernel(module=stress_module)
+    def point_stress(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        stress: wp.array3d(dtype=sym6),
+        jacobian: wp.array3d(dtype=T),
+    ):
+        """Cauchy stress P F^T / J (elastic part) and J at the quadrature points, [world, point, elem]."""
+        world, elem = wp.tid()
+        c = fn.coefficients(block, world, elem)
+        U = fn.load(block, u, world, elem)
+        for q in range(NQ):
+            G = fn.gradient_of(block, U, q, elem)
+            J = T(1.0) + t.volume_change(G)
+            P = fn.out_of_axes(block, m.stress(fn.into_axes(block, G, q, elem), c), q, elem)
+            stress[world, q, elem] = fn.pack((T(1.0) / J) * (P + P * wp.transpose(G)))
+            jacobian[world, q, elem] = J
+
+    return _types.SimpleNamespace(strain_history=strain_history, viscous_force=viscous_force, point_stress=point_stress)

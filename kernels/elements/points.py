@@ -1,0 +1,255 @@
+"""What is done at a quadrature point of a table element: gradients, axes, strain rates, increments of stress.
+
+The family of an element is only its numbers of slots and points and the tables; straight tetrahedra share one table of
+parent gradients and keep J0^-1, others keep h per element and point. Displacements are taken relative to the element's
+first position slot: a rigid translation then has exactly zero strain.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import precision
+from . import materials
+
+__all__ = ["block_struct", "point_functions"]
+
+
+@functools.cache
+def block_struct(dtype: str):
+    """The constant data of one element block, in one precision."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+
+    @wp.struct
+    class ElementBlock:
+        conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
+        is_position: wp.array(dtype=T)  # [local] 1 for a position slot, 0 for a gradient slot
+        gradient: wp.array3d(dtype=vec3)  # [point, local, elem] h_i; affine: [point, local, 0] parent gradient
+        vertex_gradient: wp.array3d(dtype=vec3)  # the same at the vertices, for laws that need J > 0
+        shape: wp.array3d(dtype=T)  # [point, local, elem or 0] s_i at the points of the mass rule (field loads)
+        field_weight: wp.array2d(dtype=T)  # [point, elem] rho w at those points
+        J0_inv: wp.array2d(dtype=T)  # [3 row + column, elem], affine only
+        vertex_J0_inv: wp.array2d(dtype=mat33)
+        weight: wp.array2d(dtype=T)  # [point, elem] W det J0; affine: [point, 0] W
+        det_J0: wp.array(dtype=T)  # [elem], affine only
+        mass: wp.array2d(dtype=T)  # [local, local] int s_i s_j over the parent; affine only
+        density: wp.array(dtype=T)  # [elem] rho det J0, where it is constant; affine only
+        material: wp.array(dtype=wp.int32)  # [elem]
+        coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]
+        frame: wp.array2d(dtype=mat33)  # [point, elem] axes of the law, framed blocks only
+        contribution_offset: wp.int32
+        element_offset: wp.int32
+        history_offset: wp.int32
+        count: wp.int32
+
+    return ElementBlock
+
+
+@functools.cache
+def point_functions(
+    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool
+) -> _types.SimpleNamespace:
+    """Functions of one kind of element block, of which the kernels of elements are made; arguments as there."""
+    p = precision(dtype)
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    t = materials.tensors(dtype)
+    m = materials.law(law, dtype)
+    Block = block_struct(dtype)
+    NCOEF = materials.NCOEF
+    coef = wp.types.vector(length=NCOEF, dtype=T)
+    Local = wp.types.matrix(shape=(slots, 3), dtype=T)
+    NS = slots
+    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
+
+    @wp.func
+    def coefficients(block: Block, world: int, elem: int) -> coef:
+        c = coef()
+        row = world % block.coefficients.shape[0]
+        mat = block.material[elem]
+        for k in range(NCOEF):
+            c[k] = block.coefficients[row, mat, k]
+        return c
+
+    @wp.func
+    def damping_coefficients(c: coef, scale: T) -> coef:
+        d = coef()
+        d[0] = c[LAMBDA_V] * scale
+        d[1] = c[ETA] * scale
+        return d
+
+    @wp.func
+    def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+        """Slot values of an element, translations taken relative to the first slot."""
+        U = Local()
+        first = field[world, block.conn[0, elem]]
+        for i in range(NS):
+            U[i] = field[world, block.conn[i, elem]] - block.is_position[i] * first
+        return U
+
+    @wp.func
+    def inverse_jacobian(block: Block, elem: int) -> mat33:
+        """J0^-1 of a straight element."""
+        return mat33(
+            block.J0_inv[0, elem], block.J0_inv[1, elem], block.J0_inv[2, elem],
+            block.J0_inv[3, elem], block.J0_inv[4, elem], block.J0_inv[5, elem],
+            block.J0_inv[6, elem], block.J0_inv[7, elem], block.J0_inv[8, elem],
+        )  # fmt: skip
+
+    @wp.func
+    def gradient_of(block: Block, U: Local, point: int, elem: int) -> mat33:
+        """sum_i u_i h_i^T at a point."""
+        D = mat33()
+        for i in range(NS):
+            if wp.static(affine):
+                D += wp.outer(U[i], block.gradient[point, i, 0])
+            else:
+                D += wp.outer(U[i], block.gradient[point, i, elem])
+        if wp.static(affine):
+            D = D * inverse_jacobian(block, elem)
+        return D
+
+    @wp.func
+    def weight_of(block: Block, point: int, elem: int) -> T:
+        if wp.static(affine):
+            return block.weight[point, 0] * block.det_J0[elem]
+        else:
+            return block.weight[point, elem]
+
+    @wp.func
+    def scatter(block: Block, f: Local, P: mat33, point: int, elem: int) -> Local:
+        """f_i += w P h_i."""
+        Q = weight_of(block, point, elem) * P
+        if wp.static(affine):
+            Q = Q * wp.transpose(inverse_jacobian(block, elem))
+        out = f
+        for i in range(NS):
+            if wp.static(affine):
+                out[i] = out[i] + Q * block.gradient[point, i, 0]
+            else:
+                out[i] = out[i] + Q * block.gradient[point, i, elem]
+        return out
+
+    @wp.func
+    def pack(A: mat33) -> sym6:
+        return sym6(A[0, 0], A[1, 1], A[2, 2], A[1, 2], A[0, 2], A[0, 1])
+
+    @wp.func
+    def unpack(a: sym6) -> mat33:
+        return mat33(a[0], a[5], a[4], a[5], a[1], a[3], a[4], a[3], a[2])
+
+    @wp.func
+    def into_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
+        """Components in the axes of the law."""
+        if wp.static(framed):
+            R = block.frame[point, elem]
+            return wp.transpose(R) * A * R
+        else:
+            return A
+
+    @wp.func
+    def out_of_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
+        """Components in the body's axes."""
+        if wp.static(framed):
+            R = block.frame[point, elem]
+            return R * A * wp.transpose(R)
+        else:
+            return A
+
+    @wp.func
+    def history_index(block: Block, point: int, elem: int) -> int:
+        return block.history_offset + point * block.count + elem
+
+    @wp.func
+    def velocity_gradient(block: Block, V: Local, point: int, elem: int) -> mat33:
+        """Fdot in the law's axes, where the form of damping needs it."""
+        if wp.static(damping == "rate"):
+            return into_axes(block, gradient_of(block, V, point, elem), point, elem)
+        else:
+            return mat33()
+
+    @wp.func
+    def strain_rate(
+        block: Block, G: mat33, Fdot: mat33, history: wp.array2d(dtype=sym6), dq: T, world: int, point: int, elem: int
+    ) -> mat33:
+        """Edot at a point: (E - history)/dq (incremental), or Eq. (58) with F and Fdot at the new state (rate); all in
+        the law's axes."""
+        if wp.static(damping == "incremental"):
+            past = unpack(history[world, history_index(block, point, elem)])
+            return (T(1.0) / dq) * (t.green(G) - past)
+        else:
+            return t.sym(wp.transpose(t.identity() + G) * Fdot)
+
+    @wp.func
+    def vertex_jacobian(block: Block, U: Local, elem: int) -> T:
+        """Smallest J at the element's vertices, where a quadratic field is outside the hull of the points."""
+        J = T(1.0e30)
+        for q in range(block.vertex_gradient.shape[0]):
+            D = mat33()
+            for i in range(NS):
+                if wp.static(affine):
+                    D += wp.outer(U[i], block.vertex_gradient[q, i, 0])
+                else:
+                    D += wp.outer(U[i], block.vertex_gradient[q, i, elem])
+            if wp.static(affine):
+                D = D * inverse_jacobian(block, elem)
+            J = wp.min(J, T(1.0) + t.volume_change(D))
+        return J
+
+    @wp.func
+    def point_increment(
+        block: Block,
+        G: mat33,
+        dG: mat33,
+        Fdot: mat33,
+        history: wp.array2d(dtype=sym6),
+        c: coef,
+        dq: T,
+        world: int,
+        point: int,
+        elem: int,
+    ) -> mat33:
+        """dP at a point, with damping."""
+        local = into_axes(block, G, point, elem)
+        change = into_axes(block, dG, point, elem)
+        dP = m.increment(local, change, c)
+        if wp.static(damping == "incremental" or damping == "rate"):
+            F = t.identity() + local
+            S = t.isotropic(strain_rate(block, local, Fdot, history, dq, world, point, elem), c[LAMBDA_V], c[ETA])
+            dS = t.isotropic(t.sym(wp.transpose(F) * change), c[LAMBDA_V] / dq, c[ETA] / dq)
+            dP = dP + change * S + F * dS
+        return out_of_axes(block, dP, point, elem)
+
+    @wp.func
+    def tangent_force(
+        block: Block,
+        U: Local,
+        dU: Local,
+        V: Local,
+        history: wp.array2d(dtype=sym6),
+        dq: T,
+        world: int,
+        elem: int,
+    ) -> Local:
+        """K dU of an element."""
+        c = coefficients(block, world, elem)
+        f = Local()
+        for q in range(block.gradient.shape[0]):
+            G = gradient_of(block, U, q, elem)
+            dG = gradient_of(block, dU, q, elem)
+            Fdot = velocity_gradient(block, V, q, elem)
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, q, elem)
+            f = scatter(block, f, dP, q, elem)
+        return f
+
+    return _types.SimpleNamespace(
+        types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
+        framed=framed, needs_J=law not in materials.ANY_J,
+        coefficients=coefficients, damping_coefficients=damping_coefficients, load=load,
+        inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
+        weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
+        into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,
+        strain_rate=strain_rate, vertex_jacobian=vertex_jacobian, point_increment=point_increment,
+        tangent_force=tangent_force,
+    )  # fmt: skip

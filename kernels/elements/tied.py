@@ -1,0 +1,374 @@
+"""Shears by assumed natural strain (Dvorkin and Bathe 1984): force, energy, tangent product and diagonal blocks.
+
+Covariant shears e_t = 2 E_ab are taken at tying points; interpolation, metric and quadrature are one symmetric matrix A
+per element, made on the host: Psi = (mu/2) e.A e.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module, precision
+from .matrix import UNROLL, panels_of, row_of, rows_type
+
+__all__ = ["tied_kernels", "tied_struct"]
+
+
+@functools.cache
+def tied_struct(dtype: str):
+    """The constant data of a block of tied elements, in one precision."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+
+    @wp.struct
+    class TiedBlock:
+        conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
+        is_position: wp.array(dtype=T)  # [local]
+        first: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_a
+        second: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
+        X_first: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
+        X_second: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
+        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the tie's run
+        material: wp.array(dtype=wp.int32)  # [elem]
+        coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
+        contribution_offset: wp.int32
+        element_offset: wp.int32
+        history_offset: wp.int32
+        count: wp.int32
+
+    return TiedBlock
+
+
+@functools.cache
+def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.SimpleNamespace:
+    """Kernels of tied elements; their arguments are those of `element_kernels`, so that one loop launches both.
+
+    Args:
+        width: A couples the ties of each run of so many.
+    """
+    p = precision(dtype)
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    Block = tied_struct(dtype)
+    name = f"tied_{dtype}_{slots}_{ties}_{width}"
+    module = kernel_module(name)
+    matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
+    Local = wp.types.matrix(shape=(slots, 3), dtype=T)
+    Ties = wp.types.vector(length=ties, dtype=T)
+    TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
+    NS, NT, W = slots, ties, width
+    PANELS, P, _ = panels_of(NS)
+    Row = wp.types.vector(length=P, dtype=T)
+    GROUP = 4 if NT % 4 == 0 else 1  # ties per loading and storing of a row of the matrix
+    Rows = rows_type(dtype, P)
+    Slots = wp.types.matrix(shape=(NT * PANELS, P), dtype=T)
+    Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
+    Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
+    rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
+
+    @wp.func
+    def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+        """Slot values of an element, translations taken relative to the first slot."""
+        U = Local()
+        first = field[world, block.conn[0, elem]]
+        for i in range(NS):
+            U[i] = field[world, block.conn[i, elem]] - block.is_position[i] * first
+        return U
+
+    @wp.func
+    def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
+        out = vec3()
+        for i in range(NS):
+            out += table[tie, i, elem] * U[i]
+        return out
+
+    @wp.func
+    def kinematics(block: Block, U: Local, elem: int):
+        """x_a and x_b at the ties, and x_a . x_b less its reference value, without cancellation."""
+        first, second = TieVectors(), TieVectors()
+        e = Ties()
+        for t in range(NT):
+            a = line(block.first, U, t, elem)
+            d = line(block.second, U, t, elem)
+            first[t] = block.X_first[t, elem] + a
+            second[t] = block.X_second[t, elem] + d
+            e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, second[t])
+        return first, second, e
+
+    @wp.func
+    def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
+        """mu A e."""
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        s = Ties()
+        for t in range(NT):
+            total = T(0.0)
+            first = (t / W) * W
+            for k in range(W):
+                total += block.coupling[t, k, elem] * e[first + k]
+            s[t] = mu * total
+        return s
+
+    @wp.kernel(module=module)
+    def internal_force(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        lanes: int,
+        contribution: wp.array2d(dtype=vec3),
+        energy: wp.array3d(dtype=wp.float64),
+        min_J: wp.array(dtype=wp.float64),
+        domain_J: wp.array(dtype=wp.float64),
+    ):
+        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), and the energy e.s/2; one lane per element."""
+        world, elem = wp.tid()
+        if active[world] == 0 or elem >= block.count:
+            return
+        U = load(block, u, world, elem)
+        x1, x2, e = kinematics(block, U, elem)
+        s = stresses(block, e, world, elem)
+        f = Local()
+        for t in range(NT):
+            a = s[t] * x1[t]
+            d = s[t] * x2[t]
+            for i in range(NS):
+                f[i] = f[i] + block.first[t, i, elem] * d + block.second[t, i, elem] * a
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        energy[0, world, block.element_offset + elem] = wp.float64(T(0.5) * wp.dot(e, s))
+        energy[1, world, block.element_offset + elem] = wp.float64(0.0)
+
+    @wp.kernel(module=module)
+    def tangent_product(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """K p."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = load(block, u, world, elem)
+        P = load(block, direction, world, elem)
+        x1, x2, e = kinematics(block, U, elem)
+        de = Ties()
+        for t in range(NT):
+            de[t] = wp.dot(x1[t], line(block.second, P, t, elem)) + wp.dot(x2[t], line(block.first, P, t, elem))
+        s = stresses(block, e, world, elem)
+        ds = stresses(block, de, world, elem)
+        f = Local()
+        for t in range(NT):
+            da = ds[t] * x1[t] + s[t] * line(block.first, P, t, elem)
+            dd = ds[t] * x2[t] + s[t] * line(block.second, P, t, elem)
+            for i in range(NS):
+                f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+
+    @wp.kernel(module=module)
+    def diagonal_blocks(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=sym6),
+    ):
+        """The 3x3 diagonal blocks of K without the geometric part: positive, as A is."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = load(block, u, world, elem)
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        for i in range(NS):
+            b = TieVectors()
+            for t in range(NT):
+                a = block.X_first[t, elem] + line(block.first, U, t, elem)
+                d = block.X_second[t, elem] + line(block.second, U, t, elem)
+                b[t] = block.first[t, i, elem] * d + block.second[t, i, elem] * a
+            K = mat33()
+            for t in range(NT):
+                row = vec3()
+                first = (t / W) * W
+                for k in range(W):
+                    row += block.coupling[t, k, elem] * b[first + k]
+                K += wp.outer(b[t], row)
+            entry = block.contribution_offset + i * block.count + elem
+            contribution[world, entry] = mu * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
+
+    @wp.kernel(module=matrix_module)
+    def prepare_matrix(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        form: int,
+        active: wp.array(dtype=wp.int32),
+        lines: wp.array3d(dtype=vec3),
+    ):
+        """What all columns of an element's matrix need of a tie: x_a and x_b, [world, tie and NT + tie, elem], and the
+        shear, the first component of 2 NT + tie."""
+        world, tie, elem = wp.tid()
+        if active[world] == 0:
+            return
+        da = vec3()
+        dd = vec3()
+        first = u[world, block.conn[0, elem]]
+        for i in range(NS):
+            x = u[world, block.conn[i, elem]] - block.is_position[i] * first
+            da += block.first[tie, i, elem] * x
+            dd += block.second[tie, i, elem] * x
+        a = block.X_first[tie, elem] + da
+        d = block.X_second[tie, elem] + dd
+        shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
+        lines[world, tie, elem] = a
+        lines[world, NT + tie, elem] = d
+        lines[world, 2 * NT + tie, elem] = vec3(shear, T(0.0), T(0.0))
+
+    @wp.kernel(module=matrix_module)
+    def prepare_stress(block: Block, active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)):
+        """The stresses of the ties, the first components of 3 NT + tie."""
+        world, tie, elem = wp.tid()
+        if active[world] == 0:
+            return
+        first = (tie / W) * W
+        s = T(0.0)
+        for k in range(W):
+            s += block.coupling[tie, k, elem] * lines[world, 2 * NT + first + k, elem][0]
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        lines[world, 3 * NT + tie, elem] = vec3(mu * s, T(0.0), T(0.0))
+
+    @wp.kernel(module=matrix_module)
+    def element_matrix(
+        block: Block,
+        dq_dv: wp.array(dtype=wp.float64),
+        lines: wp.array3d(dtype=vec3),
+        form: int,
+        add: int,
+        active: wp.array(dtype=wp.int32),
+        matrix: wp.array3d(dtype=vec3),
+    ):
+        """As of `element_kernels`; `form` = 1: without the geometric part."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        column = index / block.count
+        elem = index % block.count
+        b = column / 3
+        axis = column % 3
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        unit = vec3()
+        unit[axis] = T(1.0)
+        change = Ties()
+        for t in range(NT):
+            x = lines[world, t, elem][axis]
+            y = lines[world, NT + t, elem][axis]
+            change[t] = mu * (block.first[t, b, elem] * y + block.second[t, b, elem] * x)
+        out = Local()
+        for t in range(NT):
+            first = (t / W) * W
+            s = T(0.0)
+            for k in range(W):
+                s += block.coupling[t, k, elem] * change[first + k]
+            da = s * lines[world, t, elem]
+            dd = s * lines[world, NT + t, elem]
+            if form != 1:
+                stress = lines[world, 3 * NT + t, elem][0]
+                da += (stress * block.first[t, b, elem]) * unit
+                dd += (stress * block.second[t, b, elem]) * unit
+            for a in range(NS):
+                if a <= b:
+                    out[a] = out[a] + block.first[t, a, elem] * dd + block.second[t, a, elem] * da
+        for a in range(NS):
+            if a <= b:
+                pair = a * NS - (a * (a - 1)) / 2 + b - a
+                if add != 0:
+                    out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
+                matrix[world, 3 * pair + axis, elem] = out[a]
+
+    @wp.kernel(module=rows_module)
+    def element_rows(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        form: int,
+        active: wp.array(dtype=wp.int32),
+        add: int,
+        matrix: wp.array3d(dtype=Rows),
+    ):
+        """As of `element_kernels`: K = mu B^T A B + geometric part, with the slots of a panel side by side."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        U = load(block, u, world, elem)
+        x1, x2, e = kinematics(block, U, elem)
+        first, second, B = Slots(), Slots(), Changes()
+        for t in range(NT):
+            d1 = x1[t]
+            d2 = x2[t]
+            for a in range(NS):
+                f = block.first[t, a, elem]
+                s = block.second[t, a, elem]
+                row = NT * (a / P) + t
+                first[row, a % P] = f
+                second[row, a % P] = s
+                for i in range(3):
+                    B[3 * row + i, a % P] = f * d2[i] + s * d1[i]
+        stress = Ties()
+        if form != 1:
+            stress = stresses(block, e, world, elem)
+        if add == 0:
+            for k in range(matrix.shape[2]):
+                matrix[world, elem, k] = Rows()
+        for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
+            AB = Products()
+            for t in range(NT):
+                x, y, z = Row(), Row(), Row()
+                for k in range(W):
+                    other = 3 * (NT * panel + (t / W) * W + k)
+                    c = mu * block.coupling[t, k, elem]
+                    x = x + c * B[other]
+                    y = y + c * B[other + 1]
+                    z = z + c * B[other + 2]
+                AB[3 * t] = x
+                AB[3 * t + 1] = y
+                AB[3 * t + 2] = z
+            for group in range(NT / GROUP):
+                for a in range(wp.min(NS, P * (panel + 1))):
+                    at = row_of(panel, P, a)
+                    R = matrix[world, elem, at]
+                    row = NT * (a / P) + GROUP * group
+                    n = a % P
+                    for o in range(GROUP):
+                        t = GROUP * group + o
+                        for i in range(3):
+                            c = B[3 * (row + o) + i, n]
+                            for j in range(3):
+                                R[3 * i + j] = R[3 * i + j] + c * AB[3 * t + j]
+                        G = stress[t] * (
+                            second[row + o, n] * first[NT * panel + t] + first[row + o, n] * second[NT * panel + t]
+                        )
+                        for i in range(3):
+                            R[4 * i] = R[4 * i] + G
+                    matrix[world, elem, at] = R
+
+    return _types.SimpleNamespace(
+        module=module,
+        element_rows=element_rows,
+        prepare_matrix=prepare_matrix,
+        prepare_stress=prepare_stress,
+        element_matrix=element_matrix,
+        internal_force=internal_force,
+        tangent_product=tangent_product,
+        diagonal_blocks=diagonal_blocks,
+    )

@@ -1,0 +1,73 @@
+"""The product c_M M p + (dq/dv) K p of straight elements, mass included, by clusters of elements."""
+
+import functools
+
+import warp as wp
+
+from ..common.types import kernel_module
+from .cluster import DIRECTION, U, V, cluster_functions
+from .points import point_functions
+from .vertex import vertex_product
+
+__all__ = ["with_mass_kernel"]
+
+
+@functools.cache
+def with_mass_kernel(
+    dtype: str, law: str, slots: int, points: int, damping: str | None, vertex: bool, size: int
+) -> wp.Kernel:
+    """The kernel `with_mass_product` of one kind of straight elements.
+
+    Args:
+        dtype: precision.
+        law: name in `materials.LAWS`.
+        slots, points: slots and quadrature points per element.
+        damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
+        vertex: 10-node tetrahedra with a rule for kernels/elements/vertex.py.
+        size: elements of a cluster.
+    """
+    fn = point_functions(dtype, law, slots, True, damping, False)
+    T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
+    Block, Local, NS = fn.Block, fn.Local, fn.slots
+    shared = cluster_functions(dtype, size, slots, 3 if damping == "rate" else 2)
+    Pool = shared.Pool
+    # slots in registers, not in arrays that loops index; the loops over points stay loops
+    name = f"massive_{dtype}_{law}_{slots}_{points}_{'vertex' if vertex else 'affine'}_{damping}_{size}"
+    module = kernel_module(name, max_unroll=16, block_dim=size)
+
+    if vertex:
+        product = vertex_product(points, fn, shared)
+    else:
+
+        @wp.func
+        def fetch_all(block: Block, pool: Pool, field: int, at: int) -> Local:
+            """Slot values of an element, translations taken relative to the first slot."""
+            out = Local()
+            first = shared.fetch(pool, field, 0, at)
+            for i in range(NS):
+                out[i] = shared.fetch(pool, field, i, at) - block.is_position[i] * first
+            return out
+
+        @wp.func
+        def product(
+            block: Block, pool: Pool, history: wp.array2d(dtype=sym6), dq: T, scale: T, world: int, elem: int, at: int
+        ):
+            """scale M p + dq K p of element `at` of a cluster."""
+            u = fetch_all(block, pool, U, at)
+            du = fetch_all(block, pool, DIRECTION, at)
+            v = Local()
+            if wp.static(damping == "rate"):
+                v = fetch_all(block, pool, V, at)
+            f = fn.tangent_force(block, u, du, v, history, dq, world, elem)
+            first = shared.fetch(pool, DIRECTION, 0, at)
+            for i in range(NS):
+                a = vec3()
+                total = T(0.0)
+                for j in range(NS):
+                    a += block.mass[i, j] * du[j]
+                    total += block.mass[i, j]
+                shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
+
+    # of this kind spilling was measured to be little; of others the compiler decides
+    bounded = vertex and law == "svk" and damping is None
+    return shared.by_clusters(module, Block, product, bounded)

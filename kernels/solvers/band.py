@@ -1,0 +1,231 @@
+"""Cholesky factors of a banded matrix, in blocks of 4 x 4 whose columns lie side by side; one thread per world.
+
+Block row I of L holds the blocks J = I - width .. I one after the other, columns within, L_II as its inverse. For the
+CPU: a row after the other is what one core does well, its units of arithmetic take a column at once.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.structs import pattern_struct
+from ..common.types import kernel_module, precision
+
+__all__ = ["BLOCK", "band_kernels", "column_type"]
+
+BLOCK = 4
+SHIFT_GROWTH = 100.0
+
+
+def column_type(dtype: str):
+    """A column of a block."""
+    return wp.types.vector(length=BLOCK, dtype=precision(dtype).T)
+
+
+@functools.cache
+def band_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    Pattern = pattern_struct()
+    Column = column_type(dtype)
+    Block = wp.types.matrix(shape=(BLOCK, BLOCK), dtype=T)
+    # a pivot below this share of its diagonal is rounding, or the matrix is indefinite there
+    NEGLIGIBLE = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
+    # share of the diagonal that is added first where that comes up, of rounding or of an indefinite matrix
+    FIRST_SHIFT = {"float64": 1.0e-4, "float32": 1.0e-6}[dtype]
+    module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
+
+    @wp.kernel(module=module)
+    def clear(slots: int, width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
+        """Zeros, and ones on the diagonal beyond the slots; one thread per block row."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        for k in range(band.shape[2]):
+            band[world, row, k] = Column()
+        for r in range(BLOCK):
+            if BLOCK * row + r >= 3 * slots:
+                band[world, row, BLOCK * width + r][r] = T(1.0)
+
+    @wp.kernel(module=module)
+    def fill(
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        place_of: wp.array(dtype=wp.int32),
+        width: int,
+        shift: wp.array(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        band: wp.array3d(dtype=Column),
+    ):
+        """The lower half of A + shift D with slots in the order of `place_of`, one thread per slot. A negative number
+        on the diagonal, of an unknown under strong compression, takes the other sign."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        place = place_of[slot]
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            other = place_of[pattern.column[k]]
+            if other <= place:
+                A = value[world, k]
+                if other == place:
+                    for a in range(3):
+                        A[a, a] = (T(1.0) + shift[world]) * wp.abs(A[a, a])
+                for a in range(3):
+                    i = 3 * place + a
+                    for b in range(3):
+                        j = 3 * other + b
+                        if j <= i:
+                            at = BLOCK * (j / BLOCK - i / BLOCK + width) + j % BLOCK
+                            band[world, i / BLOCK, at][i % BLOCK] = A[a, b]
+
+    @wp.func
+    def inverse_factor(A: Block, given: Column) -> Block:
+        """Columns of L^-1 of A = L L^T.
+
+        An unknown whose pivot is not safely positive, measured by the `given` diagonal, takes that, and its column of
+        L ends there: L L^T is positive whatever A is. Its number on the diagonal is negative, for the blocks below.
+        """
+        S = Block()
+        for c in range(BLOCK):
+            S[c] = A[c]
+        rows = Block()
+        for j in range(BLOCK):
+            pivot = S[j][j]
+            size = wp.abs(given[j])
+            own = Column()
+            if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
+                scale = T(1.0) / wp.sqrt(pivot)
+                column = scale * S[j]
+                # rows of L^-1: what the rows above leave of e_j, over the pivot
+                own = scale * rows[j]
+                own[j] = scale
+                for c in range(j + 1, BLOCK):
+                    S[c] = S[c] - column[c] * column
+                    rows[c] = rows[c] - column[c] * own
+            else:
+                own[j] = -T(1.0) / wp.sqrt(wp.max(size, T(1.0e-30)))
+            rows[j] = own
+        return wp.transpose(rows)
+
+    @wp.kernel(module=module)
+    def factor(
+        width: int, active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)
+    ):
+        """L in place; `bad`: unknowns without a pivot of their own."""
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        count = wp.int32(0)
+        for row in range(band.shape[1]):
+            first = wp.max(row - width, 0)
+            for other in range(first, row + 1):
+                at = BLOCK * (other - row + width)
+                S = Block()
+                given = Column()
+                for c in range(BLOCK):
+                    S[c] = band[world, row, at + c]
+                    given[c] = S[c][c]
+                for m in range(first, other):
+                    left = BLOCK * (m - row + width)
+                    right = BLOCK * (m - other + width)
+                    for k in range(BLOCK):
+                        a = band[world, row, left + k]
+                        b = band[world, other, right + k]
+                        for c in range(BLOCK):
+                            S[c] = S[c] - b[c] * a
+                R = Block()
+                if other < row:
+                    for k in range(BLOCK):
+                        d = band[world, other, BLOCK * width + k]
+                        for c in range(BLOCK):
+                            R[c] = R[c] + d[c] * S[k]
+                    for c in range(BLOCK):
+                        if band[world, other, BLOCK * width + c][c] < T(0.0):
+                            R[c] = Column()
+                else:
+                    R = inverse_factor(S, given)
+                    for c in range(BLOCK):
+                        if R[c][c] < T(0.0):
+                            count += 1
+                for c in range(BLOCK):
+                    band[world, row, at + c] = R[c]
+        bad[world] = count
+
+    @wp.kernel(module=module)
+    def begin(flags: wp.array(dtype=wp.int32), doing: wp.array(dtype=wp.int32), shift: wp.array(dtype=T)):
+        """Which worlds are factored."""
+        world = wp.tid()
+        doing[world] = flags[world]
+        if flags[world] != 0:
+            shift[world] = T(0.0)
+
+    @wp.kernel(module=module)
+    def settle(
+        bad: wp.array(dtype=wp.int32),
+        doing: wp.array(dtype=wp.int32),
+        shift: wp.array(dtype=T),
+        again: wp.array(dtype=wp.int32),
+    ):
+        """Where A is not positive, more of its diagonal is added and it is factored again, up to A + D."""
+        world = wp.tid()
+        if doing[world] == 0:
+            return
+        if bad[world] != 0 and shift[world] < T(1.0):
+            shift[world] = wp.min(wp.max(T(SHIFT_GROWTH) * shift[world], T(FIRST_SHIFT)), T(1.0))
+            wp.atomic_max(again, 0, 1)
+        else:
+            doing[world] = 0
+
+    @wp.kernel(module=module)
+    def solve(
+        width: int,
+        band: wp.array3d(dtype=Column),
+        slot_at: wp.array(dtype=wp.int32),
+        r: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        y: wp.array2d(dtype=Column),
+        z: wp.array2d(dtype=vec3),
+    ):
+        """z = A^-1 r."""
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        slots = slot_at.shape[0]
+        rows = band.shape[1]
+        for row in range(rows):
+            s = Column()
+            for k in range(BLOCK):
+                i = BLOCK * row + k
+                if i / 3 < slots:
+                    s[k] = r[world, slot_at[i / 3]][i % 3]
+            for other in range(wp.max(row - width, 0), row):
+                x = y[world, other]
+                at = BLOCK * (other - row + width)
+                for k in range(BLOCK):
+                    s = s - x[k] * band[world, row, at + k]
+            x = Column()
+            for k in range(BLOCK):
+                x = x + s[k] * band[world, row, BLOCK * width + k]
+            y[world, row] = x
+        for back in range(rows):
+            row = rows - 1 - back
+            s = y[world, row]
+            x = Column()
+            for k in range(BLOCK):
+                x[k] = wp.dot(band[world, row, BLOCK * width + k], s)
+            for k in range(BLOCK):
+                i = BLOCK * row + k
+                if i / 3 < slots:
+                    z[world, slot_at[i / 3]][i % 3] = x[k]
+            for other in range(wp.max(row - width, 0), row):
+                at = BLOCK * (other - row + width)
+                t = y[world, other]
+                for k in range(BLOCK):
+                    t[k] = t[k] - wp.dot(band[world, row, at + k], x)
+                y[world, other] = t
+
+    return _types.SimpleNamespace(
+        module=module, begin=begin, clear=clear, fill=fill, factor=factor, settle=settle, solve=solve
+    )

@@ -1,0 +1,258 @@
+"""Matrices of 3x3 blocks: H assembled from element matrices, its product, and Galerkin products with affine functions.
+
+A pattern is symmetric and full; values are [world, entry]. An entry and its mirror are made by one thread.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.inverse import inverse_function
+from ..common.structs import pattern_struct, topology_struct
+from ..common.types import SMALL, kernel_module, precision
+from ..elements.matrix import panels_of, row_of
+
+__all__ = ["assembly_kernels", "block_kernels", "coupling_struct"]
+
+
+@functools.cache
+def coupling_struct():
+    """What constraints add to entries: rho w grad_a grad_b^T."""
+
+    @wp.struct
+    class Couplings:
+        entry: wp.array(dtype=wp.int32)  # [item] index into Pattern.upper
+        start: wp.array(dtype=wp.int32)  # [item + 1]
+        term_a: wp.array(dtype=wp.int32)  # index into Multipliers.gradient
+        term_b: wp.array(dtype=wp.int32)
+        weight: wp.array(dtype=wp.float64)
+
+    return Couplings
+
+
+@functools.cache
+def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespace:
+    """Assembly from the matrices of elements with so many slots, as `element_matrix` or, `rows`, `element_rows` leave
+    them."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64 = wp.float64
+    Topology = topology_struct(dtype)
+    Pattern = pattern_struct()
+    NS = slots
+    _, P, ROWS = panels_of(slots)
+    PLACES = P * ROWS if rows else NS * (NS + 1) // 2
+    Number = T if rows else vec3
+    module = kernel_module(f"assembly_{dtype}_{slots}{'_rows' if rows else ''}", max_unroll=SMALL)
+
+    @wp.func
+    def place(low: int, high: int) -> int:
+        """Of the block of two slots in an element's matrix."""
+        if wp.static(rows):
+            return P * row_of(high / P, P, low) + high % P
+        else:
+            return low * NS - (low * (low - 1)) / 2 + high - low
+
+    @wp.func
+    def block_at(matrix: wp.array3d(dtype=Number), world: int, elem: int, where: int) -> mat33:
+        if wp.static(rows):
+            first = 9 * P * (where / P) + where % P
+            A = mat33()
+            for i in range(3):
+                for j in range(3):
+                    A[i, j] = matrix[world, elem, first + P * (3 * i + j)]
+            return A
+        else:
+            k = 3 * where
+            return wp.matrix_from_cols(matrix[world, k, elem], matrix[world, k + 1, elem], matrix[world, k + 2, elem])
+
+    @wp.kernel(module=module)
+    def list_contributions(
+        topo: Topology,
+        pattern: Pattern,
+        conn: wp.array2d(dtype=wp.int32),
+        offset: int,
+        count: int,
+        listing: int,
+        start: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+    ):
+        """What of which element adds to an entry of Pattern.upper: start[index + 1] = how many, or with `listing` the
+        `source`s from start[index] on, 2 (PLACES elem + place) + 1 where the block is to be transposed."""
+        index = wp.tid()
+        at = pattern.upper[index]
+        found = wp.int32(0)
+        for k in range(topo.start[at[2]], topo.start[at[2] + 1]):
+            inside = topo.entry[k] - offset
+            if inside >= 0 and inside < NS * count:
+                a = inside / count
+                elem = inside % count
+                for b in range(NS):
+                    if conn[b, elem] == at[3]:
+                        if listing != 0:
+                            where = PLACES * elem + place(wp.min(a, b), wp.max(a, b))
+                            source[start[index] + found] = 2 * where + wp.where(a <= b, 0, 1)
+                        found += 1
+        if listing == 0:
+            start[index + 1] = found
+
+    @wp.kernel(module=module)
+    def add_elements(
+        topo: Topology,
+        pattern: Pattern,
+        start: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+        matrix: wp.array3d(dtype=Number),
+        mass: wp.array(dtype=T),
+        first: int,
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):
+        """value += (dq/dv) K of a block's elements; `first`: = c_M M + (dq/dv) K.
+
+        Prescribed components keep their diagonal and nothing else.
+        """
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        at = pattern.upper[index]
+        row = at[2]
+        column = at[3]
+        A = mat33()
+        for k in range(start[index], start[index + 1]):
+            code = source[k]
+            K = block_at(matrix, world, (code / 2) / PLACES, (code / 2) % PLACES)
+            if code % 2 == 0:
+                A += K
+            else:
+                A += wp.transpose(K)
+        A = T(dq_dv[world]) * A
+        if first != 0:
+            A += T(mass_factor[world]) * mass[index] * wp.identity(n=3, dtype=T)
+        row_free = topo.free[row]
+        column_free = topo.free[column]
+        for i in range(3):
+            for j in range(3):
+                if row != column or i != j:
+                    A[i, j] = row_free[i] * column_free[j] * A[i, j]
+        if first == 0:
+            A += value[world, at[0]]
+        value[world, at[0]] = A
+        if at[1] != at[0]:
+            value[world, at[1]] = wp.transpose(A)
+
+    return _types.SimpleNamespace(
+        module=module, add_elements=add_elements, list_contributions=list_contributions, places=PLACES
+    )
+
+
+@functools.cache
+def block_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels on matrices of 3x3 blocks, whatever they came from."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64 = wp.float64
+    vec4 = wp.types.vector(length=4, dtype=T)
+    Topology = topology_struct(dtype)
+    Pattern, Couplings = pattern_struct(), coupling_struct()
+    free_inverse = inverse_function(dtype)
+    module = kernel_module(f"blocks_{dtype}", max_unroll=SMALL)
+    coupling_module = kernel_module(f"couplings_{dtype}", max_unroll=SMALL)
+
+    @wp.kernel(module=coupling_module)
+    def add_constraints(
+        topo: Topology,
+        pattern: Pattern,
+        con: Couplings,
+        gradient: wp.array2d(dtype=wp.vec3d),
+        stiffness: wp.array2d(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):
+        """value += (dq/dv) J^T rho J."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        at = pattern.upper[con.entry[item]]
+        A = wp.mat33d()
+        for k in range(con.start[item], con.start[item + 1]):
+            a = con.term_a[k]
+            factor = con.weight[k] * dq_dv[world] * stiffness[world, a / 3]
+            A += factor * wp.outer(gradient[world, a], gradient[world, con.term_b[k]])
+        B = mat33(A)
+        row_free = topo.free[at[2]]
+        column_free = topo.free[at[3]]
+        for i in range(3):
+            for j in range(3):
+                B[i, j] = row_free[i] * column_free[j] * B[i, j]
+        B += value[world, at[0]]
+        value[world, at[0]] = B
+        if at[1] != at[0]:
+            value[world, at[1]] = wp.transpose(B)
+
+    @wp.kernel(module=module)
+    def take_diagonal(
+        topo: Topology,
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array2d(dtype=vec3),
+        inverse: wp.array2d(dtype=mat33),
+    ):
+        """The diagonal D and the inverses of the diagonal blocks on the free components."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            if pattern.column[k] == slot:
+                A = value[world, k]
+                D = vec3()
+                for i in range(3):
+                    D[i] = wp.max(wp.abs(A[i, i]), T(1.0e-30))
+                diagonal[world, slot] = D
+                inverse[world, slot] = free_inverse(A, T(0.0), topo.free[slot])
+
+    @wp.kernel(module=module)
+    def galerkin(
+        pair: wp.array(dtype=wp.vec3i),
+        pair_start: wp.array(dtype=wp.int32),
+        fine_entry: wp.array(dtype=wp.vec3i),
+        weight: wp.array(dtype=vec4),
+        free: wp.array(dtype=vec3),
+        fine: wp.array2d(dtype=mat33),
+        active: wp.array(dtype=wp.int32),
+        coarse: wp.array2d(dtype=mat33),
+    ):
+        """P^T A P: for two groups and two of their functions the sum of w w' A over the entries between them.
+
+        `pair`: first coarse entry of the group's rows, width of its rows, place of the other in them;
+        `fine_entry`: an entry, its row, its column.
+        """
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        group = index / 16
+        k = (index / 4) % 4
+        l = index % 4
+        A = mat33()
+        for e in range(pair_start[group], pair_start[group + 1]):
+            f = fine_entry[e]
+            w = weight[f[1]][k] * weight[f[2]][l]
+            if w != T(0.0):
+                B = fine[world, f[0]]
+                row_free = free[f[1]]
+                column_free = free[f[2]]
+                for i in range(3):
+                    for j in range(3):
+                        A[i, j] = A[i, j] + w * row_free[i] * column_free[j] * B[i, j]
+        at = pair[group]
+        coarse[world, at[0] + k * at[1] + at[2] + l] = A
+
+    return _types.SimpleNamespace(
+        module=module, coupling_module=coupling_module, add_constraints=add_constraints, take_diagonal=take_diagonal,
+        galerkin=galerkin,
+    )  # fmt: skip

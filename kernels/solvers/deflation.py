@@ -1,0 +1,288 @@
+"""Constraint directions deflated: the preconditioner (D + (dq/dv) J^T rho J)^-1 by Woodbury's identity.
+
+    z = D^-1 r - D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J D^-1 r
+
+It is exact within a cluster, rows whose matrix is inverted densely; coupled clusters are swept colour by colour.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.lanes import lane_functions
+from ..common.types import kernel_module, precision
+from ..terms.constraints import constraint_functions, constraint_struct, multiplier_struct
+
+__all__ = ["deflation_kernels"]
+
+
+@functools.cache
+def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels of the deflation for one precision of the slots; also of the penalty, which the same matrices set."""
+    p = precision(dtype)
+    vec3, mat33 = p.vec3, p.mat33
+    f64, vec3d = wp.float64, wp.vec3d
+    Constraints, Multipliers = constraint_struct(), multiplier_struct()
+    directional = constraint_functions(dtype).directional
+    row_sum = lane_functions(dtype).row_sum
+    module = kernel_module(f"deflation_{dtype}")
+
+    @wp.kernel(module=module)
+    def pair_blocks(
+        con: Constraints, inverse: wp.array2d(dtype=mat33), active: wp.array(dtype=wp.int32), mul: Multipliers
+    ):
+        """sum w w' D^-1 over the slots that two vectors share."""
+        world, block = wp.tid()
+        if active[world] == 0:
+            return
+        s = wp.mat33d()
+        for k in range(con.block_start[block], con.block_start[block + 1]):
+            s += con.block_weight[k] * wp.mat33d(inverse[world, con.block_slot[k]])
+        mul.block[world, block] = s
+
+    @wp.func
+    def pair_sum(con: Constraints, mul: Multipliers, world: int, row: int, column: int, first: int, last: int) -> f64:
+        """(J D^-1 J^T) of two rows."""
+        s = f64(0.0)
+        for k in range(first, last):
+            side = con.pair_side[k]
+            left = mul.gradient[world, 3 * row + side[0]]
+            right = mul.gradient[world, 3 * column + side[1]]
+            s += wp.dot(left, mul.block[world, con.pair_block[k]] * right)
+        return s
+
+    @wp.kernel(module=module)
+    def assemble_coupling(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
+        """J D^-1 J^T between rows of different clusters."""
+        world, k = wp.tid()
+        if active[world] != 0:
+            first, last = con.couple_pair[k], con.couple_pair[k + 1]
+            mul.coupling[world, k] = pair_sum(con, mul, world, con.couple_row[k], con.couple_column[k], first, last)
+
+    @wp.kernel(module=module)
+    def assemble_matrix(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
+        """J D^-1 J^T within each cluster, one thread per row."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        first = con.cluster_start[con.cluster[row]]
+        n = con.cluster_start[con.cluster[row] + 1] - first
+        base = con.matrix_start[con.cluster[row]] + (row - first) * n
+        for column in range(n):
+            start, end = con.pair[base + column], con.pair[base + column + 1]
+            mul.matrix[world, base + column] = pair_sum(con, mul, world, row, first + column, start, end)
+
+    @wp.kernel(module=module)
+    def penalty(con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers):
+        """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii): free of units, of the mesh and of E. Frozen during a step."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        first = con.cluster_start[con.cluster[row]]
+        n = con.cluster_start[con.cluster[row] + 1] - first
+        own = mul.matrix[world, con.matrix_start[con.cluster[row]] + (row - first) * (n + 1)]
+        rho = f64(0.0)
+        if own > f64(0.0):
+            rho = mul.kappa / (dq_dv[world] * own)
+        mul.stiffness[world, row] = rho
+
+    @wp.func
+    def regularise(con: Constraints, mul: Multipliers, dq: f64, world: int, cluster: int):
+        """Add 1 / (dq/dv rho) to the diagonal; rows without any freedom get 1."""
+        first = con.cluster_start[cluster]
+        n = con.cluster_start[cluster + 1] - first
+        base = con.matrix_start[cluster]
+        for i in range(n):
+            rho = mul.stiffness[world, first + i]
+            more = f64(1.0)
+            if rho > f64(0.0):
+                more = f64(1.0) / (dq * rho)
+            k = base + i * (n + 1)
+            mul.matrix[world, k] = mul.matrix[world, k] + more
+
+    @wp.kernel(module=module)
+    def invert_clusters(
+        con: Constraints,
+        dq_dv: wp.array(dtype=f64),
+        limit: int,
+        active: wp.array(dtype=wp.int32),
+        mul: Multipliers,
+    ):
+        """Inverse of the matrix of each cluster up to `limit` rows, in place (Gauss-Jordan; positive definite)."""
+        world, cluster = wp.tid()
+        if active[world] == 0:
+            return
+        regularise(con, mul, dq_dv[world], world, cluster)
+        n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
+        if n > limit:
+            return
+        base = con.matrix_start[cluster]
+        for k in range(n):
+            d = f64(1.0) / mul.matrix[world, base + k * (n + 1)]
+            mul.matrix[world, base + k * (n + 1)] = f64(1.0)
+            for j in range(n):
+                mul.matrix[world, base + k * n + j] = d * mul.matrix[world, base + k * n + j]
+            for i in range(n):
+                if i != k:
+                    x = mul.matrix[world, base + i * n + k]
+                    mul.matrix[world, base + i * n + k] = f64(0.0)
+                    for j in range(n):
+                        y = mul.matrix[world, base + i * n + j] - x * mul.matrix[world, base + k * n + j]
+                        mul.matrix[world, base + i * n + j] = y
+
+    @wp.kernel(module=module)
+    def eliminate(
+        con: Constraints,
+        large: wp.array(dtype=wp.int32),
+        pivot: int,
+        active: wp.array(dtype=wp.int32),
+        mul: Multipliers,
+    ):
+        """One pivot of Gauss-Jordan in every large cluster, a thread per row; the pivot's is left to `scale_row`."""
+        world, k, i = wp.tid()
+        cluster = large[k]
+        n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
+        if active[world] == 0 or pivot >= n or i >= n or i == pivot:
+            return
+        base = con.matrix_start[cluster]
+        d = mul.matrix[world, base + pivot * (n + 1)]
+        x = mul.matrix[world, base + i * n + pivot] / d
+        for j in range(n):
+            if j == pivot:
+                mul.matrix[world, base + i * n + j] = -x
+            else:
+                y = mul.matrix[world, base + i * n + j] - x * mul.matrix[world, base + pivot * n + j]
+                mul.matrix[world, base + i * n + j] = y
+
+    @wp.kernel(module=module)
+    def scale_row(
+        con: Constraints,
+        large: wp.array(dtype=wp.int32),
+        pivot: int,
+        active: wp.array(dtype=wp.int32),
+        mul: Multipliers,
+    ):
+        """The pivot's own row."""
+        world, k = wp.tid()
+        cluster = large[k]
+        n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
+        if active[world] == 0 or pivot >= n:
+            return
+        base = con.matrix_start[cluster] + pivot * n
+        d = f64(1.0) / mul.matrix[world, base + pivot]
+        mul.matrix[world, base + pivot] = f64(1.0)
+        for j in range(n):
+            mul.matrix[world, base + j] = d * mul.matrix[world, base + j]
+
+    @wp.kernel(module=module)
+    def restrict(con: Constraints, mul: Multipliers, z: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)):
+        """J z."""
+        world, row = wp.tid()
+        if active[world] != 0:
+            mul.restricted[world, row] = directional(con, mul, z, world, row)
+
+    @wp.kernel(module=module)
+    def solve_clusters(con: Constraints, mul: Multipliers, active: wp.array(dtype=wp.int32)):
+        """The inverse of each cluster's matrix times J z, one thread per row."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        first = con.cluster_start[con.cluster[row]]
+        n = con.cluster_start[con.cluster[row] + 1] - first
+        base = con.matrix_start[con.cluster[row]] + (row - first) * n
+        s = f64(0.0)
+        for j in range(n):
+            s += mul.matrix[world, base + j] * mul.restricted[world, first + j]
+        mul.solved[world, row] = s
+
+    @wp.kernel(module=module)
+    def sweep(
+        con: Constraints,
+        mul: Multipliers,
+        first_cluster: int,
+        forward: int,
+        active: wp.array(dtype=wp.int32),
+    ):
+        """One colour of a symmetric block Gauss-Seidel sweep over coupled clusters.
+
+        It stands for (G + L) G^-1 (G + L^T) >= J D^-1 J^T + 1/((dq/dv) rho), G the clusters' own matrices: with more
+        than the right matrix the preconditioner stays positive definite.
+        """
+        world, k = wp.tid()
+        if active[world] == 0:
+            return
+        cluster = con.colour_cluster[first_cluster + k]
+        colour = con.colour[cluster]
+        first = con.cluster_start[cluster]
+        n = con.cluster_start[cluster + 1] - first
+        for row in range(first, first + n):
+            s = f64(0.0)
+            if forward == 1:
+                s = mul.restricted[world, row]
+            for c in range(con.couple_start[row], con.couple_start[row + 1]):
+                other = con.couple_column[c]
+                rank = con.colour[con.cluster[other]]
+                if (forward == 1 and rank < colour) or (forward == 0 and rank > colour):
+                    s -= mul.coupling[world, c] * mul.solved[world, other]
+            mul.swept[world, row] = s
+        base = con.matrix_start[cluster]
+        for i in range(n):
+            s = f64(0.0)
+            for j in range(n):
+                s += mul.matrix[world, base + i * n + j] * mul.swept[world, first + j]
+            if forward == 0:
+                s += mul.solved[world, first + i]
+            mul.solved[world, first + i] = s
+
+    @wp.kernel(module=module)
+    def project(
+        con: Constraints,
+        mul: Multipliers,
+        inverse: wp.array2d(dtype=mat33),
+        r: wp.array2d(dtype=vec3),
+        y: wp.array2d(dtype=vec3),
+        add: int,
+        active: wp.array(dtype=wp.int32),
+        warp: int,
+        z: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """z = y - D^-1 J^T s where constraints touch a slot, y = D^-1 r, with `add` z += the same; r.z per warp."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        rz = f64(0.0)
+        if slot < z.shape[1]:
+            out = z[world, slot]
+            first = con.slot_start[slot]
+            last = con.slot_start[slot + 1]
+            if last > first:
+                s = vec3d()
+                for k in range(first, last):
+                    term = con.slot_term[k]
+                    s += (con.slot_weight[k] * mul.solved[world, term / 3]) * mul.gradient[world, term]
+                change = y[world, slot] - inverse[world, slot] * vec3(s)
+                if add != 0:
+                    change += out
+                out = change
+                z[world, slot] = out
+            rz = f64(wp.dot(r[world, slot], out))
+        rz = row_sum(rz, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = rz
+
+    return _types.SimpleNamespace(
+        module=module,
+        pair_blocks=pair_blocks,
+        assemble_matrix=assemble_matrix,
+        assemble_coupling=assemble_coupling,
+        penalty=penalty,
+        invert_clusters=invert_clusters,
+        eliminate=eliminate,
+        scale_row=scale_row,
+        restrict=restrict,
+        solve_clusters=solve_clusters,
+        sweep=sweep,
+        project=project,
+    )

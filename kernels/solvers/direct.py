@@ -1,0 +1,182 @@
+"""What a direct solver adds to the elements' matrix so that it is all of H, and what surrounds its solution."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.lanes import lane_functions
+from ..common.structs import pattern_struct, topology_struct
+from ..common.types import kernel_module, precision
+from ..terms.constraints import DISTANCE, TURN, constraint_struct, multiplier_struct
+from .blocks import coupling_struct
+
+__all__ = ["direct_kernels", "followed_struct"]
+
+
+@functools.cache
+def followed_struct():
+    """Where the matrices of follower loads enter the pattern."""
+
+    @wp.struct
+    class Followed:
+        entry: wp.array(dtype=wp.int32)  # [k] index into Pattern.upper
+        start: wp.array(dtype=wp.int32)  # [k + 1]
+        row: wp.array(dtype=wp.int32)  # local slot of an item, local * count + item
+        column: wp.array(dtype=wp.int32)  # local
+
+    return Followed
+
+
+@functools.cache
+def direct_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels of the direct solver in one precision."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64 = wp.float64
+    Topology, Pattern, Couplings, Followed = (
+        topology_struct(dtype),
+        pattern_struct(),
+        coupling_struct(),
+        followed_struct(),
+    )
+    Constraints, Multipliers = constraint_struct(), multiplier_struct()
+    row_sum = lane_functions(dtype).row_sum
+    module = kernel_module(f"direct_{dtype}")
+
+    @wp.func
+    def add_block(topo: Topology, at: wp.vec4i, A: mat33, world: int, value: wp.array2d(dtype=mat33)):
+        """Add to an entry and its mirror, on the free components."""
+        row_free = topo.free[at[2]]
+        column_free = topo.free[at[3]]
+        B = mat33()
+        for i in range(3):
+            for j in range(3):
+                B[i, j] = row_free[i] * column_free[j] * A[i, j]
+        B += value[world, at[0]]
+        value[world, at[0]] = B
+        if at[1] != at[0]:
+            value[world, at[1]] = wp.transpose(B)
+
+    @wp.func
+    def curvature(con: Constraints, mul: Multipliers, world: int, row: int, a: int, b: int) -> wp.mat33d:
+        """d2c / (d vector a  d vector b) of a row, a and b its sides."""
+        kind = con.kind[row]
+        f = mul.target[world, row]
+        scale = mul.scale[world, row]
+        one = wp.identity(n=3, dtype=f64)
+        if kind == DISTANCE:
+            n = mul.gradient[world, 3 * row] / scale
+            size = wp.abs(mul.value[world, row] / scale + f)
+            if a == 0 and b == 0:
+                return (scale / size) * (one - wp.outer(n, n))
+        elif kind == TURN:
+            if a + b == 1:
+                return -scale * wp.sin(f) * one
+            if a + b == 3:
+                return scale * wp.cos(f) * one
+        elif a + b == 1:
+            return scale * one
+        return wp.mat33d()
+
+    @wp.kernel(module=module)
+    def add_constraints(
+        topo: Topology,
+        pattern: Pattern,
+        pairs: Couplings,
+        con: Constraints,
+        mul: Multipliers,
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):
+        """value += (dq/dv) (J^T rho J + sum lambda d2c/dq2)."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        A = wp.mat33d()
+        for k in range(pairs.start[item], pairs.start[item + 1]):
+            a = pairs.term_a[k]
+            b = pairs.term_b[k]
+            row = a / 3
+            tight = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
+            bend = mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
+            A += pairs.weight[k] * (tight + bend)
+        add_block(topo, pattern.upper[pairs.entry[item]], mat33(dq_dv[world] * A), world, value)
+
+    @wp.kernel(module=module)
+    def take_local(
+        conn: wp.array2d(dtype=wp.int32),
+        u: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        out: wp.array2d(dtype=vec3),
+    ):
+        """Values at the slots of each item, local * count + item."""
+        world, local, item = wp.tid()
+        if active[world] != 0:
+            out[world, local * conn.shape[1] + item] = u[world, conn[local, item]]
+
+    @wp.kernel(module=module)
+    def unit_direction(local: int, component: int, count: int, out: wp.array2d(dtype=vec3)):
+        """A unit component at one local slot of every item, else 0."""
+        world, k = wp.tid()
+        e = vec3()
+        if k / count == local:
+            e[component] = T(1.0)
+        out[world, k] = e
+
+    @wp.kernel(module=module)
+    def add_followers(
+        topo: Topology,
+        pattern: Pattern,
+        places: Followed,
+        columns: wp.array3d(dtype=vec3),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):
+        """value -= (dq/dv) K, K from its products with unit vectors."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        A = mat33()
+        for k in range(places.start[item], places.start[item + 1]):
+            for c in range(3):
+                f = columns[3 * places.column[k] + c, world, places.row[k]]
+                for i in range(3):
+                    A[i, c] = A[i, c] + f[i]
+        add_block(topo, pattern.upper[places.entry[item]], -T(dq_dv[world]) * A, world, value)
+
+    @wp.kernel(module=module)
+    def dot_rows(
+        r: wp.array2d(dtype=vec3),
+        z: wp.array2d(dtype=vec3),
+        diagonal: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        warp: int,
+        rows: wp.array3d(dtype=f64),
+    ):
+        """r.z and r.D^-1 r per warp of slots."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        rz = f64(0.0)
+        rr = f64(0.0)
+        if slot < z.shape[1]:
+            a = r[world, slot]
+            rz = f64(wp.dot(a, z[world, slot]))
+            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
+        rz = row_sum(rz, warp)
+        rr = row_sum(rr, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = rz
+            rows[1, world, slot / warp] = rr
+
+    return _types.SimpleNamespace(
+        module=module,
+        add_constraints=add_constraints,
+        take_local=take_local,
+        unit_direction=unit_direction,
+        add_followers=add_followers,
+        dot_rows=dot_rows,
+    )

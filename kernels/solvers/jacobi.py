@@ -1,0 +1,331 @@
+"""Accelerated descent with a fixed preconditioner B: v += p, p made of B r and of the last few moves.
+
+Pairs (s, y) of the last moves s = v' - v and of what they did to the residual r = -g, y = r - r', which is H s where
+H is constant. One thread per slot, and one per world for the small systems.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module, precision
+from .newton import (
+    FAIL_CONSTRAINT,
+    FAIL_GROWTH,
+    FAIL_JACOBIAN,
+    FAIL_NAN,
+    control_struct,
+    newton_kernels,
+)
+from .pcg import pcg_struct
+
+__all__ = ["PAIRS", "jacobi_kernels", "jacobi_struct"]
+
+PAIRS = 4
+"""Moves that are remembered: 1 and 3 to 5 were tried, beyond 3 it hardly matters."""
+DEPENDENT = 1.0e-10  # a pivot below this share of its diagonal: a move that the others hold already
+
+
+@functools.cache
+def jacobi_struct():
+    """What the acceleration knows of each world."""
+
+    @wp.struct
+    class JacobiControl:
+        gram: wp.array3d(dtype=wp.float64)  # [world, pair, pair]
+        factor: wp.array3d(dtype=wp.float64)  # its Cholesky factor, newest pair first
+        right: wp.array2d(dtype=wp.float64)  # [world, pair] right side, newest first
+        gamma: wp.array2d(dtype=wp.float64)  # [world, pair] share of each pair in the move
+        sums: wp.array2d(dtype=wp.float64)  # [2 PAIRS, world]
+        first_norm: wp.array(dtype=wp.float64)  # |g| at the start of the attempt
+        rho: wp.array(dtype=wp.float64)  # of the Chebyshev recursion
+        growth: wp.float64  # |g| over that of the start beyond which a step is refused
+        gap: wp.float64  # m, violation of a constraint beyond which a step is refused
+        step: wp.float64  # factor of B r
+        centre: wp.float64  # of the interval of eigenvalues
+        half: wp.float64
+
+    return JacobiControl
+
+
+@functools.cache
+def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.SimpleNamespace:
+    """Kernels of one precision and acceleration."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
+    shared = newton_kernels(dtype, constrained)
+    measure, record = shared.measure, shared.record
+    paired = acceleration in ("secants", "anderson")
+    module = kernel_module(f"jacobi_{dtype}_{acceleration}{'_constrained' if constrained else ''}")
+
+    @wp.func
+    def settle(ctl: Newton, jac: Jacobi, world: int):
+        """End where the residual is within the tolerance, or was evaluated for the last time."""
+        record(ctl, world)
+        finite = wp.isfinite(ctl.norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
+        if ctl.domain_J[world] <= f64(0.0):
+            ctl.active[world] = 0
+            ctl.failed[world] = FAIL_JACOBIAN
+        elif not finite:
+            ctl.active[world] = 0
+            ctl.failed[world] = FAIL_NAN
+        elif ctl.excess[world] <= f64(1.0):
+            ctl.active[world] = 0
+        elif ctl.iterations[world] >= ctl.max_iterations:
+            ctl.active[world] = 0
+            if ctl.norm[world] > jac.growth * jac.first_norm[world]:
+                ctl.failed[world] = FAIL_GROWTH
+            if wp.static(constrained):
+                if ctl.open[world] * ctl.constraint_tol > jac.gap:
+                    ctl.failed[world] = FAIL_CONSTRAINT
+            # rounding may explain what is left
+            if ctl.failed[world] == 0 and ctl.floor_excess[world] > f64(1.0):
+                ctl.rough[world] = 1
+
+    @wp.kernel(module=module)
+    def begin(ctl: Newton, jac: Jacobi):
+        """Judge the first iterate."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        measure(ctl, world)
+        jac.first_norm[world] = ctl.norm[world]
+        ctl.alpha[world] = f64(1.0)
+        settle(ctl, jac, world)
+
+    @wp.kernel(module=module)
+    def judge(ctl: Newton, jac: Jacobi):
+        """Judge an iterate."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        measure(ctl, world)
+        ctl.iterations[world] = ctl.iterations[world] + 1
+        ctl.total_iterations[world] = ctl.total_iterations[world] + 1
+        settle(ctl, jac, world)
+
+    @wp.func
+    def pair_of(k: int, age: int) -> int:
+        """Place of the pair that is `age` moves old at iteration k."""
+        return (k - 1 - age) % PAIRS
+
+    @wp.kernel(module=module)
+    def remember(
+        ctl: Newton,
+        gradient: wp.array2d(dtype=vec3),
+        free: wp.array(dtype=vec3),
+        move: wp.array2d(dtype=vec3),
+        before: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+        s: wp.array3d(dtype=vec3),
+        y: wp.array3d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """r = -g on the free components; the newest pair; rows s_j.y and s_j.r."""
+        world, slot = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        new = -wp.cw_mul(gradient[world, slot], free[slot])
+        r[world, slot] = new
+        if wp.static(not paired):
+            return
+        k = ctl.iterations[world]
+        change = vec3()
+        if k > 0:
+            at = pair_of(k, 0)
+            change = before[world, slot] - new
+            s[at, world, slot] = move[world, slot]
+            y[at, world, slot] = change
+        before[world, slot] = new
+        for j in range(PAIRS):
+            w = vec3()
+            if j < k:
+                w = s[j, world, slot]
+            rows[j, world, slot] = f64(wp.dot(w, change))
+            rows[PAIRS + j, world, slot] = f64(wp.dot(w, new))
+
+    @wp.func
+    def substitute(jac: Jacobi, world: int, k: int, count: int, add: f64):
+        """gamma = add gamma + G^-1 right, without dependent pairs, whose pivots are 0."""
+        for i in range(count):
+            v = jac.right[world, i]
+            for j in range(i):
+                v -= jac.factor[world, i, j] * jac.right[world, j]
+            if jac.factor[world, i, i] > f64(0.0):
+                jac.right[world, i] = v / jac.factor[world, i, i]
+            else:
+                jac.right[world, i] = f64(0.0)
+        for m in range(count):
+            i = count - 1 - m
+            v = jac.right[world, i]
+            for j in range(i + 1, count):
+                v -= jac.factor[world, j, i] * jac.right[world, j]
+            if jac.factor[world, i, i] > f64(0.0):
+                v = v / jac.factor[world, i, i]
+            else:
+                v = f64(0.0)
+            jac.right[world, i] = v
+            at = pair_of(k, i)
+            jac.gamma[world, at] = add * jac.gamma[world, at] + v
+
+    @wp.kernel(module=module)
+    def recursion(ctl: Newton, jac: Jacobi):
+        """Chebyshev's factors of the last move and of z, for eigenvalues in centre -+ half."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        ratio = jac.centre / jac.half
+        if ctl.iterations[world] == 0:
+            jac.rho[world] = f64(1.0) / ratio
+            jac.gamma[world, 0] = f64(0.0)
+            jac.gamma[world, 1] = f64(1.0) / jac.centre
+        else:
+            new = f64(1.0) / (f64(2.0) * ratio - jac.rho[world])
+            jac.gamma[world, 0] = new * jac.rho[world]
+            jac.gamma[world, 1] = f64(2.0) * new / jac.half
+            jac.rho[world] = new
+
+    @wp.kernel(module=module)
+    def shares(ctl: Newton, jac: Jacobi):
+        """The pairs' part of the move: G gamma = S^T r by Cholesky, newest pair first."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        k = ctl.iterations[world]
+        for j in range(PAIRS):
+            jac.gamma[world, j] = f64(0.0)
+        count = wp.min(k, PAIRS)
+        if count == 0:
+            return
+        at = pair_of(k, 0)
+        for j in range(PAIRS):
+            jac.gram[world, at, j] = jac.sums[j, world]
+            jac.gram[world, j, at] = jac.sums[j, world]
+        for i in range(count):
+            a = pair_of(k, i)
+            jac.right[world, i] = jac.sums[PAIRS + a, world]
+            for j in range(i + 1):
+                v = jac.gram[world, a, pair_of(k, j)]
+                for m in range(j):
+                    v -= jac.factor[world, i, m] * jac.factor[world, j, m]
+                if j == i:
+                    if v > f64(DEPENDENT) * wp.abs(jac.gram[world, a, a]):
+                        jac.factor[world, i, i] = wp.sqrt(v)
+                    else:
+                        jac.factor[world, i, i] = f64(0.0)
+                elif jac.factor[world, j, j] > f64(0.0):
+                    jac.factor[world, i, j] = v / jac.factor[world, j, j]
+                else:
+                    jac.factor[world, i, j] = f64(0.0)
+        substitute(jac, world, k, count, f64(0.0))
+
+    @wp.kernel(module=module)
+    def project(ctl: Newton, jac: Jacobi, y: wp.array3d(dtype=vec3), r: wp.array2d(dtype=vec3)):
+        """r -= Y gamma: what the pairs leave."""
+        world, slot = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        a = r[world, slot]
+        for j in range(wp.min(ctl.iterations[world], PAIRS)):
+            a -= T(jac.gamma[world, j]) * y[j, world, slot]
+        r[world, slot] = a
+
+    @wp.kernel(module=module)
+    def conjugate_rows(ctl: Newton, y: wp.array3d(dtype=vec3), z: wp.array2d(dtype=vec3), rows: wp.array3d(dtype=f64)):
+        """Rows y_j.z."""
+        world, slot = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        for j in range(PAIRS):
+            rows[j, world, slot] = f64(0.0)
+            if j < ctl.iterations[world]:
+                rows[j, world, slot] = f64(wp.dot(y[j, world, slot], z[world, slot]))
+
+    @wp.kernel(module=module)
+    def conjugate(ctl: Newton, jac: Jacobi):
+        """gamma -= G^-1 Y^T z: the move is conjugate to the pairs."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        k = ctl.iterations[world]
+        count = wp.min(k, PAIRS)
+        for i in range(count):
+            jac.right[world, i] = -jac.step * jac.sums[pair_of(k, i), world]
+        substitute(jac, world, k, count, f64(1.0))
+
+    @wp.kernel(module=module)
+    def combine(
+        ctl: Newton,
+        jac: Jacobi,
+        s: wp.array3d(dtype=vec3),
+        z: wp.array2d(dtype=vec3),
+        move: wp.array2d(dtype=vec3),
+    ):
+        """p = S gamma + step z."""
+        world, slot = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        if wp.static(acceleration == "chebyshev"):
+            a = T(jac.gamma[world, 1]) * z[world, slot]
+            if ctl.iterations[world] > 0:
+                a += T(jac.gamma[world, 0]) * move[world, slot]
+            move[world, slot] = a
+        else:
+            a = T(jac.step) * z[world, slot]
+            if wp.static(paired):
+                for j in range(wp.min(ctl.iterations[world], PAIRS)):
+                    a += T(jac.gamma[world, j]) * s[j, world, slot]
+            move[world, slot] = a
+
+    @wp.kernel(module=module)
+    def momentum_left(
+        ctl: Newton,
+        mass_factor: wp.array(dtype=f64),
+        lumped: wp.array(dtype=T),
+        gradient: wp.array2d(dtype=vec3),
+        free: wp.array(dtype=vec3),
+        move: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """r = -g - c_M M p as far as the sum over a body counts, for its translation."""
+        world, slot = wp.tid()
+        if ctl.active[world] != 0:
+            m = T(mass_factor[world]) * lumped[slot]
+            r[world, slot] = -wp.cw_mul(gradient[world, slot] + m * move[world, slot], free[slot])
+
+    @wp.kernel(module=module)
+    def advance(ctl: Newton, move: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3)):
+        """v += p."""
+        world, slot = wp.tid()
+        if ctl.active[world] != 0:
+            v[world, slot] = v[world, slot] + move[world, slot]
+
+    @wp.kernel(module=module)
+    def tell(ctl: Newton, jac: Jacobi, pcg: PCG, running: wp.array(dtype=wp.int32)):
+        """What the attempt cost and gained, for the preconditioner's rule; flags the worlds that iterated."""
+        world = wp.tid()
+        ctl.active[world] = 0
+        if running[world] != 0 and ctl.failed[world] == 0 and ctl.iterations[world] > 0:
+            ctl.active[world] = 1
+            pcg.iterations[world] = ctl.iterations[world]
+            pcg.first_norm[world] = jac.first_norm[world]
+            pcg.norm[world] = ctl.norm[world]
+
+    return _types.SimpleNamespace(
+        module=module,
+        begin=begin,
+        judge=judge,
+        remember=remember,
+        recursion=recursion,
+        shares=shares,
+        project=project,
+        conjugate_rows=conjugate_rows,
+        conjugate=conjugate,
+        combine=combine,
+        momentum_left=momentum_left,
+        advance=advance,
+        tell=tell,
+    )

@@ -1,0 +1,285 @@
+"""Two-level preconditioner: dense inverses of tiles, affine motions of groups of tiles, a dense inverse at the bottom.
+
+A level has slots of 3-vectors, tiles of up to TILE_SLOTS slots, and groups whose four affine functions per axis are the
+slots of the next level. What is here applies it; levels_build.py makes it.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.lanes import lane_functions
+from ..common.structs import pattern_struct
+from ..common.types import SMALL, kernel_module, precision
+
+__all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
+
+TILE_SLOTS = 16
+TILE = 3 * TILE_SLOTS
+LANES = 64
+
+
+@functools.cache
+def level_struct(dtype: str):
+    """The constant data of a level."""
+    T = precision(dtype).T
+    vec4 = wp.types.vector(length=4, dtype=T)
+
+    @wp.struct
+    class Level:
+        tile_slot: wp.array2d(dtype=wp.int32)  # [tile, place] slot or -1
+        tile_of: wp.array(dtype=wp.int32)  # [slot]
+        place_of: wp.array(dtype=wp.int32)  # [slot] in its tile
+        group_start: wp.array(dtype=wp.int32)  # [group + 1]
+        group_slot: wp.array(dtype=wp.int32)
+        group_of: wp.array(dtype=wp.int32)  # [slot]
+        weight: wp.array(dtype=vec4)  # [slot] values of the group's affine functions 1, x, y, z
+        tiles: wp.int32
+        groups: wp.int32
+
+    return Level
+
+
+@functools.cache
+def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamespace:
+    """Kernels that apply the levels in one precision; `storage`: of the inverses, as of `build_kernels`."""
+    storage = storage or dtype
+    S = precision(storage).T
+    scaled = storage != dtype
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64 = wp.float64
+    Level = level_struct(dtype)
+    Pattern = pattern_struct()
+    lanes_of = lane_functions(dtype)
+    lane_sum, row_sum, scalar_sum = lanes_of.lane_sum, lanes_of.row_sum, lanes_of.scalar_sum
+    module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SMALL)
+
+    @wp.kernel(module=module)
+    def smooth(
+        level: Level,
+        inverse: wp.array4d(dtype=S),
+        root: wp.array3d(dtype=T),
+        by_row: int,
+        share: int,
+        lanes: int,
+        first_group: int,
+        r: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        z: wp.array2d(dtype=vec3),
+        coarse: wp.array2d(dtype=vec3),
+    ):
+        """z = tile inverse times r, `share` lanes per slot; from thread `first_group` on P^T r, `lanes` per group.
+
+        The inverse is symmetric: read by columns neighbouring threads read neighbouring numbers, which CUDA wants;
+        read by rows one thread does, which the CPU wants.
+        """
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        if index < first_group:
+            part = index % share
+            place = (index / share) % TILE_SLOTS
+            tile = index / (share * TILE_SLOTS)
+            slot = level.tile_slot[wp.min(tile, level.tiles - 1), place]
+            if tile >= level.tiles:
+                slot = -1
+            s = vec3()
+            if slot >= 0:
+                for b in range(part, TILE_SLOTS, share):
+                    other = level.tile_slot[tile, b]
+                    if other >= 0:
+                        x = r[world, other]
+                        if wp.static(scaled):
+                            for j in range(3):
+                                x[j] = x[j] * root[world, tile, 3 * b + j]
+                        row = 3 * place
+                        column = 3 * b
+                        if by_row != 0:
+                            for i in range(3):
+                                for j in range(3):
+                                    s[i] = s[i] + T(inverse[world, tile, row + i, column + j]) * x[j]
+                        else:
+                            for j in range(3):
+                                for i in range(3):
+                                    s[i] = s[i] + T(inverse[world, tile, column + j, row + i]) * x[j]
+            s = lane_sum(s, share)
+            if part == 0 and slot >= 0:
+                if wp.static(scaled):
+                    for i in range(3):
+                        s[i] = s[i] * root[world, tile, 3 * place + i]
+                z[world, slot] = s
+            return
+        index -= first_group
+        group = index / lanes
+        lane = index % lanes
+        s0 = vec3()
+        s1 = vec3()
+        s2 = vec3()
+        s3 = vec3()
+        for e in range(level.group_start[group] + lane, level.group_start[group + 1], lanes):
+            slot = level.group_slot[e]
+            w = level.weight[slot]
+            x = r[world, slot]
+            s0 += w[0] * x
+            s1 += w[1] * x
+            s2 += w[2] * x
+            s3 += w[3] * x
+        s0 = lane_sum(s0, lanes)
+        s1 = lane_sum(s1, lanes)
+        s2 = lane_sum(s2, lanes)
+        s3 = lane_sum(s3, lanes)
+        if lane == 0:
+            coarse[world, 4 * group] = s0
+            coarse[world, 4 * group + 1] = s1
+            coarse[world, 4 * group + 2] = s2
+            coarse[world, 4 * group + 3] = s3
+
+    @wp.func
+    def prolonged(level: Level, x: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
+        """(P x) of a slot."""
+        first = 4 * level.group_of[slot]
+        w = level.weight[slot]
+        s = vec3()
+        for k in range(4):
+            s += w[k] * x[world, first + k]
+        return s
+
+    @wp.kernel(module=module)
+    def add_coarse(
+        level: Level,
+        correct: int,
+        x: wp.array2d(dtype=vec3),
+        free: wp.array(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+        diagonal: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        warp: int,
+        z: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """z += P x; rows: r.z and r.D^-1 r per warp of slots."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        rz = f64(0.0)
+        rr = f64(0.0)
+        if slot < z.shape[1]:
+            a = r[world, slot]
+            s = z[world, slot]
+            if correct != 0:
+                s += wp.cw_mul(prolonged(level, x, world, slot), free[slot])
+                z[world, slot] = s
+            rz = f64(wp.dot(a, s))
+            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
+        rz = row_sum(rz, warp)
+        rr = row_sum(rr, warp)
+        if slot % warp == 0:
+            rows[0, world, slot / warp] = rz
+            rows[1, world, slot / warp] = rr
+
+    @wp.kernel(module=module)
+    def chebyshev(
+        level: Level,
+        correct: int,
+        coarse: wp.array2d(dtype=vec3),
+        z: wp.array2d(dtype=vec3),
+        keep: T,
+        step: T,
+        active: wp.array(dtype=wp.int32),
+        d: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+    ):
+        """d = keep d + step (z + P coarse), x += d; with keep = 0 both start anew."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        s = z[world, slot]
+        if correct != 0:
+            s += prolonged(level, coarse, world, slot)
+        s = step * s
+        if keep == T(0.0):
+            d[world, slot] = s
+            x[world, slot] = s
+        else:
+            s += keep * d[world, slot]
+            d[world, slot] = s
+            x[world, slot] = x[world, slot] + s
+
+    @wp.kernel(module=module)
+    def subtract_product(
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        d: wp.array2d(dtype=vec3),
+        lanes: int,
+        active: wp.array(dtype=wp.int32),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """r -= A d, so many lanes per row."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        slot = index / lanes
+        lane = index % lanes
+        s = vec3()
+        if slot < r.shape[1]:
+            for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
+                s += value[world, k] * d[world, pattern.column[k]]
+        s = lane_sum(s, lanes)
+        if lane == 0 and slot < r.shape[1]:
+            r[world, slot] = r[world, slot] - s
+
+    @wp.func
+    def part_of(root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, k: int) -> T:
+        if wp.static(scaled):
+            return r[world, k] * root[world, k]
+        else:
+            return r[world, k]
+
+    @wp.kernel(module=module)
+    def apply_dense(
+        matrix: wp.array3d(dtype=S),
+        root: wp.array2d(dtype=T),
+        lanes: int,
+        r: wp.array2d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        x: wp.array2d(dtype=T),
+    ):
+        """x = A^-1 r, so many lanes per row."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        lane = index % lanes
+        row = wp.min(index / lanes, x.shape[1] - 1)
+        # four sums at once keep enough loads under way
+        n = r.shape[1]
+        s0 = T(0.0)
+        s1 = T(0.0)
+        s2 = T(0.0)
+        s3 = T(0.0)
+        last = n - 3 * lanes
+        k = lane
+        while k < last:
+            s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
+            s1 += T(matrix[world, row, k + lanes]) * part_of(root, r, world, k + lanes)
+            s2 += T(matrix[world, row, k + 2 * lanes]) * part_of(root, r, world, k + 2 * lanes)
+            s3 += T(matrix[world, row, k + 3 * lanes]) * part_of(root, r, world, k + 3 * lanes)
+            k += 4 * lanes
+        while k < n:
+            s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
+            k += lanes
+        s = scalar_sum((s0 + s1) + (s2 + s3), lanes)
+        if lane == 0:
+            if wp.static(scaled):
+                s = s * root[world, row]
+            x[world, row] = s
+
+    return _types.SimpleNamespace(
+        module=module,
+        smooth=smooth,
+        add_coarse=add_coarse,
+        chebyshev=chebyshev,
+        subtract_product=subtract_product,
+        apply_dense=apply_dense,
+    )

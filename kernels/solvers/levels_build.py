@@ -1,0 +1,305 @@
+"""Making of the levels: tiles and dense matrices filled, inverted by Gauss-Jordan, and put into their storage.
+
+Work of a block is shared by the lanes of a block on CUDA and done by one lane on the CPU.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.lanes import lane_functions
+from ..common.structs import pattern_struct
+from ..common.types import SMALL, kernel_module, precision
+from .levels import TILE, level_struct
+
+__all__ = ["build_kernels"]
+
+
+@functools.cache
+def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamespace:
+    """Kernels that make the levels in one precision.
+
+    `storage`: precision of the inverses, by default the same. Another one holds them scaled to a unit diagonal of A,
+    R B R with R^2 = diag A, and with so much on the diagonal that rounding leaves them positive definite.
+    """
+    storage = storage or dtype
+    S = precision(storage).T
+    ROUNDING = {"float64": 2.0**-53, "float32": 2.0**-24}[storage]
+    p = precision(dtype)
+    T, mat33 = p.T, p.mat33
+    f64 = wp.float64
+    vec4 = wp.types.vector(length=4, dtype=T)
+    Level = level_struct(dtype)
+    Pattern = pattern_struct()
+    sync = lane_functions(dtype).sync
+    # a pivot below this share of its diagonal is rounding: the functions are dependent
+    NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
+    module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SMALL)
+
+    @wp.kernel(module=module)
+    def fill_tiles(
+        level: Level,
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array3d(dtype=T),
+        matrix: wp.array4d(dtype=T),
+    ):
+        """Diagonal blocks of A and their diagonal, one thread per slot; rows without an unknown are zero."""
+        world, tile, place = wp.tid()
+        if active[world] == 0:
+            return
+        for a in range(3):
+            diagonal[world, tile, 3 * place + a] = T(0.0)
+            for j in range(TILE):
+                matrix[world, tile, 3 * place + a, j] = T(0.0)
+        slot = level.tile_slot[tile, place]
+        if slot < 0:
+            return
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            other = pattern.column[k]
+            if level.tile_of[other] == tile:
+                b = 3 * level.place_of[other]
+                A = value[world, k]
+                for i in range(3):
+                    for j in range(3):
+                        matrix[world, tile, 3 * place + i, b + j] = A[i, j]
+        for a in range(3):
+            diagonal[world, tile, 3 * place + a] = matrix[world, tile, 3 * place + a, 3 * place + a]
+
+    @wp.kernel(module=module)
+    def invert_tiles(
+        lanes: int,
+        tiles: int,
+        keep: int,
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array3d(dtype=T),
+        column: wp.array3d(dtype=T),
+        matrix: wp.array4d(dtype=T),
+    ):
+        """Inverse in place by Gauss-Jordan. A row whose pivot is not safely positive, measured by its given diagonal,
+        is dropped: zeros, or with `keep` the inverse of the diagonal, so that the result is positive (semi-)definite
+        always."""
+        thread = wp.tid()
+        lane = thread % lanes
+        index = thread / lanes
+        tile = index % tiles
+        world = index / tiles
+        if active[world] == 0:
+            return
+        for k in range(TILE):
+            for i in range(lane, TILE, lanes):
+                column[world, tile, i] = matrix[world, tile, i, k]
+            sync()
+            pivot = column[world, tile, k]
+            size = diagonal[world, tile, k]
+            if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
+                scale = T(1.0) / pivot
+                for j in range(lane, TILE, lanes):
+                    if j == k:
+                        for i in range(TILE):
+                            matrix[world, tile, i, k] = -scale * column[world, tile, i]
+                        matrix[world, tile, k, k] = scale
+                    else:
+                        d = scale * matrix[world, tile, k, j]
+                        for i in range(TILE):
+                            matrix[world, tile, i, j] = matrix[world, tile, i, j] - d * column[world, tile, i]
+                        matrix[world, tile, k, j] = d
+            else:
+                for j in range(lane, TILE, lanes):
+                    matrix[world, tile, k, j] = T(0.0)
+                    matrix[world, tile, j, k] = T(0.0)
+                sync()
+                if lane == 0 and keep != 0 and wp.abs(size) > T(0.0):
+                    # negative now: the pivots to come must not see it, the end turns its sign
+                    diagonal[world, tile, k] = -wp.abs(size)
+            sync()
+        for j in range(lane, TILE, lanes):
+            size = diagonal[world, tile, j]
+            if size < T(0.0) and keep != 0:
+                matrix[world, tile, j, j] = -T(1.0) / size
+
+    @wp.kernel(module=module)
+    def fill_dense(
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        slots: int,
+        active: wp.array(dtype=wp.int32),
+        scale: wp.array2d(dtype=T),
+        matrix: wp.array3d(dtype=T),
+    ):
+        """The whole matrix and its diagonal, one thread per row of slots; rows beyond the slots are zero."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        for a in range(3):
+            scale[world, 3 * slot + a] = T(0.0)
+            for j in range(matrix.shape[2]):
+                matrix[world, 3 * slot + a, j] = T(0.0)
+        if slot >= slots:
+            return
+        for k in range(pattern.start[slot], pattern.start[slot + 1]):
+            b = 3 * pattern.column[k]
+            A = value[world, k]
+            for i in range(3):
+                for j in range(3):
+                    matrix[world, 3 * slot + i, b + j] = A[i, j]
+                if pattern.column[k] == slot:
+                    scale[world, 3 * slot + i] = A[i, i]
+
+    @wp.kernel(module=module)
+    def take_pivot(
+        matrix: wp.array3d(dtype=T),
+        scale: wp.array2d(dtype=T),
+        first: int,
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array3d(dtype=T),
+        pivot: wp.array4d(dtype=T),
+    ):
+        """The pivot's block, and the diagonal that it had at first."""
+        world, i, j = wp.tid()
+        if active[world] != 0:
+            pivot[world, 0, i, j] = matrix[world, first + i, first + j]
+            if i == j:
+                diagonal[world, 0, i] = scale[world, first + i]
+
+    @wp.kernel(module=module)
+    def take_panels(
+        matrix: wp.array3d(dtype=T),
+        pivot: wp.array4d(dtype=T),
+        first: int,
+        active: wp.array(dtype=wp.int32),
+        left: wp.array3d(dtype=T),
+        top: wp.array3d(dtype=T),
+    ):
+        """left = A_ik P, top = A_kj: what the rest of the matrix is changed with."""
+        world, m, i = wp.tid()
+        if active[world] == 0:
+            return
+        s = T(0.0)
+        for n in range(TILE):
+            # the rows of A beside the pivot are symmetric but for the sign that columns done before have
+            s += matrix[world, i, first + n] * pivot[world, 0, n, m]
+        left[world, m, i] = s
+        top[world, m, i] = matrix[world, first + m, i]
+
+    @wp.kernel(module=module)
+    def eliminate(
+        pivot: wp.array4d(dtype=T),
+        left: wp.array3d(dtype=T),
+        top: wp.array3d(dtype=T),
+        first: int,
+        active: wp.array(dtype=wp.int32),
+        matrix: wp.array3d(dtype=T),
+    ):
+        """One pivot of block Gauss-Jordan; a thread does four rows of a column, which share what they read."""
+        world, i4, j = wp.tid()
+        if active[world] == 0:
+            return
+        i = 4 * i4
+        # a tile's size is a multiple of 4: the rows lie on the same side of it
+        in_row = i >= first and i < first + TILE
+        in_column = j >= first and j < first + TILE
+        s = vec4()
+        if in_row and in_column:
+            for a in range(4):
+                s[a] = pivot[world, 0, i - first + a, j - first]
+        elif in_column:
+            for a in range(4):
+                s[a] = -left[world, j - first, i + a]
+        elif in_row:
+            for m in range(TILE):
+                x = top[world, m, j]
+                for a in range(4):
+                    s[a] = s[a] + pivot[world, 0, i - first + a, m] * x
+        else:
+            for a in range(4):
+                s[a] = matrix[world, i + a, j]
+            for m in range(TILE):
+                x = top[world, m, j]
+                for a in range(4):
+                    s[a] = s[a] - left[world, m, i + a] * x
+        for a in range(4):
+            matrix[world, i + a, j] = s[a]
+
+    @wp.func
+    def inverse_root(d: T) -> T:
+        """1/sqrt of a pivot's diagonal, 0 without an unknown."""
+        return wp.where(d == T(0.0), T(0.0), T(1.0) / wp.sqrt(wp.abs(d)))
+
+    @wp.func
+    def scaled_entry(b: T, own: T, other: T, on_diagonal: bool, trace: T) -> S:
+        """An entry of R B R, with what rounding needs on the diagonal."""
+        x = T(0.0)
+        if own > T(0.0) and other > T(0.0):
+            x = b / (own * other)
+            if on_diagonal:
+                x += T(ROUNDING) * trace
+        return S(x)
+
+    @wp.kernel(module=module)
+    def store_tiles(
+        tiles: int,
+        diagonal: wp.array3d(dtype=T),
+        matrix: wp.array4d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        root: wp.array3d(dtype=T),
+        stored: wp.array4d(dtype=S),
+    ):
+        """Inverses of tiles into their storage, one thread per row."""
+        world, tile, i = wp.tid()
+        if active[world] == 0:
+            return
+        trace = T(0.0)
+        for j in range(TILE):
+            trace += matrix[world, tile, j, j] * wp.abs(diagonal[world, tile, j])
+        own = inverse_root(diagonal[world, tile, i])
+        root[world, tile, i] = own
+        for j in range(TILE):
+            other = inverse_root(diagonal[world, tile, j])
+            stored[world, tile, i, j] = scaled_entry(matrix[world, tile, i, j], own, other, i == j, trace)
+
+    @wp.kernel(module=module)
+    def store_dense(
+        diagonal: wp.array2d(dtype=T),
+        trace: wp.array2d(dtype=f64),
+        matrix: wp.array3d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        root: wp.array2d(dtype=T),
+        stored: wp.array3d(dtype=S),
+    ):
+        """The dense inverse into its storage."""
+        world, i, j = wp.tid()
+        if active[world] == 0:
+            return
+        own = inverse_root(diagonal[world, i])
+        other = inverse_root(diagonal[world, j])
+        stored[world, i, j] = scaled_entry(matrix[world, i, j], own, other, i == j, T(trace[0, world]))
+        if i == j:
+            root[world, i] = own
+
+    @wp.kernel(module=module)
+    def dense_traces(
+        diagonal: wp.array2d(dtype=T),
+        matrix: wp.array3d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """Terms of the trace of the scaled inverse."""
+        world, i = wp.tid()
+        if active[world] != 0:
+            rows[0, world, i] = f64(matrix[world, i, i] * wp.abs(diagonal[world, i]))
+
+    return _types.SimpleNamespace(
+        module=module,
+        fill_tiles=fill_tiles,
+        invert_tiles=invert_tiles,
+        fill_dense=fill_dense,
+        take_pivot=take_pivot,
+        take_panels=take_panels,
+        eliminate=eliminate,
+        store_tiles=store_tiles,
+        store_dense=store_dense,
+        dense_traces=dense_traces,
+    )

@@ -1,0 +1,1 @@
+"""The step: time levels, residual, ledger, predictor."""

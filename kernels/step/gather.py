@@ -1,0 +1,343 @@
+"""From element contributions to slots: the residual of a step Eq. (17), the product H p, the diagonal blocks.
+
+Contributions are gathered per slot in a fixed order instead of added atomically: reproducible, and faster.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.inverse import inverse_function
+from ..common.lanes import lane_functions
+from ..common.structs import additions_struct, balance_struct, pattern_struct, topology_struct
+from ..common.types import SMALL, kernel_module, precision
+from ..terms.constraints import constraint_struct, multiplier_struct
+
+__all__ = ["RESIDUAL_ROWS", "gather_kernels"]
+
+RESIDUAL_ROWS = 10
+"""Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
+part of Phi and its magnitude; g.p with non-potential forces held; what Phi changes by when they are refreshed; the
+squared norm of the rounding of the positions; |g|^2."""
+
+
+SUM_BLOCKS = {"float64": 6, "float32": 8}
+"""Blocks of 256 threads of `with_mass_sum` that registers must leave room for: it waits for memory most of the time."""
+REACTION = wp.constant(wp.float64(1.0e-6))
+"""Share of the squared reactions in the squared scale of the residual."""
+
+
+@functools.cache
+def gather_kernels(
+    dtype: str, nonpotential: bool, pressure: bool = False, constrained: bool = False
+) -> _types.SimpleNamespace:
+    """Kernels over slots; `nonpotential` adds forces that are held inside a line search, `pressure` their tangent,
+    `constrained` the forces of constraints."""
+    p = precision(dtype)
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    Topology = topology_struct(dtype)
+    Balance, Additions = balance_struct(dtype), additions_struct(dtype)
+    Constraints, Multipliers = constraint_struct(), multiplier_struct()
+    f64 = wp.float64
+    Pattern = pattern_struct()
+    lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
+    free_inverse = inverse_function(dtype)
+    name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
+    module = kernel_module(f"gather_{name}", max_unroll=SMALL)
+    matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
+
+    @wp.func
+    def weighted(a: vec3, D: vec3) -> f64:
+        s = f64(0.0)
+        for k in range(3):
+            x = f64(a[k])
+            if x != f64(0.0):
+                s += x * x / f64(D[k])
+        return s
+
+    @wp.func
+    def spread(u: vec3, free: vec3, D: vec3, dq: f64) -> f64:
+        """Squared D norm of the velocity that makes all of u: times eps^2, what its rounding does to the residual."""
+        s = f64(0.0)
+        for k in range(3):
+            x = f64(u[k]) / dq
+            s += f64(free[k]) * f64(D[k]) * x * x
+        return s
+
+    @wp.func
+    def constraint_forces(con: Constraints, mul: Multipliers, world: int, slot: int) -> wp.mat33d:
+        """J^T of the trial's lambda, of rho c, and of the held lambda + rho c, as rows."""
+        tie = wp.vec3d()
+        squeeze = wp.vec3d()
+        merit = wp.vec3d()
+        for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
+            term = con.slot_term[k]
+            row = term / 3
+            d = con.slot_weight[k] * mul.gradient[world, term]
+            tie += mul.trial[world, row] * d
+            squeeze += mul.excess[world, row] * d
+            merit += mul.merit[world, row] * d
+        return wp.matrix_from_rows(tie, squeeze, merit)
+
+    @wp.kernel(module=module)
+    def gather_force(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        out: wp.array2d(dtype=vec3),
+    ):
+        """out = sum of contributions."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        f = vec3()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            f += contribution[world, topo.entry[k]]
+        out[world, slot] = f
+
+    @wp.kernel(module=module)
+    def residual(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        balance: Balance,
+        active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
+    ):
+        """Eq. (17): g = M (v - v~) c_M + f_int - f_dead - f_nonpotential + J^T lambda, and the rows of `RESIDUAL_ROWS`.
+
+        `gradient` is that of the augmented potential, g + J^T rho c, which the next Newton step is solved for.
+        """
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        f = vec3()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            f += contribution[world, topo.entry[k]]
+        a = vec3()
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            j = topo.mass_column[k]
+            a += topo.mass_value[k] * (balance.v[world, j] - balance.v_tilde[world, j])
+        a = T(balance.mass_factor[world]) * a
+        load = balance.dead[world, slot]
+        magnitude = balance.dead_magnitude[world, slot]
+        held = load
+        if wp.static(nonpotential):
+            new = balance.nonpotential[world, slot]
+            held = load + balance.nonpotential_held[world, slot]
+            load = load + new
+            for k in range(3):
+                magnitude[k] = magnitude[k] + wp.abs(new[k])
+        residual_force = a + f - load
+        descent = a + f - held
+        if wp.static(constrained):
+            tie = constraint_forces(con, mul, world, slot)
+            residual_force += vec3(tie[0])
+            balance.gradient[world, slot] = residual_force + vec3(tie[1])
+            descent += vec3(tie[2])
+            for k in range(3):
+                magnitude[k] = magnitude[k] + T(wp.abs(tie[0][k]))
+        balance.inertia[world, slot] = a
+        balance.internal[world, slot] = f
+        balance.g[world, slot] = residual_force
+        free = topo.free[slot]
+        D = balance.diagonal[world, slot]
+        vs = balance.v[world, slot]
+        kinetic = T(0.5) * wp.dot(vs - balance.v_tilde[world, slot], a)
+        work = wp.dot(held, vs)
+        balance.rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
+        # a held, stressed body without loads has no other force than its reactions: a small part of them is its scale
+        reaction = f - wp.cw_mul(f, free)
+        balance.rows[1, world, slot] = weighted(wp.cw_mul(f, free), D) + REACTION * weighted(reaction, D)
+        balance.rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
+        balance.rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
+        balance.rows[4, world, slot] = f64(kinetic - work)
+        balance.rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
+        balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
+        balance.rows[7, world, slot] = f64(0.0)
+        if wp.static(nonpotential):
+            balance.rows[7, world, slot] = f64(
+                wp.dot(balance.nonpotential_held[world, slot] - balance.nonpotential[world, slot], vs)
+            )
+        balance.rows[8, world, slot] = spread(balance.u[world, slot], free, D, balance.dq_dv[world])
+        plain = wp.cw_mul(residual_force, free)
+        balance.rows[9, world, slot] = f64(wp.dot(plain, plain))
+
+    @wp.func
+    def finish(
+        topo: Topology,
+        h: vec3,
+        more: Additions,
+        p: vec3,
+        con: Constraints,
+        mul: Multipliers,
+        world: int,
+        slot: int,
+        result: wp.array2d(dtype=vec3),
+    ) -> f64:
+        """H p: follower loads and constraints added to the elements' part, on the free components; returns p.Hp."""
+        out = h
+        if wp.static(pressure):
+            f = vec3()
+            for k in range(more.start[slot], more.start[slot + 1]):
+                f += more.contribution[world, more.entry[k]]
+            out -= T(more.dq_dv[world]) * f
+        if wp.static(constrained):
+            tie = wp.vec3d()
+            for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
+                tie += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
+            out += vec3(tie)
+        held = int(topo.held[slot])
+        for k in range(3):
+            if held & (1 << k) != 0:
+                out[k] = T(0.0)
+        result[world, slot] = out
+        return f64(wp.dot(out, p))
+
+    @wp.func
+    def share_of_warp(share: f64, index: int, warp: int, world: int, rows: wp.array3d(dtype=f64)):
+        """p.Hp of a warp's rows."""
+        total = row_sum(share, warp)
+        if index % warp == 0:
+            rows[0, world, index / warp] = total
+
+    @wp.kernel(module=module)
+    def product(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        more: Additions,
+        p_in: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
+        out: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        share = f64(0.0)
+        if slot < out.shape[1]:
+            f = vec3()
+            for k in range(topo.start[slot], topo.start[slot + 1]):
+                f += contribution[world, topo.entry[k]]
+            a = vec3()
+            for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+                a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
+            dq = T(more.dq_dv[world])
+            h = T(more.mass_factor[world]) * a + dq * f
+            share = finish(topo, h, more, p_in[world, slot], con, mul, world, slot, out)
+        share_of_warp(share, slot, more.warp, world, rows)
+
+    @wp.kernel(module=module, launch_bounds=(256, SUM_BLOCKS[dtype]))
+    def with_mass_sum(
+        topo: Topology,
+        contribution: wp.array2d(dtype=vec3),
+        more: Additions,
+        p_in: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
+        out: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """The same from contributions that hold the mass and the factors."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        share = f64(0.0)
+        if slot < out.shape[1]:
+            p = p_in[world, slot]
+            f = vec3()
+            for k in range(topo.start[slot], topo.start[slot + 1]):
+                f += contribution[world, topo.entry[k]]
+            share = finish(topo, f, more, p, con, mul, world, slot, out)
+        share_of_warp(share, slot, more.warp, world, rows)
+
+    @wp.kernel(module=matrix_module)
+    def matrix_product(
+        topo: Topology,
+        pattern: Pattern,
+        value: wp.array2d(dtype=mat33),
+        lanes: int,
+        more: Additions,
+        p_in: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        con: Constraints,
+        mul: Multipliers,
+        out: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """The same with the elements' part and the mass as one matrix, so many lanes per row."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        slot = index / lanes
+        lane = index % lanes
+        h = vec3()
+        if slot < out.shape[1]:
+            for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
+                h += value[world, k] * p_in[world, pattern.column[k]]
+        h = lane_sum(h, lanes)
+        share = f64(0.0)
+        if lane == 0 and slot < out.shape[1]:
+            share = finish(topo, h, more, p_in[world, slot], con, mul, world, slot, out)
+        share_of_warp(share, index, more.warp, world, rows)
+
+    @wp.kernel(module=module)
+    def gather_blocks(
+        topo: Topology,
+        contribution: wp.array2d(dtype=sym6),
+        mass_factor: wp.array(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        diagonal: wp.array2d(dtype=vec3),
+        inverse: wp.array2d(dtype=mat33),
+    ):
+        """Diagonal blocks of H: their diagonal D and their inverse on the free components."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        k6 = sym6()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            k6 += contribution[world, topo.entry[k]]
+        mass = T(0.0)
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            if topo.mass_column[k] == slot:
+                mass = T(mass_factor[world]) * topo.mass_value[k]
+        k6 = T(dq_dv[world]) * k6
+        A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
+        free = topo.free[slot]
+        D = vec3()
+        for i in range(3):
+            A[i, i] = A[i, i] + mass
+            D[i] = wp.max(wp.abs(A[i, i]), T(1.0e-30))
+        diagonal[world, slot] = D
+        inverse[world, slot] = free_inverse(A, mass, free)
+
+    @wp.kernel(module=module)
+    def mass_product(
+        topo: Topology,
+        a: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """a.M a / 2 per slot, for every world."""
+        world, slot = wp.tid()
+        s = vec3()
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            s += topo.mass_value[k] * a[world, topo.mass_column[k]]
+        rows[0, world, slot] = f64(0.5) * f64(wp.dot(s, a[world, slot]))
+
+    return _types.SimpleNamespace(
+        module=module,
+        matrix_module=matrix_module,
+        matrix_product=matrix_product,
+        gather_force=gather_force,
+        residual=residual,
+        product=product,
+        with_mass_sum=with_mass_sum,
+        gather_blocks=gather_blocks,
+        mass_product=mass_product,
+    )

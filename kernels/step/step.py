@@ -1,0 +1,423 @@
+"""The step itself: time levels, predictor, acceptance, energy ledger, report.
+
+A step of dt is walked in substeps of dt / 2^level. A refused substep raises the level by one; after an accepted one
+the level falls again as soon as the position is even, so that time stays an exact binary fraction of dt.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.structs import balance_struct, topology_struct
+from ..common.types import kernel_module, precision
+from ..solvers.newton import control_struct
+from ..solvers.pcg import pcg_struct
+
+__all__ = ["LEDGER", "LEDGER_ROWS", "REPORT", "STATUS", "step_kernels", "step_struct"]
+
+STATUS = {"running": 0, "failed": 1, "frozen": 2}
+
+REPORT = (
+    "status",
+    "newton",
+    "pcg",
+    "residual",
+    "halvings",
+    "min_J",
+    "time",
+    "failure",
+    "attempt_time",
+    "violation",
+    "outer",
+    "residual_force",
+    "rough",
+)
+"""Columns of the report of a step, [world, column] in float64; probes follow."""
+
+LEDGER = (
+    "kinetic",
+    "strain",
+    "potential",
+    "work_loads",
+    "work_supports",
+    "work_fields",
+    "viscous",
+    "integrator",
+    "ledger_residual",
+    "unbalanced",
+    "work_joints",
+)
+"""Columns of the energy ledger, J, accumulated since the start (the first three: current values)."""
+
+LEDGER_ROWS = 10
+
+
+@functools.cache
+def step_struct():
+    """What the step loop knows of each world."""
+
+    @wp.struct
+    class StepControl:
+        status: wp.array(dtype=wp.int32)  # STATUS
+        running: wp.array(dtype=wp.int32)  # this step is not finished
+        level: wp.array(dtype=wp.int32)
+        part: wp.array(dtype=wp.int32)  # substeps of the level that are done
+        halvings: wp.array(dtype=wp.int32)
+        refused: wp.array(dtype=wp.int32)  # in this attempt
+        accepted: wp.array(dtype=wp.int32)
+        first_refusal: wp.array(dtype=wp.int32)
+        time: wp.array(dtype=wp.float64)  # s, state
+        new_time: wp.array(dtype=wp.float64)  # end of the attempt
+        step_start: wp.array(dtype=wp.float64)
+        h: wp.array(dtype=wp.float64)
+        previous_h: wp.array(dtype=wp.float64)  # state of multistep schemes; 0 before the first step
+        previous_end: wp.array(dtype=wp.float64)  # time that the step before ended at
+        dt: wp.array(dtype=wp.float64)
+        a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1}
+        a1: wp.array(dtype=wp.float64)
+        dq_dv: wp.array(dtype=wp.float64)  # beta h
+        mass_factor: wp.array(dtype=wp.float64)  # 1/(beta h), 0 in statics
+        ramp: wp.array(dtype=wp.float64)  # factor of constant loads
+        gravity: wp.array(dtype=wp.vec3d)
+        any_running: wp.array(dtype=wp.int32)
+        max_halvings: wp.int32
+        total_J: wp.array(dtype=wp.float64)
+        ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
+
+    return StepControl
+
+
+@functools.cache
+def step_kernels(
+    dtype: str, coefficients: wp.Function, static: bool, multistep: bool, nonpotential: bool, constrained: bool = False
+) -> _types.SimpleNamespace:
+    """Kernels of the step loop.
+
+    Args:
+        dtype: precision of the vectors.
+        coefficients: wp.func (h, previous h) -> vec3d(a0, a1, beta) of the time discretisation.
+        static: no inertia, v is the displacement increment.
+        multistep: the scheme uses the step before the last.
+        nonpotential: forces without a potential act.
+        constrained: the model has constraints.
+    """
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Step = step_struct()
+    Newton = control_struct()
+    Topology, Balance = topology_struct(dtype), balance_struct(dtype)
+    PCG = pcg_struct()
+    tied = "_constrained" if constrained else ""
+    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}_{nonpotential}{tied}")
+
+    @wp.kernel(module=module)
+    def begin_step(step: Step, newton: Newton, pcg: PCG):
+        """Open a step of every world that has not failed."""
+        world = wp.tid()
+        alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
+        step.running[world] = alive
+        step.refused[world] = 0
+        newton.total_iterations[world] = 0
+        newton.rough[world] = 0
+        if wp.static(constrained):
+            newton.outer[world] = 0
+        pcg.total[world] = 0
+        step.halvings[world] = 0
+        if alive == 0:
+            return
+        wp.atomic_max(step.any_running, 0, 1)
+        step.level[world] = 0
+        step.part[world] = 0
+        step.step_start[world] = step.time[world]
+        step.total_J[world] = f64(1.0e30)
+
+    @wp.kernel(module=module)
+    def begin_attempt(step: Step, newton: Newton):
+        """Time levels and coefficients of the next substep."""
+        world = wp.tid()
+        if world == 0:
+            step.any_running[0] = 0
+        step.accepted[world] = 0
+        step.first_refusal[world] = 0
+        newton.active[world] = step.running[world]
+        newton.searching[world] = 0
+        if step.running[world] == 0:
+            return  # `refused` keeps the verdict of a world that failed earlier in this step
+        step.refused[world] = 0
+        newton.failed[world] = 0
+        newton.iterations[world] = 0
+        parts = f64(wp.lshift(1, step.level[world]))
+        h = step.dt[world] / parts
+        step.h[world] = h
+        step.new_time[world] = step.step_start[world] + step.dt[world] * (f64(step.part[world] + 1) / parts)
+        previous = f64(0.0)
+        if wp.static(multistep):
+            # a state that was set, reset or advanced by another scheme since has no past
+            if step.previous_end[world] == step.time[world]:
+                previous = step.previous_h[world]
+        c = coefficients(h, previous)
+        step.a0[world] = c[0]
+        step.a1[world] = c[1]
+        if wp.static(static):
+            step.dq_dv[world] = f64(1.0)
+            step.mass_factor[world] = f64(0.0)
+            step.ramp[world] = step.new_time[world]
+        else:
+            step.dq_dv[world] = c[2] * h
+            step.mass_factor[world] = f64(1.0) / (c[2] * h)
+            step.ramp[world] = f64(1.0)
+
+    @wp.kernel(module=module)
+    def predict(
+        step: Step,
+        is_position: wp.array(dtype=T),
+        free: wp.array(dtype=vec3),
+        u_n: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        u_before: wp.array2d(dtype=vec3),
+        v_before: wp.array2d(dtype=vec3),
+        q_tilde: wp.array2d(dtype=vec3),
+        v_tilde: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+    ):
+        """q~, v~ and the first iterate; a clamped component keeps its place.
+
+        The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) where the step before is known: its error is
+        of the second order in h then, which a stiff rotating body needs.
+        """
+        world, slot = wp.tid()
+        if step.running[world] == 0:
+            return
+        q = u_n[world, slot]
+        w = v_n[world, slot]
+        if wp.static(multistep):
+            a0 = T(step.a0[world])
+            a1 = T(step.a1[world])
+            q = a0 * q - a1 * u_before[world, slot]
+            w = a0 * w - a1 * v_before[world, slot]
+        q_tilde[world, slot] = q
+        v_tilde[world, slot] = w
+        first = vec3()
+        dq = T(step.dq_dv[world])
+        if wp.static(not static):
+            first = w + (dq * is_position[slot]) * vec3(step.gravity[world])
+            if wp.static(multistep):
+                if step.a1[world] > f64(0.0):  # goes on as it went: exact for a constant acceleration too
+                    ratio = T(step.h[world] / step.previous_h[world])
+                    first = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
+        keep = (T(1.0) / dq) * (u_n[world, slot] - q)
+        f = free[slot]
+        for k in range(3):
+            if f[k] == T(0.0):
+                first[k] = keep[k]
+        v[world, slot] = first
+
+    @wp.kernel(module=module)
+    def end_attempt(step: Step, newton: Newton):
+        """Accept the substep, or refuse it and halve."""
+        world = wp.tid()
+        if step.running[world] == 0:
+            return
+        if newton.failed[world] == 0:
+            step.accepted[world] = 1
+            step.total_J[world] = wp.min(step.total_J[world], newton.min_J[world])
+            part = step.part[world] + 1
+            level = step.level[world]
+            while level > 0 and part % 2 == 0:
+                part = part / 2
+                level = level - 1
+            step.part[world] = part
+            step.level[world] = level
+            step.time[world] = step.new_time[world]
+            if level == 0:
+                step.running[world] = 0
+            else:
+                wp.atomic_max(step.any_running, 0, 1)
+            return
+        step.refused[world] = 1
+        if step.halvings[world] == 0:
+            step.first_refusal[world] = 1
+        step.halvings[world] = step.halvings[world] + 1
+        level = step.level[world] + 1
+        if level > step.max_halvings:
+            step.status[world] = wp.static(STATUS["failed"])
+            step.running[world] = 0
+        else:
+            step.level[world] = level
+            step.part[world] = step.part[world] * 2
+            wp.atomic_max(step.any_running, 0, 1)
+
+    @wp.kernel(module=module)
+    def failed_now(step: Step, flags: wp.array(dtype=wp.int32)):
+        """Flags of the worlds whose step failed for good: accepted substeps of it are taken back."""
+        world = wp.tid()
+        flags[world] = 0
+        if step.status[world] == wp.static(STATUS["failed"]) and step.refused[world] == 1:
+            flags[world] = 1
+
+    @wp.kernel(module=module)
+    def commit(
+        step: Step,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        u_n: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        u_before: wp.array2d(dtype=vec3),
+        v_before: wp.array2d(dtype=vec3),
+    ):
+        """Make the accepted iterate the state."""
+        world, slot = wp.tid()
+        if step.accepted[world] == 0:
+            return
+        if wp.static(multistep):
+            u_before[world, slot] = u_n[world, slot]
+            v_before[world, slot] = v_n[world, slot]
+            if slot == 0:
+                step.previous_h[world] = step.h[world]
+                step.previous_end[world] = step.new_time[world]
+        u_n[world, slot] = u[world, slot]
+        if wp.static(not static):
+            v_n[world, slot] = v[world, slot]
+
+    @wp.kernel(module=module)
+    def ledger_rows(
+        step: Step,
+        topo: Topology,
+        balance: Balance,
+        lumped: wp.array(dtype=T),
+        u_n: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+    ):
+        """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq,
+        nonpotential.dq, inertia.dq, gravity.u."""
+        world, slot = wp.tid()
+        if step.accepted[world] == 0:
+            return
+        Mv = vec3()
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            Mv += topo.mass_value[k] * balance.v[world, topo.mass_column[k]]
+        dq = balance.u[world, slot] - u_n[world, slot]
+        a = balance.inertia[world, slot]
+        dv = balance.v[world, slot] - v_n[world, slot]
+        f = topo.free[slot]
+        held = vec3(T(1.0) - f[0], T(1.0) - f[1], T(1.0) - f[2])
+        weight = lumped[slot] * vec3(step.gravity[world])
+        loads = balance.dead[world, slot]
+        balance.rows[0, world, slot] = f64(0.5) * step.dq_dv[world] * f64(wp.dot(dv, a))
+        balance.rows[1, world, slot] = f64(wp.dot(balance.internal[world, slot], dq))
+        balance.rows[2, world, slot] = f64(wp.dot(loads, dq))
+        balance.rows[3, world, slot] = f64(wp.dot(weight, dq))
+        balance.rows[4, world, slot] = f64(wp.dot(wp.cw_mul(balance.g[world, slot], held), dq))
+        balance.rows[5, world, slot] = f64(0.5) * f64(wp.dot(balance.v[world, slot], Mv))
+        balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(balance.g[world, slot], f), dq))
+        balance.rows[7, world, slot] = f64(0.0)
+        if wp.static(nonpotential):
+            balance.rows[7, world, slot] = f64(wp.dot(balance.nonpotential[world, slot], dq))
+        balance.rows[8, world, slot] = f64(wp.dot(a, dq))
+        balance.rows[9, world, slot] = f64(wp.dot(weight, balance.u[world, slot]))
+
+    @wp.kernel(module=module)
+    def ledger_update(
+        step: Step,
+        newton: Newton,
+        sums: wp.array2d(dtype=f64),
+        explicit_viscous: wp.array(dtype=f64),
+        constraint_work: wp.array2d(dtype=f64),
+        ledger: wp.array2d(dtype=f64),
+    ):
+        """Add a substep to the ledger; the integrator's part from its own formula, never as the remainder."""
+        world = wp.tid()
+        if step.accepted[world] == 0:
+            return
+        kinetic = sums[5, world]
+        strain = newton.elem_sums[0, world]
+        change_K = kinetic - ledger[world, 0]
+        change_W = strain - ledger[world, 1]
+        implicit = f64(2.0) * newton.elem_sums[1, world] * (step.h[world] / step.dq_dv[world])
+        viscous = implicit + explicit_viscous[world]
+        loads = sums[2, world] + explicit_viscous[world] - sums[3, world]
+        numerical = sums[1, world] - change_W - implicit
+        if wp.static(multistep):
+            numerical += sums[8, world] - change_K
+        else:
+            numerical += sums[0, world]
+        joints = f64(0.0)
+        if wp.static(constrained):
+            joints = constraint_work[0, world]
+            numerical += constraint_work[1, world]
+        step.ledger_time[world] = step.time[world]
+        ledger[world, 0] = kinetic
+        ledger[world, 1] = strain
+        ledger[world, 2] = -sums[9, world]
+        ledger[world, 3] = ledger[world, 3] + loads
+        ledger[world, 4] = ledger[world, 4] + sums[4, world]
+        ledger[world, 5] = ledger[world, 5] + sums[7, world]
+        ledger[world, 6] = ledger[world, 6] + viscous
+        ledger[world, 7] = ledger[world, 7] + numerical
+        balance = change_K + change_W - sums[3, world] + viscous + numerical
+        balance -= loads + sums[4, world] + sums[7, world] + joints
+        ledger[world, 8] = ledger[world, 8] + balance
+        ledger[world, 9] = ledger[world, 9] + sums[6, world]
+        ledger[world, 10] = ledger[world, 10] + joints
+
+    @wp.kernel(module=module)
+    def write_report(step: Step, newton: Newton, pcg: PCG, report: wp.array2d(dtype=f64)):
+        """The one array that the host reads after a step; columns as `REPORT`."""
+        world = wp.tid()
+        report[world, 0] = f64(step.status[world])
+        report[world, 1] = f64(newton.total_iterations[world])
+        report[world, 2] = f64(pcg.total[world])
+        report[world, 3] = newton.relative[world]
+        report[world, 4] = f64(step.halvings[world])
+        report[world, 5] = step.total_J[world]
+        report[world, 6] = step.time[world]
+        report[world, 7] = f64(newton.failed[world])
+        report[world, 8] = step.new_time[world]
+        report[world, 9] = f64(0.0)
+        report[world, 10] = f64(0.0)
+        report[world, 11] = newton.force[world]
+        report[world, 12] = f64(newton.rough[world])
+        if wp.static(constrained):
+            largest = f64(0.0)
+            for c in range(newton.components):
+                largest = wp.max(largest, newton.violation[world, c])
+            report[world, 9] = largest
+            report[world, 10] = f64(newton.outer[world])
+
+    @wp.kernel(module=module)
+    def probe_values(
+        start: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        weight: wp.array(dtype=T),
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        first_column: int,
+        report: wp.array2d(dtype=f64),
+    ):
+        """Displacement and velocity of each probe, sum of s_i u_i, into the report."""
+        world, probe = wp.tid()
+        d = wp.vec3d()
+        w = wp.vec3d()
+        for k in range(start[probe], start[probe + 1]):
+            s = f64(weight[k])
+            d += s * wp.vec3d(u[world, slot[k]])
+            w += s * wp.vec3d(v[world, slot[k]])
+        for c in range(3):
+            report[world, first_column + 6 * probe + c] = d[c]
+            report[world, first_column + 6 * probe + 3 + c] = w[c]
+
+    return _types.SimpleNamespace(
+        module=module,
+        begin_step=begin_step,
+        begin_attempt=begin_attempt,
+        predict=predict,
+        end_attempt=end_attempt,
+        failed_now=failed_now,
+        commit=commit,
+        ledger_rows=ledger_rows,
+        ledger_update=ledger_update,
+        write_report=write_report,
+        probe_values=probe_values,
+    )

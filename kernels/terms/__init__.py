@@ -1,0 +1,1 @@
+"""Forces that are not of elements: loads, followers, constraints."""

@@ -1,0 +1,425 @@
+"""Holonomic constraints by augmented Lagrangian: rows c(q, t) = 0 m, their derivatives, and multipliers in N.
+
+Every constraint is made of vectors a = sum_k w_k e_k, linear in the slots (a difference of two points, a material
+direction, a constant), three at most per row:
+
+    DOT       c = scale (a.b - f)                       DP1, DP2; PIN with b a constant axis
+    DISTANCE  c = scale (|a| - f)                       DIST
+    TURN      c = scale (cos f a2 - sin f a).b          the sine of the angle between b and the direction f of (a, a2)
+
+Vectors are the terms 3 row + side, sides a, b, a2. Rows are evaluated in float64 from displacements, so that c has no
+rounding of large coordinates. One thread per (world, row); slots gather from terms in a fixed order.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module, precision
+
+__all__ = [
+    "DISTANCE",
+    "DOT",
+    "JOINT_COLUMNS",
+    "SUM_ROWS",
+    "TURN",
+    "constraint_functions",
+    "constraint_kernels",
+    "constraint_struct",
+    "joint_struct",
+    "multiplier_struct",
+]
+
+DOT = 0
+DISTANCE = 1
+TURN = 2
+JOINT_COLUMNS = 7
+"""Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
+MOST_TURN = 1.0
+"""rad that a driven angle may change by in a substep: from further off, a body may be crushed instead of turned."""
+SUM_ROWS = 3
+"""Rows summed per world with an evaluation: the augmented potential with the multipliers held, with the new ones, and
+its magnitude."""
+
+
+@functools.cache
+def constraint_struct():
+    """The rows of a model, their terms, and where each slot finds the terms that it enters."""
+
+    @wp.struct
+    class Constraints:
+        kind: wp.array(dtype=wp.int32)  # [row]
+        scale: wp.array(dtype=wp.float64)  # [row]
+        constant: wp.array(dtype=wp.float64)  # [row] A.B of the reference, |A|^2 of distances
+        fixed: wp.array(dtype=wp.float64)  # [row] f without a law
+        law: wp.array(dtype=wp.int32)  # [row] or -1
+        law_component: wp.array(dtype=wp.int32)
+        component: wp.array(dtype=wp.int32)  # [row] connected component of the model
+        start: wp.array(dtype=wp.int32)  # [3 row + 1] entries of a term
+        slot: wp.array(dtype=wp.int32)
+        weight: wp.array(dtype=wp.float64)
+        reference: wp.array(dtype=wp.vec3d)  # [3 row] value of a term in the reference configuration
+        slot_start: wp.array(dtype=wp.int32)  # [slot + 1]
+        slot_term: wp.array(dtype=wp.int32)
+        slot_weight: wp.array(dtype=wp.float64)
+        cluster: wp.array(dtype=wp.int32)  # [row] rows whose matrix is inverted together
+        cluster_start: wp.array(dtype=wp.int32)  # [cluster + 1] rows
+        matrix_start: wp.array(dtype=wp.int32)  # [cluster] entry of its dense matrix
+        pair: wp.array(dtype=wp.int32)  # [matrix entry] its first pair of terms
+        pair_side: wp.array(dtype=wp.vec2i)  # [pair] sides of the row and of the column
+        pair_block: wp.array(dtype=wp.int32)  # [pair] the block of both vectors
+        couple_start: wp.array(dtype=wp.int32)  # [row + 1] its couplings to rows of other clusters
+        couple_row: wp.array(dtype=wp.int32)  # [coupling] the row
+        couple_column: wp.array(dtype=wp.int32)  # [coupling] the other row
+        couple_pair: wp.array(dtype=wp.int32)  # [coupling + 1] its pairs of terms
+        colour: wp.array(dtype=wp.int32)  # [cluster] coupled clusters differ
+        colour_cluster: wp.array(dtype=wp.int32)  # clusters by colour
+        block_start: wp.array(dtype=wp.int32)  # [block + 1]
+        block_slot: wp.array(dtype=wp.int32)
+        block_weight: wp.array(dtype=wp.float64)  # product of both weights at the slot
+
+    return Constraints
+
+
+@functools.cache
+def multiplier_struct():
+    """What varies: [world, row], [world, term]."""
+
+    @wp.struct
+    class Multipliers:
+        value: wp.array2d(dtype=wp.float64)  # c, m
+        target: wp.array2d(dtype=wp.float64)  # f
+        last: wp.array2d(dtype=wp.float64)  # f of the last accepted step
+        gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector
+        scale: wp.array2d(dtype=wp.float64)  # of the row, negative where a turn is more than a right angle off
+        force: wp.array2d(dtype=wp.float64)  # lambda, N
+        change: wp.array2d(dtype=wp.float64)  # of lambda with a full Newton step
+        trial: wp.array2d(dtype=wp.float64)  # lambda at the trial of the line search
+        merit: wp.array2d(dtype=wp.float64)  # lambda + rho c with lambda held in the line search
+        excess: wp.array2d(dtype=wp.float64)  # rho c
+        stiffness: wp.array2d(dtype=wp.float64)  # rho, N/m
+        product: wp.array2d(dtype=wp.vec3d)  # [world, term] contributions to H p
+        rows: wp.array3d(dtype=wp.float64)  # [SUM_ROWS, world, row]
+        violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m
+        block: wp.array2d(dtype=wp.mat33d)  # [world, block] sum w w D^-1
+        matrix: wp.array2d(dtype=wp.float64)  # [world, entry] (1 / (dq/dv rho) + J D^-1 J^T)^-1
+        coupling: wp.array2d(dtype=wp.float64)  # [world, coupling] J D^-1 J^T between clusters
+        restricted: wp.array2d(dtype=wp.float64)  # J D^-1 r
+        swept: wp.array2d(dtype=wp.float64)
+        solved: wp.array2d(dtype=wp.float64)  # matrix times it
+        classical: wp.int32  # multipliers change in the outer loop only
+        kappa: wp.float64
+
+    return Multipliers
+
+
+@functools.cache
+def joint_struct():
+    """Which rows are a joint's, and the child's side of their entries, for reactions."""
+
+    @wp.struct
+    class Joints:
+        first: wp.array(dtype=wp.int32)  # [joint] row
+        last: wp.array(dtype=wp.int32)
+        anchor: wp.array(dtype=wp.vec3d)  # [joint] reference place
+        anchor_start: wp.array(dtype=wp.int32)  # [joint + 1]
+        anchor_slot: wp.array(dtype=wp.int32)
+        anchor_weight: wp.array(dtype=wp.float64)
+        role: wp.array(dtype=wp.int32)  # [entry] 1 child's gradient, 2 child's position, negative: a parent's against
+        # a child in space, 0: not counted
+        place: wp.array(dtype=wp.vec3d)  # [entry] reference value of the slot, in space
+
+    return Joints
+
+
+@functools.cache
+def constraint_functions(dtype: str) -> _types.SimpleNamespace:
+    """Functions of terms and rows that several kernels share."""
+    vec3 = precision(dtype).vec3
+    f64, vec3d = wp.float64, wp.vec3d
+    Constraints, Multipliers = constraint_struct(), multiplier_struct()
+
+    @wp.func
+    def combine(con: Constraints, term: int, x: wp.array2d(dtype=vec3), world: int) -> vec3d:
+        """sum_k w_k x_k of a term."""
+        s = vec3d()
+        for k in range(con.start[term], con.start[term + 1]):
+            s += con.weight[k] * vec3d(x[world, con.slot[k]])
+        return s
+
+    @wp.func
+    def directional(con: Constraints, mul: Multipliers, x: wp.array2d(dtype=vec3), world: int, row: int) -> f64:
+        """(J x) of a row."""
+        s = wp.dot(mul.gradient[world, 3 * row], combine(con, 3 * row, x, world))
+        s += wp.dot(mul.gradient[world, 3 * row + 1], combine(con, 3 * row + 1, x, world))
+        if con.kind[row] == TURN:
+            s += wp.dot(mul.gradient[world, 3 * row + 2], combine(con, 3 * row + 2, x, world))
+        return s
+
+    return _types.SimpleNamespace(combine=combine, directional=directional)
+
+
+@functools.cache
+def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels of the constraints for one precision of the slots."""
+    p = precision(dtype)
+    vec3 = p.vec3
+    f64, vec3d = wp.float64, wp.vec3d
+    Constraints, Multipliers, Joints = constraint_struct(), multiplier_struct(), joint_struct()
+    functions = constraint_functions(dtype)
+    combine, directional = functions.combine, functions.directional
+    module = kernel_module(f"constraints_{dtype}")
+
+    @wp.func
+    def gradients(kind: int, scale: f64, f: f64, a: vec3d, b: vec3d, a2: vec3d) -> wp.mat33d:
+        """dc/da, dc/db, dc/da2 as rows, linear in the vectors; of a distance a must be a unit vector."""
+        if kind == DISTANCE:
+            return wp.matrix_from_rows(scale * a, vec3d(), vec3d())
+        if kind == TURN:
+            s = scale * wp.sin(f)
+            c = scale * wp.cos(f)
+            return wp.matrix_from_rows(-s * b, c * a2 - s * a, c * b)
+        return wp.matrix_from_rows(scale * b, scale * a, vec3d())
+
+    @wp.kernel(module=module)
+    def reset_violation(active: wp.array(dtype=wp.int32), mul: Multipliers):
+        """Before an evaluation."""
+        world, component = wp.tid()
+        if active[world] != 0:
+            mul.violation[world, component] = f64(0.0)
+
+    @wp.kernel(module=module)
+    def evaluate(
+        con: Constraints,
+        u: wp.array2d(dtype=vec3),
+        law_value: wp.array2d(dtype=vec3d),
+        alpha: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        mul: Multipliers,
+    ):
+        """c and its gradients at u; multipliers of the trial step alpha; the rows of the augmented potential."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        kind = con.kind[row]
+        scale = con.scale[row]
+        f = con.fixed[row]
+        if con.law[row] >= 0:
+            f = f + law_value[world, con.law[row]][con.law_component[row]]
+        da = combine(con, 3 * row, u, world)
+        db = combine(con, 3 * row + 1, u, world)
+        A = con.reference[3 * row]
+        B = con.reference[3 * row + 1]
+        a = A + da
+        b = B + db
+        a2 = vec3d()
+        c = f64(0.0)
+        slope = a
+        if kind == DISTANCE:
+            size = wp.length(a)
+            # |a| - f without cancellation when f is the reference length
+            c = scale * (con.constant[row] - f * f + f64(2.0) * wp.dot(A, da) + wp.dot(da, da)) / (size + f)
+            slope = a / size
+        elif kind == TURN:
+            a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u, world)
+            along = wp.sin(f) * a2 + wp.cos(f) * a
+            c = scale * wp.dot(wp.cos(f) * a2 - wp.sin(f) * a, b)
+            if wp.dot(along, b) < f64(0.0):
+                # more than a right angle off: the sine vanishes at a half turn too, which is no solution
+                c = wp.sign(c) * f64(2.0) * scale - c
+                scale = -scale
+            if wp.abs(f - mul.last[world, row]) > f64(MOST_TURN):
+                c = f64(2.0) * con.scale[row]  # turns can't be told apart: the step must be halved
+        else:
+            c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
+        G = gradients(kind, scale, f, slope, b, a2)
+        for side in range(3):
+            mul.gradient[world, 3 * row + side] = G[side]
+        rho = mul.stiffness[world, row]
+        held = mul.force[world, row]
+        new = held
+        if mul.classical == 0:
+            new = held + alpha[world] * mul.change[world, row]
+        mul.value[world, row] = c
+        mul.scale[world, row] = scale
+        mul.target[world, row] = f
+        mul.merit[world, row] = held + rho * c
+        if mul.classical == 0:
+            mul.trial[world, row] = new
+            mul.excess[world, row] = rho * c
+        else:
+            mul.trial[world, row] = held + rho * c
+            mul.excess[world, row] = f64(0.0)
+        squeeze = f64(0.5) * rho * c * c
+        mul.rows[0, world, row] = held * c + squeeze
+        mul.rows[1, world, row] = new * c + squeeze
+        mul.rows[2, world, row] = wp.max(wp.abs(held * c), wp.abs(new * c)) + squeeze
+        wp.atomic_max(mul.violation, world, con.component[row], wp.abs(c))
+
+    @wp.kernel(module=module)
+    def product_terms(
+        con: Constraints,
+        mul: Multipliers,
+        p_in: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+    ):
+        """Contributions to (dq/dv) (rho J^T J + sum lambda d2c/dq2) p, one vector per term."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        kind = con.kind[row]
+        a = combine(con, 3 * row, p_in, world)
+        b = combine(con, 3 * row + 1, p_in, world)
+        a2 = vec3d()
+        if kind == TURN:
+            a2 = combine(con, 3 * row + 2, p_in, world)
+        Ga = mul.gradient[world, 3 * row]
+        Gb = mul.gradient[world, 3 * row + 1]
+        Gc = mul.gradient[world, 3 * row + 2]
+        change = wp.dot(Ga, a) + wp.dot(Gb, b) + wp.dot(Gc, a2)
+        f = mul.target[world, row]
+        scale = mul.scale[world, row]
+        if kind == DISTANCE:
+            n = Ga / scale
+            size = wp.abs(mul.value[world, row] / scale + f)
+            a = (a - wp.dot(n, a) * n) / size
+        bend = gradients(kind, scale, f, a, b, a2)
+        tight = dq_dv[world] * mul.stiffness[world, row] * change
+        force = dq_dv[world] * mul.trial[world, row]
+        mul.product[world, 3 * row] = tight * Ga + force * bend[0]
+        mul.product[world, 3 * row + 1] = tight * Gb + force * bend[1]
+        mul.product[world, 3 * row + 2] = tight * Gc + force * bend[2]
+
+    @wp.kernel(module=module)
+    def load_multipliers(
+        state: wp.array2d(dtype=f64),
+        travel: wp.array2d(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        mul: Multipliers,
+    ):
+        """Warm start: the forces and right sides of the last accepted step."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        mul.last[world, row] = travel[world, row]
+        mul.force[world, row] = state[world, row]
+        mul.trial[world, row] = state[world, row]
+        mul.change[world, row] = f64(0.0)
+        mul.stiffness[world, row] = f64(0.0)
+
+    @wp.kernel(module=module)
+    def predict_change(
+        con: Constraints,
+        mul: Multipliers,
+        direction: wp.array2d(dtype=vec3),
+        quiet: wp.array2d(dtype=wp.int32),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+    ):
+        """Change of lambda that belongs to a full Newton step, rho (c + (dq/dv) J p); none in converged components."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        mul.change[world, row] = f64(0.0)
+        if quiet[world, con.component[row]] == 0:
+            after = mul.value[world, row] + dq_dv[world] * directional(con, mul, direction, world, row)
+            mul.change[world, row] = mul.stiffness[world, row] * after
+
+    @wp.kernel(module=module)
+    def adopt(flags: wp.array(dtype=wp.int32), mul: Multipliers):
+        """Make the multipliers of the trial those of the iterate."""
+        world, row = wp.tid()
+        if flags[world] != 0:
+            mul.force[world, row] = mul.trial[world, row]
+
+    @wp.kernel(module=module)
+    def commit_multipliers(
+        accepted: wp.array(dtype=wp.int32), mul: Multipliers, state: wp.array2d(dtype=f64),
+        travel: wp.array2d(dtype=f64),
+    ):  # fmt: skip
+        """Make the multipliers and right sides of an accepted step the state's."""
+        world, row = wp.tid()
+        if accepted[world] != 0:
+            state[world, row] = mul.trial[world, row]
+            travel[world, row] = mul.target[world, row]
+
+    @wp.kernel(module=module)
+    def work_terms(
+        con: Constraints,
+        mul: Multipliers,
+        u: wp.array2d(dtype=vec3),
+        u_n: wp.array2d(dtype=vec3),
+        travel: wp.array2d(dtype=f64),
+        accepted: wp.array(dtype=wp.int32),
+    ):
+        """Work of a substep per row: of the drive, -lambda scale df, and lambda (J dq - scale df), which is lost.
+
+        A constraint at rest does no work along the exact path; along a chord it takes some.
+        """
+        world, row = wp.tid()
+        if accepted[world] == 0:
+            return
+        moved = f64(0.0)
+        for side in range(3):
+            s = vec3d()
+            term = 3 * row + side
+            for k in range(con.start[term], con.start[term + 1]):
+                slot = con.slot[k]
+                s += con.weight[k] * vec3d(u[world, slot] - u_n[world, slot])
+            moved += wp.dot(mul.gradient[world, term], s)
+        driven = con.scale[row] * (mul.target[world, row] - travel[world, row])
+        mul.rows[0, world, row] = -mul.trial[world, row] * driven
+        mul.rows[1, world, row] = mul.trial[world, row] * (moved - driven)
+
+    @wp.kernel(module=module)
+    def joint_report(
+        con: Constraints,
+        mul: Multipliers,
+        joints: Joints,
+        u: wp.array2d(dtype=vec3),
+        force: wp.array2d(dtype=f64),
+        first_column: int,
+        report: wp.array2d(dtype=f64),
+    ):
+        """Force and moment about the anchor that each joint exerts on its child, world axes, and its violation."""
+        world, joint = wp.tid()
+        anchor = joints.anchor[joint]
+        for k in range(joints.anchor_start[joint], joints.anchor_start[joint + 1]):
+            anchor += joints.anchor_weight[k] * vec3d(u[world, joints.anchor_slot[k]])
+        F = vec3d()
+        M = vec3d()
+        worst = f64(0.0)
+        for row in range(joints.first[joint], joints.last[joint]):
+            worst = wp.max(worst, wp.abs(mul.value[world, row]))
+            for side in range(3):
+                term = 3 * row + side
+                for k in range(con.start[term], con.start[term + 1]):
+                    role = joints.role[k]
+                    if role != 0:
+                        f = -(force[world, row] * con.weight[k]) * mul.gradient[world, term]
+                        f = f64(wp.sign(role)) * f
+                        arm = joints.place[k] + vec3d(u[world, con.slot[k]])
+                        if wp.abs(role) == 2:
+                            arm = arm - anchor
+                            F += f
+                        M += wp.cross(arm, f)
+        column = first_column + JOINT_COLUMNS * joint
+        for c in range(3):
+            report[world, column + c] = F[c]
+            report[world, column + 3 + c] = M[c]
+        report[world, column + 6] = worst
+
+    return _types.SimpleNamespace(
+        module=module,
+        reset_violation=reset_violation,
+        evaluate=evaluate,
+        product_terms=product_terms,
+        load_multipliers=load_multipliers,
+        predict_change=predict_change,
+        adopt=adopt,
+        commit_multipliers=commit_multipliers,
+        work_terms=work_terms,
+        joint_report=joint_report,
+    )

@@ -1,0 +1,257 @@
+"""Loads on the device: time laws, dead loads Eq. (72), body forces Eq. (23), driven nodes."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module, precision
+from ..elements.points import block_struct
+
+__all__ = ["body_force_kernel", "law_function_kernel", "law_struct", "load_kernels"]
+
+
+@functools.cache
+def law_struct():
+    """Time laws: row k is a constant (count 1) or samples of time, piecewise linear, held beyond both ends."""
+
+    @wp.struct
+    class TimeLaws:
+        start: wp.array(dtype=wp.int32)  # [law + 1]; no samples: a function fills the value
+        times: wp.array(dtype=wp.float64)
+        values: wp.array(dtype=wp.vec3d)
+
+    return TimeLaws
+
+
+@functools.cache
+def load_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels of the loads in one precision."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Laws = law_struct()
+    # a module per kind of load: a scene compiles what it uses
+    laws_module = kernel_module(f"laws_{dtype}")
+    dead_module = kernel_module(f"dead_load_{dtype}")
+    explicit_module = kernel_module(f"explicit_{dtype}")
+    drive_module = kernel_module(f"drive_{dtype}")
+    turn_module = kernel_module(f"drive_rotation_{dtype}")
+
+    @wp.kernel(module=laws_module)
+    def evaluate_laws(
+        laws: Laws,
+        time: wp.array(dtype=f64),
+        ramp: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=wp.vec3d),
+    ):
+        """Value of each law at the new time; constants carry the ramp of a static load path."""
+        world, law = wp.tid()
+        if active[world] == 0:
+            return
+        first = laws.start[law]
+        last = laws.start[law + 1] - 1
+        if last < first:
+            return
+        if last == first:
+            value[world, law] = ramp[world] * laws.values[first]
+            return
+        t = time[world]
+        k = first
+        while k < last - 1 and laws.times[k + 1] < t:
+            k += 1
+        s = (t - laws.times[k]) / (laws.times[k + 1] - laws.times[k])
+        s = wp.clamp(s, f64(0.0), f64(1.0))
+        value[world, law] = (f64(1.0) - s) * laws.values[k] + s * laws.values[k + 1]
+
+    @wp.kernel(module=dead_module)
+    def dead_load(
+        start: wp.array(dtype=wp.int32),
+        law: wp.array(dtype=wp.int32),
+        weight: wp.array(dtype=vec3),
+        value: wp.array2d(dtype=wp.vec3d),
+        lumped: wp.array(dtype=T),
+        gravity: wp.array(dtype=wp.vec3d),
+        ramp: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        force: wp.array2d(dtype=vec3),
+        magnitude: wp.array2d(dtype=vec3),
+    ):
+        """Sum of weight x value per slot (Eq. 72), gravity included (Eq. 24), and of the magnitudes."""
+        world, slot = wp.tid()
+        if active[world] == 0:
+            return
+        f = (T(ramp[world]) * lumped[slot]) * vec3(gravity[world])
+        m = wp.cw_mul(f, wp.sign(f))
+        for k in range(start[slot], start[slot + 1]):
+            x = wp.cw_mul(weight[k], vec3(value[world, law[k]]))
+            f += x
+            m += wp.cw_mul(x, wp.sign(x))
+        force[world, slot] = f
+        magnitude[world, slot] = m
+
+    @wp.kernel(module=explicit_module)
+    def work_rows(
+        a: wp.array2d(dtype=vec3),
+        u: wp.array2d(dtype=vec3),
+        u_n: wp.array2d(dtype=vec3),
+        accepted: wp.array(dtype=wp.int32),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """Work of an explicit force on a substep, a.dq per slot."""
+        world, slot = wp.tid()
+        if accepted[world] != 0:
+            rows[0, world, slot] = f64(wp.dot(a[world, slot], u[world, slot] - u_n[world, slot]))
+
+    @wp.kernel(module=explicit_module)
+    def add_explicit(
+        explicit_force: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        force: wp.array2d(dtype=vec3),
+    ):
+        """Dead force -= explicit internal force."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            force[world, slot] = force[world, slot] - explicit_force[world, slot]
+
+    @wp.kernel(module=drive_module)
+    def drive_displacement(
+        slot: wp.array(dtype=wp.int32),
+        law: wp.array(dtype=wp.vec3i),
+        value: wp.array2d(dtype=wp.vec3d),
+        q_tilde: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        v: wp.array2d(dtype=vec3),
+    ):
+        """v = (u(t) - q~)/(dq/dv) on the driven components, u(t) the value of a law per component (-1: not driven)."""
+        world, k = wp.tid()
+        if active[world] == 0:
+            return
+        s = slot[k]
+        velocity = v[world, s]
+        for c in range(3):
+            row = law[k][c]
+            if row >= 0:
+                velocity[c] = T((value[world, row][c] - f64(q_tilde[world, s][c])) / dq_dv[world])
+        v[world, s] = velocity
+
+    @wp.kernel(module=turn_module)
+    def drive_rotation(
+        slot: wp.array(dtype=wp.int32),
+        law: wp.array(dtype=wp.int32),
+        components: wp.array(dtype=wp.vec3d),
+        arm: wp.array(dtype=wp.vec3d),
+        axis: wp.array(dtype=wp.vec3d),
+        value: wp.array2d(dtype=wp.vec3d),
+        q_tilde: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        v: wp.array2d(dtype=vec3),
+    ):
+        """The same for u(t) = (R(angle) - I) arm, arm the slot's reference value from the anchor (Rodrigues)."""
+        world, k = wp.tid()
+        if active[world] == 0:
+            return
+        s = slot[k]
+        angle = value[world, law[k]][0]
+        n = axis[k]
+        half = wp.sin(f64(0.5) * angle)
+        turn = wp.cross(n, arm[k])
+        target = wp.sin(angle) * turn + f64(2.0) * half * half * wp.cross(n, turn)
+        velocity = v[world, s]
+        for c in range(3):
+            if components[k][c] != f64(0.0):
+                velocity[c] = T((target[c] - f64(q_tilde[world, s][c])) / dq_dv[world])
+        v[world, s] = velocity
+
+    return _types.SimpleNamespace(
+        evaluate_laws=evaluate_laws,
+        dead_load=dead_load,
+        work_rows=work_rows,
+        add_explicit=add_explicit,
+        drive_displacement=drive_displacement,
+        drive_rotation=drive_rotation,
+    )
+
+
+@functools.lru_cache(maxsize=256)
+def law_function_kernel(function: wp.Function, scalar: bool, take_dtype: str):
+    """Kernel that fills one law's value from a `wp.func` of t (s)."""
+    f64 = wp.float64
+    A = precision(take_dtype).T
+
+    def fill(
+        law: int,
+        time: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=wp.vec3d),
+    ):
+        """Value of a law given as a function of t."""
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        if wp.static(scalar):
+            value[world, law] = wp.vec3d(f64(function(A(time[world]))), f64(0.0), f64(0.0))
+        else:
+            value[world, law] = wp.vec3d(function(A(time[world])))
+
+    return wp.Kernel(func=fill, module=_unique_module("law", function, scalar, take_dtype))
+
+
+@functools.lru_cache(maxsize=256)
+def body_force_kernel(function: wp.Function, dtype: str, slots: int, points: int, take_dtype: str):
+    """Kernel of Eq. (23): f_i = sum_q rho w s_i b(r_q, t), with b evaluated at the current position."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    take = precision(take_dtype)
+    Block = block_struct(dtype)
+    f64 = wp.float64
+
+    def fill(
+        block: Block,
+        members: wp.array(dtype=wp.int32),
+        reference: wp.array(dtype=vec3),
+        origin: wp.vec3d,
+        u: wp.array2d(dtype=vec3),
+        time: wp.array(dtype=f64),
+        ramp: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        offset: int,
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """f_i = sum_q rho w s_i b(r_q, t) of one element."""
+        world, k = wp.tid()
+        if active[world] == 0:
+            return
+        elem = members[k]
+        column = elem % block.shape.shape[2]
+        count = members.shape[0]
+        for i in range(wp.static(slots)):
+            contribution[world, offset + i * count + k] = vec3()
+        for q in range(wp.static(points)):
+            r = vec3()
+            for i in range(wp.static(slots)):
+                s = block.conn[i, elem]
+                r += block.shape[q, i, column] * (reference[s] + u[world, s])
+            x = take.vec3(origin + wp.vec3d(r))
+            b = vec3(function(x, take.T(time[world])))
+            f = (T(ramp[world]) * block.field_weight[q, elem]) * b
+            for i in range(wp.static(slots)):
+                e = offset + i * count + k
+                contribution[world, e] = contribution[world, e] + block.shape[q, i, column] * f
+
+    return wp.Kernel(func=fill, module=_unique_module("field", function, dtype, slots, points, take_dtype))
+
+
+_names: dict[str, list[wp.Function]] = {}
+
+
+def _unique_module(kind: str, function: wp.Function, *key) -> wp.Module:
+    """A module per user function, named alike in every process so that the kernel cache finds it again."""
+    same = _names.setdefault(function.key, [])
+    if function not in same:
+        same.append(function)
+    parts = [kind, function.key, str(same.index(function)), *map(str, key)]
+    return kernel_module("_".join(parts).replace(".", "_"))

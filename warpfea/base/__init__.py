@@ -1,0 +1,1 @@
+"""What every floor uses: errors, launches, safe writing of files, text for consoles."""

@@ -1,0 +1,112 @@
+"""Exceptions of warpfea. Every one derives from :class:`Error`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = [
+    "CapacityError",
+    "CheckpointError",
+    "ConstraintError",
+    "ConvergenceError",
+    "Error",
+    "MeshError",
+    "MeshWarning",
+    "ModelError",
+    "OutputError",
+    "PenetrationError",
+]
+
+
+class Error(Exception):
+    """Base of all errors that warpfea raises on purpose."""
+
+
+class MeshError(Error):
+    """A mesh file or mesh can't be used; the text names file, element or node, and value."""
+
+
+class MeshWarning(UserWarning):
+    """A mesh was usable, but something in it was left out or looks unintended."""
+
+
+class ModelError(Error):
+    """The description of a model is wrong; the text names the body, group or parameter."""
+
+
+class ConstraintError(Error):
+    """A constraint or joint can't be satisfied.
+
+    Attributes:
+        joints: names of the joints, the most violated first.
+        violations: of each, m.
+        time: time (s) at the start of the refused step.
+        world: index of the world.
+        state: the state, unchanged since before the refused step; None where none was made.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        joints: list[str] | None = None,
+        violations: list[float] | None = None,
+        time: float = 0.0,
+        world: int = 0,
+        state: Any = None,
+    ) -> None:
+        super().__init__(message)
+        self.joints = joints or []
+        self.violations = violations or []
+        self.time = time
+        self.world = world
+        self.state = state
+
+
+class PenetrationError(Error):
+    """An impact exceeds what the contact penalty can hold."""
+
+
+class CapacityError(Error):
+    """A device array is too small for what a step needs."""
+
+
+class CheckpointError(Error):
+    """A checkpoint can't be written, read, or belongs to another model."""
+
+
+class OutputError(Error):
+    """An output file can't be written or is not valid."""
+
+
+class ConvergenceError(Error):
+    """A step or a static load step was not accepted.
+
+    Attributes:
+        time: time (s) at the start of the refused step, of the first failed world.
+        world: index of the first failed world.
+        residuals: relative residual after each Newton iteration of the last attempt.
+        element: index of the element with the largest residual at its nodes (model numbering), or -1.
+        state: the state, unchanged since before the refused step.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        time: float = 0.0,
+        world: int = 0,
+        residuals: list[float] | None = None,
+        element: int = -1,
+        state: Any = None,
+    ) -> None:
+        super().__init__(message)
+        self.time = time
+        self.world = world
+        self.residuals = residuals or []
+        self.element = element
+        self.state = state
+
+
+class UsageError(Error):
+    """The command line is wrong."""

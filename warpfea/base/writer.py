@@ -1,0 +1,89 @@
+"""Output protocol and safe writing of files: whole or not at all."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import pathlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from .errors import OutputError
+
+__all__ = ["Output", "check_folder", "check_target", "progress_bar", "temporary_beside", "write_whole"]
+
+
+class Output:
+    """A writer of results, called by `Simulation.run` as open, write ..., close.
+
+    `write` comes once for the initial state and after each accepted step; the writer decides itself whether a
+    frame is due. `close` makes the file valid and is also called after an interrupted run. `abort` drops all
+    that the run wrote and leaves an older target file as it was. A writer may be opened again after either.
+    """
+
+    def open(self, sim: Any) -> None:
+        """Check the target and start. OutputError if the target can't be written."""
+        raise NotImplementedError
+
+    def write(self, sim: Any) -> None:
+        """Take the present state if a frame is due."""
+        raise NotImplementedError
+
+    def close(self, sim: Any) -> None:
+        """Finish; the target is complete and valid afterwards. OutputError otherwise."""
+        raise NotImplementedError
+
+    def abort(self) -> None:
+        """Remove temporary files; does nothing when not open."""
+        raise NotImplementedError
+
+
+_counter = itertools.count()
+
+
+def check_target(path: str | os.PathLike[str], suffixes: Sequence[str]) -> pathlib.Path:
+    """The target as a path. OutputError unless it ends in one of `suffixes` and its folder can be written."""
+    target = pathlib.Path(path)
+    if target.suffix.lower() not in suffixes:
+        raise OutputError(f"{target}: the file name must end in {' or '.join(suffixes)}")
+    if target.is_dir():
+        raise OutputError(f"{target}: is a folder, not a file")
+    check_folder(target.parent, target)
+    return target
+
+
+def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:
+    """OutputError naming `target` unless `folder` exists and can be written."""
+    if not folder.is_dir():
+        raise OutputError(f"{target}: the folder {folder} does not exist")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f"{target}: the folder {folder} is not writable")
+
+
+def temporary_beside(target: pathlib.Path) -> pathlib.Path:
+    """An unused hidden name in the target's folder with the target's suffix."""
+    return target.with_name(f".{target.stem}.{os.getpid()}-{next(_counter)}.part{target.suffix}")
+
+
+def write_whole(target: pathlib.Path, write: Callable[[pathlib.Path], object]) -> None:
+    """Call `write(temporary)` and rename the result to `target`. OutputError for what the system refuses."""
+    temporary = temporary_beside(target)
+    try:
+        write(temporary)
+        os.replace(temporary, target)
+    except OSError as error:
+        raise OutputError(f"{target}: can't be written ({error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def progress_bar(total: int, label: str, show: bool | None = None) -> Iterator[Callable[[], object]]:
+    """A bar on stderr; yields the function that advances it. `show=None`: only when stderr is a terminal."""
+    from tqdm import tqdm  # type: ignore[import-untyped,unused-ignore]
+
+    disable = None if show is None else not show
+    with tqdm(total=total, desc=label, file=sys.stderr, disable=disable, leave=False, unit="frame") as bar:
+        yield lambda: bar.update(1)

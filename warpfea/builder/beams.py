@@ -1,0 +1,214 @@
+"""Geometry of beams: from a curve and a section to nodes, their axes, and the frames dX/dxi of each element."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..elements.sections import Rectangle
+from ..mesh import Mesh
+
+__all__ = ["beam_geometry", "spline"]
+
+CORNER = math.radians(1.0)
+"""A polyline that bends by more than this has a corner."""
+
+
+def spline(points: Any, *, closed: bool = False) -> Callable[[float], np.ndarray]:
+    """A smooth curve through points (n, 3), m, as a function of s in [0, 1]: cubic, parameterised by chord length.
+
+    Args:
+        closed: join the last point to the first smoothly; the ends of a beam along it stay two nodes.
+
+    Raises:
+        ModelError: fewer than three points, points that repeat or are not finite.
+    """
+    from scipy.interpolate import CubicSpline
+
+    x = np.asarray(points, dtype=float)
+    if x.ndim != 2 or x.shape[1] != 3 or len(x) < 3 or not np.all(np.isfinite(x)):
+        raise ModelError(f"spline: points must be finite, of shape (n, 3) with n >= 3, got shape {x.shape}")
+    if closed:
+        x = np.vstack([x, x[:1]])
+    size = np.linalg.norm(np.diff(x, axis=0), axis=1)
+    if not size.min() > 0.0:
+        raise ModelError(f"spline: point {int(np.argmin(size)) + 1} repeats the one before")
+    at = np.concatenate([[0.0], np.cumsum(size)]) / size.sum()
+    curve = CubicSpline(at, x, bc_type="periodic" if closed else "not-a-knot" if len(x) > 3 else "natural")
+    return lambda s: np.asarray(curve(s))
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """A curve by its parameter s in [0, 1]: place and derivative on one side, and where elements may end.
+
+    Attributes:
+        at: s -> (3,) m.
+        slope: (s, side) -> dX/ds (3,), side -1 or 1.
+        marks: parameters of corners, which must be nodes.
+    """
+
+    at: Callable[[float], np.ndarray]
+    slope: Callable[[float, int], np.ndarray]
+    marks: tuple[float, ...] = ()
+
+
+def beam_geometry(
+    name: str, curve: Any, elements: int, section: Rectangle, normal: Any, corners: str
+) -> tuple[Mesh, np.ndarray, np.ndarray]:
+    """Nodes and frames of a beam.
+
+    Returns:
+        Mesh of line cells with the node sets "start" and "end"; node axes (nodes, 3, 3) with columns along the axis,
+        the width and the height; frames (elements, 2, 3, 3) = dX/dxi in those axes, m.
+
+    Raises:
+        ModelError: as ModelBuilder.add_beam.
+    """
+    if isinstance(elements, bool) or not (isinstance(elements, (int, np.integer)) and elements >= 1):
+        raise ModelError(f"body {name!r}: elements = {elements!r} must be a positive whole number")
+    if not isinstance(section, Rectangle):
+        raise ModelError(f"body {name!r}: section must be a Rectangle, got {section!r}")
+    if corners not in ("error", "weld"):
+        raise ModelError(f"body {name!r}: corners = {corners!r} is neither 'error' nor 'weld'")
+    path = _path(name, curve, corners)
+    s = _parameters(name, int(elements), path.marks)
+    points = np.array([path.at(k) for k in s])
+    if points.shape != (len(s), 3) or not np.all(np.isfinite(points)):
+        raise ModelError(f"body {name!r}: the curve must give three finite coordinates (m) for every s in [0, 1]")
+    ends = [(path.slope(a, 1) * (b - a), path.slope(b, -1) * (b - a)) for a, b in itertools.pairwise(s)]
+    _check_turns(name, s, ends, sharp_allowed=bool(path.marks))
+    frames = np.array(
+        [[_frame(name, x, k, section, normal) for x, k in zip(pair, s[e : e + 2])] for e, pair in enumerate(ends)]
+    )
+    axes = np.concatenate([frames[:, 0], frames[-1:, 1]])
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    cells = np.column_stack([np.arange(elements), np.arange(elements) + 1])
+    sets = {"start": np.array([0]), "end": np.array([int(elements)])}
+    local = np.einsum("enck,encl->enkl", axes[cells], frames)
+    return Mesh(points, cells, "line", node_sets=sets, name=name), axes, local
+
+
+def _check_turns(name: str, s: np.ndarray, ends: list[tuple[np.ndarray, np.ndarray]], *, sharp_allowed: bool) -> None:
+    """Refuse elements that turn too far for a cubic, and kinks between elements."""
+
+    def angle(a: np.ndarray, b: np.ndarray) -> float:
+        size = float(np.linalg.norm(a) * np.linalg.norm(b))
+        return math.degrees(math.acos(float(np.clip(a @ b / size, -1.0, 1.0)))) if size > 0.0 else 0.0
+
+    turns = [angle(a, b) for a, b in ends]
+    worst = int(np.argmax(turns))
+    if turns[worst] > 100.0:
+        raise ModelError(
+            f"body {name!r}: element {worst} (s = {s[worst]:.3g} to {s[worst + 1]:.3g}) turns by {turns[worst]:.3g} "
+            f"degrees; use elements = {math.ceil(len(ends) * turns[worst] / 20.0)} or more, for 20 degrees each"
+        )
+    for k in range(1, len(ends)):
+        kink = angle(ends[k - 1][1], ends[k][0])
+        if kink > 5.0 and not sharp_allowed:
+            raise ModelError(
+                f"body {name!r}: the curve has a corner of {kink:.3g} degrees at s = {s[k]:.3g}; give a smooth curve, "
+                "one beam per side, or a polyline with corners='weld'"
+            )
+
+
+def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal: Any) -> np.ndarray:
+    """(3, 3) columns: tangent (as it is), width and height vectors."""
+    length = float(np.linalg.norm(tangent))
+    if not (math.isfinite(length) and length > 0.0):
+        raise ModelError(f"body {name!r}: the curve stands still or is not finite at s = {s:.4g}")
+    t = tangent / length
+    try:
+        up = np.asarray(normal(s) if callable(normal) else normal, dtype=float)
+    except (TypeError, ValueError):
+        up = np.zeros(0)
+    if up.shape != (3,) or not np.all(np.isfinite(up)):
+        raise ModelError(f"body {name!r}: normal must be three finite numbers or a function of s, got {normal!r}")
+    n = up - (up @ t) * t
+    size = float(np.linalg.norm(n))
+    if not size > 1e-6 * float(np.linalg.norm(up)):
+        raise ModelError(
+            f"body {name!r}: normal {up.tolist()} lies along the beam's axis at s = {s:.4g}; give one across it"
+        )
+    n /= size
+    return np.stack([tangent, section.width * np.cross(n, t), section.height * n], axis=1)
+
+
+def _parameters(name: str, elements: int, marks: tuple[float, ...]) -> np.ndarray:
+    """Node parameters, evenly spread between marks, which are nodes."""
+    if not marks:
+        return np.linspace(0.0, 1.0, elements + 1)
+    edges = np.array([0.0, *marks, 1.0])
+    share = np.diff(edges)
+    if elements < len(share):
+        raise ModelError(f"body {name!r}: {elements} elements for {len(share)} sides; each side needs one at least")
+    counts = np.ones(len(share), dtype=int)
+    for _ in range(elements - len(share)):
+        counts[int(np.argmax(share / counts))] += 1
+    parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts)]
+    return np.concatenate([*parts, [1.0]])
+
+
+def _path(name: str, curve: Any, corners: str) -> _Path:
+    if callable(curve):
+        return _function_path(name, curve)
+    ends = np.asarray(curve, dtype=float)
+    if ends.ndim != 2 or ends.shape[1] != 3 or len(ends) < 2 or not np.all(np.isfinite(ends)):
+        raise ModelError(
+            f"body {name!r}: the curve must be finite points (n, 3), m, or a function of s; got shape {ends.shape}"
+        )
+    chord = np.diff(ends, axis=0)
+    size = np.linalg.norm(chord, axis=1)
+    if not size.min() > 0.0:
+        raise ModelError(f"body {name!r}: point {int(np.argmin(size)) + 1} of the curve repeats the one before")
+    straight = chord / size[:, None]
+    bend = np.arccos(np.clip(np.sum(straight[1:] * straight[:-1], axis=1), -1.0, 1.0))
+    sharp = np.flatnonzero(bend > CORNER)
+    if len(sharp) and corners == "error":
+        k = int(sharp[0]) + 1
+        raise ModelError(
+            f"body {name!r}: the polyline has a corner of {math.degrees(bend[k - 1]):.3g} degrees at point {k}. Give a "
+            "smooth function of s, one beam per side, or corners='weld', which makes a rigid corner (both sides share "
+            "the deformation gradient there)"
+        )
+    if len(sharp) and np.any(bend[sharp] > math.radians(150.0)):
+        raise ModelError(f"body {name!r}: the polyline folds back on itself at point {int(sharp[0]) + 1}")
+    at = np.concatenate([[0.0], np.cumsum(size)]) / size.sum()
+
+    def side(s: float, which: int) -> np.ndarray:
+        k = np.searchsorted(at, s + which * 1e-9, side="right") - 1
+        return straight[min(max(int(k), 0), len(straight) - 1)] * size.sum()
+
+    marks = tuple(at[1:-1][bend > 0.0]) if len(sharp) else ()
+    return _Path(lambda s: np.array([np.interp(s, at, ends[:, c]) for c in range(3)]), side, marks)
+
+
+def _function_path(name: str, curve: Callable[[float], Any]) -> _Path:
+    """A smooth curve; its derivative by fourth-order differences, one-sided at the ends."""
+
+    def at(s: float) -> np.ndarray:
+        out = np.asarray(curve(s), dtype=float)
+        if out.shape != (3,):
+            raise ModelError(f"body {name!r}: the curve must return three numbers (m), it returned shape {out.shape}")
+        return out
+
+    h = 1e-3
+
+    def slope(s: float, side: int) -> np.ndarray:
+        low, high = at(max(s - h, 0.0)), at(min(s + h, 1.0))
+        middle = at(s)
+        bend = float(np.linalg.norm(high - 2.0 * middle + low))
+        kinked = 2 * h <= s <= 1 - 2 * h and bend > 0.05 * float(np.linalg.norm(high - low))
+        if s < 2 * h or s > 1 - 2 * h or kinked:
+            d = h * side if kinked else h if s < 2 * h else -h
+            w = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / (12.0 * d)
+            return np.sum([c * at(s + k * d) for k, c in enumerate(w)], axis=0)
+        return (8.0 * (at(s + h) - at(s - h)) - (at(s + 2 * h) - at(s - 2 * h))) / (12.0 * h)
+
+    return _Path(at, slope)

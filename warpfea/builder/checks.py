@@ -1,0 +1,121 @@
+"""Checks of what users pass to a builder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..materials import Material
+from ..mesh import Mesh
+from ..model.bodies import Body
+
+__all__ = ["COMPONENTS", "assign_materials", "component_mask", "nodal", "slot_field", "vector"]
+
+COMPONENTS = {"x": 0, "y": 1, "z": 2}
+
+
+def vector(value: Any, what: str) -> np.ndarray:
+    """Three finite numbers. ModelError otherwise."""
+    try:
+        out = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{what} = {value!r} is not three numbers") from error
+    if out.shape != (3,) or not np.all(np.isfinite(out)):
+        raise ModelError(f"{what} = {value!r} is not three finite numbers")
+    return out
+
+
+def nodal(values: Any, nodes: int, what: str) -> np.ndarray:
+    """(nodes, 3) from one vector or one per node. ModelError for another shape or values that are not finite."""
+    out = np.asarray(values, dtype=float)
+    if out.shape == (3,):
+        out = np.broadcast_to(out, (nodes, 3))
+    if out.shape != (nodes, 3):
+        raise ModelError(f"{what} has shape {out.shape}, expected (3,) or {(nodes, 3)}")
+    bad = np.flatnonzero(~np.isfinite(out).all(axis=1))
+    if len(bad):
+        raise ModelError(f"{what}: node {int(bad[0])} has {out[bad[0]].tolist()}")
+    return out.copy()
+
+
+def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
+    """A vector field on a body's slots, (slots, 3): values at the nodes, and its gradient on gradient slots.
+
+    Args:
+        values: (3,) the same everywhere; a function X (n, 3) -> (n, 3), whose gradient is taken by central
+            differences; or (nodes, 3), for bodies without gradient slots.
+
+    Raises:
+        ModelError: another shape, values that are not finite, or nodal values on a body with gradient slots.
+    """
+    X = body.mesh.points
+    if callable(values):
+        out = nodal(values(X), len(X), what)[body.slot_node]
+        gradient = np.flatnonzero(body.slot_kind > 0)
+        if len(gradient):
+            low, high = body.mesh.bounding_box()
+            step = 1e-5 * float(np.max(high - low))
+            at, along = X[body.slot_node[gradient]], body.reference[gradient]
+            ahead, behind = (nodal(values(at + k * step * along), len(at), what) for k in (1.0, -1.0))
+            out[gradient] = (ahead - behind) / (2.0 * step)
+        return out
+    if body.family.has_gradients and np.shape(values) != (3,):
+        raise ModelError(
+            f"{what}: body {body.name!r} of element {body.family.name} has gradients at its nodes; give a function "
+            "X (n, 3) -> (n, 3), or one vector (3,)"
+        )
+    return np.where((body.slot_kind == 0)[:, None], nodal(values, len(X), what)[body.slot_node], 0.0)
+
+
+def component_mask(text: str, what: str) -> np.ndarray:
+    """(3,) ones where a letter of "xyz" is named."""
+    out = np.zeros(3)
+    if not isinstance(text, str) or not text or any(c not in COMPONENTS for c in text):
+        raise ModelError(f"{what}: components = {text!r} must be letters of 'xyz'")
+    for c in text:
+        out[COMPONENTS[c]] = 1.0
+    return out
+
+
+def assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[str, Material]], np.ndarray]:
+    """Laws with the names of their groups, and each element's index into them."""
+    if isinstance(material, Material):
+        _check_density(name, "", material, mesh)
+        return [("", material)], np.zeros(len(mesh.cells), dtype=np.int64)
+    if not isinstance(material, dict) or not all(isinstance(m, Material) for m in material.values()):
+        raise ModelError(f"body {name!r}: material must be a law or a dict of group name to law, got {material!r}")
+    index = np.full(len(mesh.cells), -1, dtype=np.int64)
+    for k, (group, law) in enumerate(material.items()):
+        if group not in mesh.element_sets:
+            raise ModelError(
+                f"body {name!r}: material group {group!r} is not an element group of {mesh.label}; there are "
+                f"{sorted(mesh.element_sets)}"
+            )
+        members = mesh.element_sets[group]
+        twice = members[index[members] >= 0]
+        if len(twice):
+            raise ModelError(f"body {name!r}: element {int(twice[0])} is in two material groups, one of them {group!r}")
+        index[members] = k
+        _check_density(name, group, law, mesh)
+    bare = np.flatnonzero(index < 0)
+    if len(bare):
+        raise ModelError(
+            f"body {name!r}: {len(bare)} elements of {mesh.label} have no material, the first is element "
+            f"{int(bare[0])}; groups given: {sorted(material)}"
+        )
+    return list(material.items()), index
+
+
+def _check_density(name: str, group: str, material: Any, mesh: Mesh) -> None:
+    density: float | np.ndarray | Callable[[np.ndarray], np.ndarray] = material.density
+    if callable(density):
+        values = np.asarray(density(mesh.points), dtype=float)
+        if values.shape != (len(mesh.points),) or not np.all(np.isfinite(values) & (values > 0.0)):
+            raise ModelError(f"body {name!r}: density f(X) must give one positive finite value per point")
+    elif isinstance(density, np.ndarray) and density.ndim == 1 and len(density) != len(mesh.cells):
+        raise ModelError(
+            f"body {name!r}: density of group {group!r} has {len(density)} values for {len(mesh.cells)} elements"
+        )

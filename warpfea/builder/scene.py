@@ -1,0 +1,358 @@
+"""Scenes: functions that return a ModelBuilder, with typed parameters that the command line can set.
+
+    @wf.scene(dt=1e-3, t_end=0.5)
+    def cantilever(*, length: float = 1.0, cells: int = 10) -> wf.ModelBuilder:
+        '''A bar that bends under its own weight.
+
+        Args:
+            length: of the bar, m.
+        '''
+
+The module `warpfea.scenes.<name>` holds the scene `<name>`; a user's file may hold any number of them.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import inspect
+import itertools
+import math
+import pathlib
+import pkgutil
+import re
+import sys
+import types
+import typing
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec
+
+from ..base.errors import ModelError
+
+if TYPE_CHECKING:
+    from .builder import ModelBuilder
+
+__all__ = ["Parameter", "Scene", "find", "load_file", "names", "scene"]
+
+P = ParamSpec("P")
+REQUIRED = inspect.Parameter.empty
+_BOOL = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a scene: its name, type, default (REQUIRED if there is none) and description."""
+
+    name: str
+    kind: Any
+    default: Any
+    doc: str = ""
+
+    @property
+    def required(self) -> bool:
+        return self.default is REQUIRED
+
+    @property
+    def kind_name(self) -> str:
+        """The type as a user reads it."""
+        return _kind_name(self.kind)
+
+    def parse(self, text: str) -> Any:
+        """The value that `text` stands for. ValueError says what was expected."""
+        return _parse(text, self.kind)
+
+
+class Scene(Generic[P]):
+    """A scene; calling it makes its ModelBuilder.
+
+    Attributes:
+        name: of the function.
+        dt, t_end: step and end time, s. integrator: name. tol: of the solver, or None.
+        fps: frames of a USD file per simulated second.
+        speed: simulated seconds per second of an animation.
+        picture: time of a picture, s, or None for the end.
+        description: first line of the docstring.
+        parameters: by name.
+    """
+
+    def __init__(
+        self,
+        function: Callable[P, ModelBuilder],
+        *,
+        dt: float,
+        t_end: float,
+        integrator: str = "backward_euler",
+        tol: float | None = None,
+        fps: float = 60.0,
+        speed: float = 1.0,
+        picture: float | None = None,
+    ) -> None:
+        for what, value in (("dt", dt), ("t_end", t_end), ("fps", fps), ("speed", speed)):
+            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
+                raise ModelError(f"scene {function.__name__!r}: {what} = {value!r} must be a positive finite number")
+        self.function = function
+        functools.update_wrapper(self, function)
+        self.name = function.__name__
+        self.dt, self.t_end, self.fps, self.speed = float(dt), float(t_end), float(fps), float(speed)
+        self.integrator, self.tol, self.picture = integrator, tol, picture
+        text = inspect.getdoc(function) or ""
+        self.description = text.split("\n\n")[0].replace("\n", " ").strip()
+        self.details = text.partition("\n\n")[2].partition("Args:")[0].strip()
+        self.parameters = _parameters(function, text)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> ModelBuilder:
+        return self.function(*args, **kwargs)
+
+    def __repr__(self) -> str:
+        return f"Scene({self.name!r}, dt={self.dt:g}, t_end={self.t_end:g})"
+
+    def parse(self, settings: Iterable[str]) -> dict[str, Any]:
+        """Values of `name=value` texts.
+
+        Raises:
+            ModelError: no `=`, a name given twice, an unknown parameter (lists what there is), or a bad value.
+        """
+        out: dict[str, Any] = {}
+        for setting in settings:
+            name, equals, text = setting.partition("=")
+            name = name.strip()
+            if not equals or not name:
+                raise ModelError(f"--set {setting}: expected name=value")
+            if name not in self.parameters:
+                raise ModelError(f"scene {self.name!r} has no parameter {name!r}; {self._listing()}")
+            if name in out:
+                raise ModelError(f"--set {name}: given twice")
+            try:
+                out[name] = self.parameters[name].parse(text.strip())
+            except ValueError as error:
+                raise ModelError(f"--set {setting}: {error} for parameter {name!r} of scene {self.name!r}") from None
+        return out
+
+    def resolve(self, given: dict[str, Any]) -> dict[str, Any]:
+        """All parameters: what is given, and defaults. ModelError for one without either."""
+        out = {}
+        for name, parameter in self.parameters.items():
+            if name not in given and parameter.required:
+                kind = parameter.kind_name
+                raise ModelError(f"scene {self.name!r}: parameter {name!r} ({kind}) has no default, give --set {name}=")
+            out[name] = given.get(name, parameter.default)
+        return out
+
+    def build(self, given: dict[str, Any]) -> ModelBuilder:
+        """Call the scene with the given parameters. ModelError if it returns no ModelBuilder."""
+        from .builder import ModelBuilder
+
+        out = self.function(**given)  # type: ignore[call-arg]
+        if not isinstance(out, ModelBuilder):
+            raise ModelError(f"scene {self.name!r} must return a ModelBuilder, it returned {type(out).__name__}")
+        return out
+
+    def _listing(self) -> str:
+        if not self.parameters:
+            return "it has none"
+        texts = [p.name + ("" if p.required else f"={p.default}") for p in self.parameters.values()]
+        return f"it has {', '.join(texts)}"
+
+
+def scene(
+    *,
+    dt: float,
+    t_end: float,
+    integrator: str = "backward_euler",
+    tol: float | None = None,
+    fps: float = 60.0,
+    speed: float = 1.0,
+    picture: float | None = None,
+) -> Callable[[Callable[P, ModelBuilder]], Scene[P]]:
+    """Make a function that returns a ModelBuilder a scene.
+
+    Args:
+        dt: default step, s.
+        t_end: default end time, s.
+        integrator: default integrator.
+        tol: default tolerance of the solver; None: the solver's own.
+        fps: frames per simulated second in a USD file.
+        speed: simulated seconds per second of a GIF; less than 1 is slow motion.
+        picture: time that a PNG shows, s; None: the end.
+
+    Raises:
+        ModelError: a number that is not positive.
+    """
+
+    def decorate(function: Callable[P, ModelBuilder]) -> Scene[P]:
+        return Scene(
+            function, dt=dt, t_end=t_end, integrator=integrator, tol=tol, fps=fps, speed=speed, picture=picture
+        )
+
+    return decorate
+
+
+# finding scenes
+
+
+def names() -> list[str]:
+    """Names of the scenes that come with warpfea. Imports none of them."""
+    package = importlib.import_module("warpfea.scenes")
+    return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if not m.name.startswith("_"))
+
+
+def find(name: str) -> Scene[Any]:
+    """The scene `name` that comes with warpfea. ModelError lists what there is."""
+    if name not in names():
+        raise ModelError(f"there is no scene {name!r}; there are {', '.join(names())}, or give a .py or mesh file")
+    found = getattr(importlib.import_module(f"warpfea.scenes.{name}"), name, None)
+    if not isinstance(found, Scene):
+        raise ModelError(f"module warpfea.scenes.{name} does not define the scene {name!r}")
+    return found
+
+
+_loaded = itertools.count()
+
+
+def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
+    """Run a Python file and return its scenes by name; of those, imported ones only if it defines none itself.
+
+    Raises:
+        ModelError: no such file, an error in it (with its line), or no scene in it.
+    """
+    file = pathlib.Path(path)
+    if not file.is_file():
+        raise ModelError(f"{file}: no such file")
+    name = f"_warpfea_scenes_{next(_loaded)}_{re.sub(r'[^0-9a-zA-Z_]', '_', file.stem)}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise ModelError(f"{file}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    folder = str(file.resolve().parent)
+    sys.path.insert(0, folder)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise ModelError(f"{_place(error, file)}: {type(error).__name__}: {error}") from error
+    finally:
+        sys.path.remove(folder)
+    every = {item.name: item for item in vars(module).values() if isinstance(item, Scene)}
+    own = {key: item for key, item in every.items() if item.function.__module__ == name}
+    if not every:
+        raise ModelError(f"{file}: defines no scene; put @wf.scene(dt=..., t_end=...) before a function")
+    return own or every
+
+
+def _place(error: BaseException, file: pathlib.Path) -> str:
+    """`file:line` of the deepest frame of an error that lies in the file."""
+    if isinstance(error, SyntaxError):
+        return f"{error.filename or file}:{error.lineno}"
+    lines = []
+    trace = error.__traceback__
+    while trace is not None:
+        if pathlib.Path(trace.tb_frame.f_code.co_filename) == file:
+            lines.append(trace.tb_lineno)
+        trace = trace.tb_next
+    return f"{file}:{lines[-1]}" if lines else str(file)
+
+
+# parameters
+
+
+def _parameters(function: Callable[..., Any], text: str) -> dict[str, Parameter]:
+    docs = _argument_docs(text)
+    try:
+        hints = typing.get_type_hints(function)
+    except Exception:  # an annotation that can't be evaluated: the default's type decides
+        hints = {}
+    out = {}
+    for name, item in inspect.signature(function).parameters.items():
+        if item.kind in (item.VAR_POSITIONAL, item.VAR_KEYWORD, item.POSITIONAL_ONLY):
+            raise ModelError(f"scene {function.__name__!r}: parameter {name!r} must be a keyword with a name")
+        kind = hints.get(name)
+        if kind is None:
+            kind = str if item.default in (REQUIRED, None) else type(item.default)
+        out[name] = Parameter(name, kind, item.default, docs.get(name, ""))
+    return out
+
+
+def _argument_docs(text: str) -> dict[str, str]:
+    """Descriptions in the "Args:" section of a docstring; lines indented further continue one."""
+    out: dict[str, str] = {}
+    _, _, section = text.partition("Args:\n")
+    current, indent = "", -1
+    for line in section.splitlines():
+        depth = len(line) - len(line.lstrip())
+        if not line.strip() or depth == 0:
+            break
+        indent = depth if indent < 0 else indent
+        if depth == indent and ":" in line:
+            current, _, doc = line.strip().partition(":")
+            out[current] = doc.strip()
+        elif current:
+            out[current] += " " + line.strip()
+    return out
+
+
+def _kind_name(kind: Any) -> str:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Literal:
+        return " or ".join(map(str, arguments))
+    if origin is tuple:
+        if arguments[-1] is Ellipsis:
+            return f"{_kind_name(arguments[0])},..."
+        return ",".join(_kind_name(a) for a in arguments)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join("none" if a is type(None) else _kind_name(a) for a in arguments)
+    return getattr(kind, "__name__", str(kind))
+
+
+def _parse(text: str, kind: Any) -> Any:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        if type(None) in arguments and text.lower() == "none":
+            return None
+        for choice in arguments:
+            try:
+                if choice is not type(None):
+                    return _parse(text, choice)
+            except ValueError:
+                continue
+        raise ValueError(f"{text!r} is not {_kind_name(kind)}")
+    if origin is typing.Literal:
+        for value in arguments:
+            if text == str(value):
+                return value
+        raise ValueError(f"{text!r} is not {_kind_name(kind)}")
+    if origin is tuple or kind is tuple:
+        return _parse_tuple(text, kind, arguments or (float, Ellipsis))
+    if kind is bool:
+        if text.lower() not in _BOOL:
+            raise ValueError(f"{text!r} is not true or false")
+        return _BOOL[text.lower()]
+    if kind is int:
+        try:
+            return int(text)
+        except ValueError:
+            raise ValueError(f"{text!r} is not a whole number") from None
+    if kind is float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ValueError(f"{text!r} is not a finite number")
+        return value
+    if kind is str:
+        return text
+    if kind is pathlib.Path:
+        return pathlib.Path(text)
+    raise ValueError(f"{text!r} can't be read as {_kind_name(kind)}")
+
+
+def _parse_tuple(text: str, kind: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    parts = [part.strip() for part in text.strip("()").split(",")]
+    if arguments[-1] is Ellipsis:
+        return tuple(_parse(part, arguments[0]) for part in parts)
+    if len(parts) != len(arguments):
+        raise ValueError(f"{text!r} is not {len(arguments)} values ({_kind_name(kind)})")
+    return tuple(_parse(part, each) for part, each in zip(parts, arguments))

@@ -1,0 +1,395 @@
+"""Host tables of a model: geometry, mass, connectivity. Everything here is numpy and scipy in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from .. import elements as families
+from ..base.errors import MeshError, ModelError
+from ..elements import Part, Rule
+from ..elements.family import Tying
+from ..elements.quadrature import composite
+from .discretisation import Discretisation, element_functions
+from .handles import SurfaceSet
+
+__all__ = [
+    "BlockKey",
+    "FacetTables",
+    "HostBlock",
+    "body_mass",
+    "facet_places",
+    "facet_tables",
+    "gather_table",
+    "host_blocks",
+    "rigid_modes",
+    "surface_weights",
+]
+
+CHUNK = 20000
+"""Most elements handled at once where a table per element would be large."""
+TABLE = 20_000_000
+"""Most entries (elements x points x slots) of a table that is made at once."""
+
+
+def chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[np.ndarray]:
+    """Elements in runs whose tables stay small."""
+    per_element = points * body.family.slots if body.family.has_gradients else 1
+    size = max(1, min(CHUNK, TABLE // per_element))
+    for first in range(0, len(elements), size):
+        yield elements[first : first + size]
+
+
+@dataclass(frozen=True)
+class BlockKey:
+    """What elements must share to be done by one kernel."""
+
+    family: str
+    scheme: str
+    part: int
+    law: str
+    damping: str | None
+    affine: bool
+    framed: bool
+
+    def output_scheme(self, name: str) -> tuple[Part, ...] | None:
+        """The output integration `name` of the family, if it has one."""
+        return families.get(self.family).output_schemes.get(name)
+
+    @property
+    def integral(self) -> Part:
+        """The part of the energy."""
+        return families.get(self.family).scheme(self.scheme)[self.part]
+
+    @property
+    def rule(self) -> Rule:
+        """Quadrature of the part."""
+        return self.integral.rule
+
+    @property
+    def vertex(self) -> bool:
+        """Whether kernels/elements/vertex.py does the product: straight T10 with points towards the vertices."""
+        family = families.get(self.family)
+        quadratic = family.cell_type == "tetra10" and family.slots == 10
+        return self.affine and quadratic and not self.framed and self.rule.radial
+
+    @property
+    def tying(self) -> Tying | None:
+        """Assumed shear, of tied parts."""
+        return self.integral.tying
+
+
+@dataclass(eq=False)
+class HostBlock:
+    """Elements with one key, of one body.
+
+    Attributes:
+        body: the body.
+        elements: (E,) element indices in the body.
+        material: index into the body's materials.
+        coefficients: of the device law.
+    """
+
+    key: BlockKey
+    body: Discretisation
+    elements: np.ndarray
+    material: int
+    coefficients: tuple[float, ...]
+
+    @property
+    def conn(self) -> np.ndarray:
+        return self.body.connectivity[self.elements]
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """(E, n, 3) reference node positions relative to the body origin."""
+        return self.body.mesh.points[self.body.mesh.cells[self.elements]] - self.body.origin
+
+
+def geometry(
+    body: Discretisation, elements: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Functions and J0 at parent points.
+
+    Returns:
+        s (E or 1, Q, S), ds (E or 1, Q, S, 3), J0 (E, Q, 3, 3) = sum E_i ds_i^T, det J0 (E, Q).
+    """
+    s, ds = element_functions(body, elements, points)
+    E = body.reference[body.connectivity[elements]]
+    subscripts = "esk,qsl->eqkl" if len(ds) == 1 else "esk,eqsl->eqkl"
+    J0 = np.einsum(subscripts, E, ds[0] if len(ds) == 1 else ds, optimize=True)
+    return s, ds, J0, np.linalg.det(J0)
+
+
+def gradients(ds: np.ndarray, J0: np.ndarray) -> np.ndarray:
+    """h_i = J0^-T ds_i/dxi, (E, Q, S, 3)."""
+    inverse = np.linalg.inv(J0)
+    return np.einsum("eqlk,eqsl->eqsk", inverse, np.broadcast_to(ds, (len(J0), *ds.shape[1:])), optimize=True)
+
+
+def straight(body: Discretisation) -> np.ndarray:
+    """(E,) whether an element has one J0."""
+    if not body.family.affine:
+        return np.zeros(len(body.mesh.cells), dtype=bool)
+    return body.mesh.straight_sided()
+
+
+def mass_rule(body: Discretisation, affine: bool) -> Rule:
+    """The rule that integrates the mass: exact, also with curved sides; richer with a density that varies in space."""
+    varying = any(callable(m.density) for _, m in body.materials)
+    return body.family.mass_rule if affine and not varying else body.family.curved_mass_rule
+
+
+def density_at(body: Discretisation, elements: np.ndarray, s: np.ndarray, conn: np.ndarray) -> np.ndarray:
+    """(E, Q) density of elements at points."""
+    out = np.empty((len(elements), s.shape[1]))
+    index = body.material_of[elements]
+    for k, (_, material) in enumerate(body.materials):
+        rows = np.flatnonzero(index == k)
+        if not len(rows):
+            continue
+        if callable(material.density):
+            position = body.slot_kind[conn[rows]] == 0
+            E = body.reference[conn[rows]] + position[:, :, None] * body.origin
+            table = np.broadcast_to(s, (len(elements), *s.shape[1:]))[rows]
+            X = np.einsum("eqs,esk->eqk", table, E)
+            values = np.asarray(material.density(X.reshape(-1, 3)), dtype=float).reshape(X.shape[:2])
+            if not np.all(np.isfinite(values) & (values > 0.0)):
+                raise ModelError(f"body {body.name!r}: density f(X) is not positive and finite everywhere")
+            out[rows] = values
+        elif np.ndim(material.density) == 1:
+            out[rows] = np.asarray(material.density, dtype=float)[elements[rows], None]
+        else:
+            out[rows] = float(material.density)
+    return out
+
+
+def parent_mass(family: Any) -> np.ndarray:
+    """int s_i s_j over the parent element, of families whose functions there are those of every straight element."""
+    s, _ = family.shape(family.mass_rule.points, np.zeros((1, len(family.node_slots), 3)))
+    table = np.asarray(s[0])
+    return np.einsum("q,qi,qj->ij", family.mass_rule.weights, table, table)
+
+
+def element_density(host: HostBlock) -> np.ndarray:
+    """(E,) density of the elements of a block, constant in each, kg/m^3."""
+    density = np.asarray(host.body.materials[host.material][1].density, dtype=float)
+    return np.full(len(host.elements), float(density)) if density.ndim == 0 else density[host.elements]
+
+
+def body_mass(body: Discretisation) -> sp.csr_matrix:
+    """Consistent scalar mass matrix m_ij = int rho s_i s_j dV (Eq. 20), body slots, kg."""
+    flat = straight(body)
+    n = body.slot_count
+    total = sp.csr_matrix((n, n))
+    for affine in (True, False):
+        chosen = np.flatnonzero(flat == affine)
+        rule = mass_rule(body, affine)
+        for part in chunks(body, chosen, len(rule.weights)):
+            conn = body.connectivity[part]
+            s, _, _, det = geometry(body, part, rule.points)
+            w = density_at(body, part, s, conn) * det * rule.weights
+            subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
+            table = s[0] if len(s) == 1 else s
+            local = np.einsum(subscripts, w, table, table, optimize=True)
+            S = conn.shape[1]
+            rows = np.repeat(conn, S, axis=1).ravel()
+            cols = np.tile(conn, (1, S)).ravel()
+            total = total + sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n))
+    return total
+
+
+def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
+    """Split a body's elements by what a kernel must know. `tables`: straight elements take the table path too."""
+    flat = straight(body)
+    for k, (_, material) in enumerate(body.materials):
+        damping = material.damping.form if material.damping else None
+        if material.damping and material.damping.eta == 0.0 and material.damping.lambda_v == 0.0:
+            damping = None
+        for is_flat, rule in ((True, body.rule), (False, body.curved_rule)):
+            chosen = (body.material_of == k) & (flat == is_flat)
+            members = body.element_order[chosen[body.element_order]]
+            if len(members):
+                for part, integral in enumerate(body.family.scheme(rule)):
+                    law, values = integral.law(material) if integral.law else (material.law, material.coefficients())
+                    key = BlockKey(
+                        body.family.name,
+                        rule,
+                        part,
+                        law,
+                        damping if part == 0 else None,
+                        is_flat and not tables,
+                        integral.framed,
+                    )
+                    yield HostBlock(key, body, members, k, values)
+
+
+def element_volumes(body: Discretisation) -> np.ndarray:
+    """(E,) m^3, with section and thickness."""
+    rule = body.family.rule(None)
+    every = np.arange(len(body.mesh.cells))
+    parts = [geometry(body, part, rule.points)[3] @ rule.weights for part in chunks(body, every, len(rule.weights))]
+    return np.concatenate(parts)
+
+
+@dataclass(eq=False)
+class TiedTables:
+    """Tables of elements with tied shears e_t = x_a . x_b - X_a . X_b (see kernels/elements/tied.py).
+
+    Attributes:
+        first, second: (E, n, S) ds_i/dxi_a and ds_i/dxi_b at the tying points.
+        X_first, X_second: (E, n, 3) X_a and X_b.
+        coupling: (E, n, width) A of Psi = (mu/2) e.A e.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    X_first: np.ndarray
+    X_second: np.ndarray
+    coupling: np.ndarray
+
+
+def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
+    """Tables of a tied part of some elements of a block."""
+    part, body = host.key.integral, host.body
+    tying = part.tying
+    assert tying is not None
+    _, ds, J, _ = geometry(body, elements, tying.points)
+    t = np.arange(len(tying.points))
+    a, b = tying.pairs.T
+    _, _, J_rule, det = geometry(body, elements, part.rule.points)
+    coupling = tying.coupling(J, J_rule, det, part.rule, body.materials[host.material][1], body.section)
+    first, second = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
+    X_first, X_second = (np.moveaxis(J[:, t, :, k], 0, 1) for k in (a, b))
+    return TiedTables(first, second, X_first, X_second, coupling)
+
+
+def orthonormal(J0: np.ndarray) -> np.ndarray:
+    """Axes along the first parent line, then by Gram-Schmidt; columns, same shape as J0 (..., 3, 3)."""
+    a = J0[..., 0] / np.linalg.norm(J0[..., 0], axis=-1, keepdims=True)
+    b = J0[..., 1] - np.sum(J0[..., 1] * a, axis=-1, keepdims=True) * a
+    b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+    return np.stack([a, b, np.cross(a, b)], axis=-1)
+
+
+def check_orientation(body: Discretisation, rule: Rule) -> None:
+    """Raise MeshError where det J0 <= 0 at a force point."""
+    for part in chunks(body, np.arange(len(body.mesh.cells)), len(rule.weights)):
+        det = geometry(body, part, rule.points)[3]
+        bad = np.flatnonzero((det <= 0.0).any(axis=1))
+        if len(bad):
+            raise MeshError(
+                f"body {body.name!r} ({body.mesh.label}): element {int(part[bad[0]])} has det J0 = "
+                f"{det[bad[0]].min():.3g} <= 0 at a quadrature point: it is inverted"
+            )
+
+
+def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.ndarray]:
+    """Who contributes to each slot: CSR start (slots + 1,) and entries, entry k of [local, elem] in order of `conn`."""
+    flat = np.concatenate([c.T.ravel() for c in conn]) if conn else np.zeros(0, dtype=np.int64)
+    order = np.argsort(flat, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=slots))])
+    return start.astype(np.int32), order.astype(np.int32)
+
+
+def slot_graph(conn: list[np.ndarray], slots: int) -> sp.csr_matrix:
+    """Which slots share an element (the mass alone does not tell: it vanishes between some slots)."""
+    rows = np.concatenate([np.repeat(first + np.arange(len(c)), c.shape[1]) for first, c in _offsets(conn)])
+    columns = np.concatenate([c.ravel() for c in conn])
+    incidence = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(rows.max() + 1, slots))
+    return sp.csr_matrix(incidence.T @ incidence)
+
+
+def _offsets(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
+    first = 0
+    for c in conn:
+        yield first, c
+        first += len(c)
+
+
+@dataclass(eq=False)
+class FacetTables:
+    """Faces of a surface with the slots that their functions need (the rest of an element's vanish there).
+
+    Attributes:
+        conn: (F, n) body slots; faces with fewer repeat their first with functions of 0.
+        shape, d_a, d_b: (F, Q, n) functions and derivatives along the two sides of the face, outward by the right hand.
+        weights: (Q,).
+    """
+
+    conn: np.ndarray
+    shape: np.ndarray
+    d_a: np.ndarray
+    d_b: np.ndarray
+    weights: np.ndarray
+
+
+def facet_tables(surface: SurfaceSet, parts: int = 1) -> FacetTables:
+    """Functions of the faces of a surface at the points of its family's face rule, repeated on parts x parts of it."""
+    body, faces = surface.body, surface.faces
+    rule = composite(body.family.face_rule, parts)
+    Q, S = len(rule.weights), body.family.slots
+    values = np.zeros((3, len(faces), Q, S))
+    used = np.zeros((len(faces), S), dtype=bool)
+    for face in np.unique(faces[:, 1]):
+        rows = np.flatnonzero(faces[:, 1] == face)
+        xi, dxi = body.family.face_points(int(face), rule.points)
+        s, ds = element_functions(body, faces[rows, 0], xi)
+        values[0, rows] = s
+        values[1:, rows] = np.einsum("eqsk,qkd->deqs", ds, dxi)
+        size = np.abs(values[:, rows]).max(axis=(0, 1, 2))
+        used[rows] = size > 1e-12 * size.max()
+    width = int(used.sum(axis=1).max())
+    order = np.argsort(~used, axis=1, kind="stable")[:, :width]
+    real = np.take_along_axis(used, order, axis=1)
+    conn = np.take_along_axis(body.connectivity[faces[:, 0]], order, axis=1)
+    conn = np.where(real, conn, conn[:, :1])
+    table = np.take_along_axis(values, order[None, :, None, :], axis=3) * real[:, None, :]
+    return FacetTables(conn, table[0], table[1], table[2], rule.weights)
+
+
+def facet_places(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.ndarray]:
+    """Reference places X (F, Q, 3), m, of the points of faces, and the areas (F, Q), m^2, that they stand for."""
+    x = body.reference[t.conn]
+    normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
+    X = np.einsum("fqi,fik->fqk", t.shape, x) + body.origin
+    return X, np.linalg.norm(normal, axis=2) * t.weights
+
+
+def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
+    """Integral of each function over faces: body slots and weights (m^2; m^3 for gradients); curved faces too."""
+    t = facet_tables(surface)
+    _, dA = facet_places(surface.body, t)
+    weights = np.einsum("fq,fqi->fi", dA, t.shape)
+    slots, inverse = np.unique(t.conn, return_inverse=True)
+    return slots, np.bincount(inverse.ravel(), weights=weights.ravel(), minlength=len(slots))
+
+
+def center_of_mass(body: Discretisation, values: np.ndarray) -> np.ndarray:
+    """Centre of mass (m) of a body with slot values (slots, 3) relative to its origin."""
+    position = (body.slot_kind == 0).astype(float)
+    lumped = body_mass(body) @ position
+    return lumped @ values / (lumped @ position) + body.origin
+
+
+def rigid_modes(x: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """Six rigid motions on slots with values x: (6, slots, 3), rotations about the mean position."""
+    modes = np.zeros((6, len(x), 3))
+    position = kind == 0
+    arm = x.copy()
+    arm[position] -= x[position].mean(axis=0)
+    for k in range(3):
+        modes[k, position, k] = 1.0
+        axis = np.zeros(3)
+        axis[k] = 1.0
+        modes[3 + k] = np.cross(axis, arm)
+    return modes
+
+
+def components_of(graph: Any) -> np.ndarray:
+    """Connected component of each row of a sparse matrix."""
+    return sp.csgraph.connected_components(graph, directed=False)[1]

@@ -1,0 +1,138 @@
+"""What a builder has collected of a scene, and the checks of what users pass in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..laws import TimeLaw
+from .bodies import Body
+from .handles import NodeSet, SurfaceSet
+from .joints import Joint
+
+__all__ = [
+    "BodyForce",
+    "DeadLoad",
+    "Description",
+    "Moment",
+    "Pressure",
+    "Probe",
+    "Rotation",
+    "Support",
+    "support_slots",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Rotation:
+    """A prescribed rotation about an axis through an anchor.
+
+    Args:
+        anchor: (3,) m.
+        axis: (3,), any length but zero.
+        angle: time law, rad.
+    """
+
+    anchor: Any
+    axis: Any
+    angle: Any
+
+
+@dataclass(eq=False)
+class DeadLoad:
+    """Force weight_i x value(t) on slots; kept for point loads and tractions alike."""
+
+    body: Body
+    slots: np.ndarray
+    weights: np.ndarray
+    law: TimeLaw
+    name: str
+
+
+@dataclass(eq=False)
+class Pressure:
+    """Follower pressure on faces."""
+
+    surface: SurfaceSet
+    law: TimeLaw
+
+
+@dataclass(eq=False)
+class Moment:
+    """A moment shared equally by K points, on the spin of vectors y_k = sum_i vectors_ik e_i of each.
+
+    Attributes:
+        slots: (K, n) body slots.
+        vectors: (K, n, 3) coefficients; columns that the element's spin does not use are 0.
+        axes: (K, 3, 3) reference values of the vectors, columns.
+    """
+
+    body: Body
+    slots: np.ndarray
+    vectors: np.ndarray
+    axes: np.ndarray
+    law: TimeLaw
+
+
+@dataclass(eq=False)
+class BodyForce:
+    """Field b(r, t) on bodies, N/kg."""
+
+    function: Any
+    bodies: list[Body]
+
+
+@dataclass(eq=False)
+class Support:
+    """Prescribed components of slots: clamped (no law), moved by a law, or rotated."""
+
+    body: Body
+    slots: np.ndarray
+    components: np.ndarray
+    law: TimeLaw | None = None
+    node_laws: list[TimeLaw] | None = None
+    rotation: tuple[np.ndarray, np.ndarray] | None = None
+
+
+@dataclass(eq=False)
+class Probe:
+    """A recorded point: sum of weights x slot values."""
+
+    name: str
+    body: Body
+    slots: np.ndarray
+    weights: np.ndarray
+    X: np.ndarray
+
+
+@dataclass(eq=False)
+class Description:
+    """All that a builder has collected."""
+
+    bodies: list[Body] = field(default_factory=list)
+    supports: list[Support] = field(default_factory=list)
+    dead_loads: list[DeadLoad] = field(default_factory=list)
+    pressures: list[Pressure] = field(default_factory=list)
+    moments: list[Moment] = field(default_factory=list)
+    body_forces: list[BodyForce] = field(default_factory=list)
+    probes: list[Probe] = field(default_factory=list)
+    joints: list[Joint] = field(default_factory=list)
+
+
+def support_slots(nodes: NodeSet, which: str) -> np.ndarray:
+    """Body slots of a node set, of the kinds named (see Family.kinds)."""
+    body = nodes.body
+    try:
+        kinds = body.family.kinds(which)
+    except ModelError as error:
+        raise ModelError(f"body {body.name!r}: {error}") from None
+    first = body.node_slot[nodes.indices]
+    first = first[first >= 0]
+    if not len(first):
+        return first
+    counts = body.node_slot_count[body.slot_node[first]]
+    every = np.concatenate([f + np.arange(c) for f, c in zip(first, counts)])
+    return every[np.isin(body.slot_kind[every], sorted(kinds))]

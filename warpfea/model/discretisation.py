@@ -1,0 +1,183 @@
+"""A body as its mesh, its element family and their slots: what tables are made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..elements import Family
+from ..materials import Material
+from ..mesh import Mesh
+from .partition import morton_order
+
+__all__ = ["Discretisation", "boundary_faces", "element_boxes", "element_functions"]
+
+LARGE = 20000
+"""Nodes from which a body's slots and elements are ordered by place; smaller ones fit into caches anyway."""
+
+
+@dataclass(eq=False)
+class Discretisation:
+    """A meshed body with its slots; nodes and elements are counted as in its mesh.
+
+    Attributes:
+        name: unique in its model.
+        mesh: reference mesh, m.
+        family: element family.
+        materials: distinct materials with the names of their groups.
+        material_of: (elements,) index into materials.
+        rule: name of the force quadrature rule.
+        curved_rule: the same of elements with curved sides.
+        frames: (elements, n, 3, 3) parent gradients dX/dxi at the element nodes, in the axes of the node, m; of
+            families with gradient slots.
+        section: section of a beam.
+        node_axes: (nodes, 3, 3) orthonormal axes (columns) of each node's gradient slots; None: the global ones.
+        origin: (3,) body origin; device positions are relative to it.
+        element_offset: number of elements of the bodies before it, set at finalize.
+        slots: (used nodes x slots per node) model slots in body order, set at finalize; -1 before.
+    """
+
+    name: str
+    mesh: Mesh
+    family: Family
+    materials: list[tuple[str, Material]]
+    material_of: np.ndarray
+    rule: str
+    curved_rule: str
+    frames: np.ndarray | None = field(default=None, repr=False)
+    node_axes: np.ndarray | None = field(default=None, repr=False)
+    section: Any = None
+    index: int = -1
+    slot_offset: int = -1
+    element_offset: int = -1
+    velocity: np.ndarray | None = field(default=None, repr=False)
+    initial_displacement: np.ndarray | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {self.family.name}, {len(self.mesh.cells)} elements)"
+
+    # numbering
+
+    @cached_property
+    def origin(self) -> np.ndarray:
+        low, high = self.mesh.bounding_box()
+        return 0.5 * (np.asarray(low) + np.asarray(high))
+
+    @cached_property
+    def node_slot_count(self) -> np.ndarray:
+        """(nodes,) slots of each mesh node; 0 for nodes that no element uses."""
+        counts = np.zeros(len(self.mesh.points), dtype=np.int64)
+        per_node = np.array([len(kinds) for kinds in self.family.node_slots])
+        counts[self.mesh.cells] = per_node[None, :]
+        return counts
+
+    @cached_property
+    def node_slot(self) -> np.ndarray:
+        """(nodes,) first body slot of each mesh node, -1 for unused nodes.
+
+        Large bodies number them along a curve that fills space, so that neighbours lie close in memory.
+        """
+        counts = self.node_slot_count
+        order = morton_order(self.mesh.points) if len(counts) > LARGE else np.arange(len(counts))
+        first = np.empty(len(counts), dtype=np.int64)
+        first[order] = np.concatenate([[0], np.cumsum(counts[order])[:-1]])
+        return np.where(counts > 0, first, -1)
+
+    @property
+    def slot_count(self) -> int:
+        """Slots of the body."""
+        return int(self.node_slot_count.sum())
+
+    @cached_property
+    def connectivity(self) -> np.ndarray:
+        """(elements, slots per element) body slots."""
+        node = self.family.slot_node
+        within = np.concatenate([np.arange(len(kinds)) for kinds in self.family.node_slots])
+        return self.node_slot[self.mesh.cells[:, node]] + within[None, :]
+
+    @cached_property
+    def slot_kind(self) -> np.ndarray:
+        """(slots,) 0 for positions, 1..3 for gradients along the node's axes."""
+        kinds = np.zeros(self.slot_count, dtype=np.int64)
+        kinds[self.connectivity] = self.family.slot_kind[None, :]
+        return kinds
+
+    @cached_property
+    def slot_node(self) -> np.ndarray:
+        """(slots,) mesh node of each slot."""
+        nodes = np.zeros(self.slot_count, dtype=np.int64)
+        nodes[self.connectivity] = self.mesh.cells[:, self.family.slot_node]
+        return nodes
+
+    @cached_property
+    def reference(self) -> np.ndarray:
+        """(slots, 3) reference slot values E_i: positions relative to the origin, gradients the node's axes."""
+        E = self.mesh.points[self.slot_node] - self.origin
+        for k in (1, 2, 3):
+            rows = self.slot_kind == k
+            E[rows] = np.eye(3)[k - 1] if self.node_axes is None else self.node_axes[self.slot_node[rows], :, k - 1]
+        return E
+
+    @property
+    def slots(self) -> np.ndarray:
+        """(slots,) indices of the body's slots in the model, nodes in mesh order. Raises ModelError before finalize."""
+        if self.slot_offset < 0:
+            raise ModelError(f"body {self.name!r}: slots are numbered by ModelBuilder.finalize")
+        counts = self.node_slot_count
+        within = np.arange(self.slot_count) - np.repeat(np.cumsum(counts) - counts, counts)
+        return self.slot_offset + np.repeat(self.node_slot, counts) + within
+
+    @cached_property
+    def element_order(self) -> np.ndarray:
+        """(elements,) the order that elements are computed in: large bodies as their nodes are numbered."""
+        if len(self.mesh.points) <= LARGE:
+            return np.arange(len(self.mesh.cells))
+        return morton_order(self.mesh.points[self.mesh.cells].mean(axis=1))
+
+    @cached_property
+    def boundary(self) -> np.ndarray:
+        """(K, 2) all outer faces, rows (element, local face)."""
+        return boundary_faces(self)
+
+    @cached_property
+    def element_boxes(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Boxes of the elements, for finding points."""
+        return element_boxes(self)
+
+
+def element_functions(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """s (E or 1, Q, S) and ds/dxi (E or 1, Q, S, 3) of elements at parent points (Q, 3)."""
+    nodes = body.mesh.points[body.mesh.cells[elements]] - body.origin
+    extra = () if body.frames is None else (body.frames[elements],)
+    return body.family.shape(xi, nodes, *extra)
+
+
+def boundary_faces(body: Discretisation) -> np.ndarray:
+    """Outer faces, rows (element, local face): of solids the mesh's, of beams and shells their own."""
+    mesh, family = body.mesh, body.family
+    if family.solid:
+        return mesh.boundary()
+    every = np.arange(len(mesh.cells))
+    if mesh.cell_type == "line":
+        uses = np.bincount(mesh.cells.ravel(), minlength=len(mesh.points))
+        ends = [np.column_stack([e, np.full(len(e), k)]) for k in (0, 1) for e in [every[uses[mesh.cells[:, k]] == 1]]]
+        long = [np.column_stack([every, np.full(len(every), k)]) for k in (2, 3, 4, 5)]
+        return np.concatenate(ends + long)
+    edges = mesh.boundary()
+    wide = [np.column_stack([every, np.full(len(every), k)]) for k in (0, 1)]
+    return np.concatenate([*wide, edges + np.array([0, 2])])
+
+
+def element_boxes(body: Discretisation) -> tuple[np.ndarray, np.ndarray, float]:
+    """Corners (E, 3) of the boxes of the elements in the reference, and the longest side of any, m."""
+    E = body.reference[body.connectivity] + (body.slot_kind[body.connectivity] == 0)[:, :, None] * body.origin
+    coords = E
+    if body.family.has_gradients:
+        s, _ = element_functions(body, np.arange(len(E)), body.family.lattice.points)
+        coords = np.einsum("eps,esk->epk", s, E, optimize=True)
+    low, high = coords.min(axis=1), coords.max(axis=1)
+    return low, high, float(np.max(high - low))

@@ -1,0 +1,295 @@
+"""Functions of a state for checking and for output: forces, energy, tangent, stresses. Not on the path of a step."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..base.errors import ModelError
+from ..base.launch import Launcher
+from ..elements import Rule
+from ..kernels.common.types import precision
+from ..kernels.elements.materials import ANY_J
+from ..kernels.step.gather import gather_kernels
+from ..kernels.terms.constraints import SUM_ROWS, multiplier_struct
+from . import assembly
+from .assembly import chunks, geometry, gradients
+from .state import State
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["Evaluation"]
+
+
+class Evaluation:
+    """Evaluates a model at a state; allocates what it needs at each call."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.launch = Launcher(model.device)
+
+    def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.model.device)
+
+    def _gather(self, contribution: wp.array) -> np.ndarray:
+        m = self.model
+        out = self._zeros((m.worlds, m.slots), m.types.vec3)
+        kernel = gather_kernels(m.dtype, False).gather_force
+        self.launch(kernel, (m.worlds, m.slots), [m.topology, contribution, self._all(), out])
+        return out.numpy()
+
+    def _all(self) -> wp.array:
+        return wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
+
+    def internal_force(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Elastic force [world, slot, 3], strain energy [world], smallest J [world]."""
+        m = self.model
+        contribution = self._zeros((m.worlds, m.contributions), m.types.vec3)
+        energy = self._zeros((2, m.worlds, m.element_count), wp.float64)
+        low = wp.full(m.worlds, 1e30, dtype=wp.float64, device=m.device)
+        domain = wp.full(m.worlds, 1e30, dtype=wp.float64, device=m.device)
+        one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
+        history = self._zeros((1, 1), m.types.sym)
+        for block in m.blocks:
+            kernel = block.kernels_for(m.dtype, None).internal_force
+            args = [
+                block.data,
+                state.displacement,
+                state.velocity,
+                history,
+                one,
+                self._all(),
+                1,
+                contribution,
+                energy,
+                low,
+                domain,
+            ]
+            self.launch(kernel, (m.worlds, block.count), args)
+        return self._gather(contribution), energy.numpy()[0].sum(axis=1), low.numpy()
+
+    def viscous_force(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Viscous force [world, slot, 3] and dissipation rate [world]."""
+        m = self.model
+        contribution = self._zeros((m.worlds, m.contributions), m.types.vec3)
+        power = self._zeros((m.worlds, m.element_count), wp.float64)
+        for block in m.blocks:
+            if block.key.damping:
+                args = [block.data, state.displacement, state.velocity, self._all(), contribution, power]
+                self.launch(block.kernels.viscous_force, (m.worlds, block.count), args)
+        return self._gather(contribution), power.numpy().sum(axis=1)
+
+    def constraints(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Constraints at a state: values [world, row], gradients [world, 3 row + side, 3], right sides [world, row]."""
+        mul = self._multipliers(state)
+        return mul.value.numpy(), mul.gradient.numpy(), mul.target.numpy()
+
+    def _multipliers(self, state: State, multipliers: np.ndarray | None = None) -> Any:
+        """Evaluated constraints with given multipliers (rows,) and no penalty."""
+        m = self.model
+        con = m.constraints
+        if con is None:
+            raise ModelError("the model has no constraints")
+        loads, B = m.loads, m.worlds
+        value = self._zeros((B, max(loads.law_count, 1)), wp.vec3d)
+        one = wp.ones(B, dtype=wp.float64, device=m.device)
+        if loads.law_count:
+            args = [loads.laws, state.time, one, self._all(), value]
+            self.launch(loads.kernels.evaluate_laws, (B, loads.law_count), args)
+            for kernel, law in loads.function_laws:
+                self.launch(kernel, B, [law, state.time, self._all(), value])
+        mul = multiplier_struct()()
+        for name in ("value", "target", "last", "scale", "force", "change", "trial", "merit", "excess", "stiffness"):
+            setattr(mul, name, self._zeros((B, con.count), wp.float64))
+        for name in ("gradient", "product"):
+            setattr(mul, name, self._zeros((B, 3 * con.count), wp.vec3d))
+        mul.rows = self._zeros((SUM_ROWS, B, con.count), wp.float64)
+        mul.violation = self._zeros((B, m.component_count), wp.float64)
+        if multipliers is not None:
+            mul.force.assign(np.tile(multipliers, (B, 1)))
+        mul.last.fill_(np.nan)  # any turn is as good as another
+        alpha = self._zeros((B,), wp.float64)
+        args = [con.data, state.displacement, value, alpha, self._all(), mul]
+        self.launch(con.kernels.evaluate, (B, con.count), args)
+        return mul
+
+    def constraint_jacobian(self, state: State, world: int) -> sp.csr_matrix:
+        """dc/dq of one world, (rows, 3 slots) CSR."""
+        _, gradient, _ = self.constraints(state)
+        con = self.model.constraints
+        assert con is not None
+        return con.expand(gradient[world].reshape(-1, 3, 3))
+
+    def constraint_curvature(self, state: State, multipliers: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """sum_i multipliers_i d2c_i/dq2 direction, [world, slot, 3]; multipliers (rows,), direction (slots, 3)."""
+        m, con = self.model, self.model.constraints
+        mul = self._multipliers(state, multipliers)
+        assert con is not None
+        p = self._zeros((m.worlds, m.slots), m.types.vec3)
+        p.assign(np.tile(direction, (m.worlds, 1, 1)).astype(p.numpy().dtype))
+        one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
+        self.launch(con.kernels.product_terms, (m.worlds, con.count), [con.data, mul, p, one, self._all()])
+        out = np.zeros((m.worlds, m.slots, 3))
+        terms = mul.product.numpy()
+        for world in range(m.worlds):
+            np.add.at(out[world], con.slot_host, con.weight_host[:, None] * terms[world, con.term_host])
+        return out
+
+    def tangent_matrix(self, state: State, world: int) -> sp.csr_matrix:
+        """df_int/dq as CSR. No element holds two slots of one colour: one product per colour and axis."""
+        m = self.model
+        one_world = State(1, m.device)
+        row = state.displacement.numpy()[world : world + 1]
+        u = one_world.register("displacement", m.types.vec3, (m.slots,), row)
+        contribution = self._zeros((1, m.contributions), m.types.vec3)
+        direction = self._zeros((1, m.slots), m.types.vec3)
+        flag = wp.ones(1, dtype=wp.int32, device=m.device)
+        dq = wp.ones(1, dtype=wp.float64, device=m.device)
+        history = self._zeros((1, 1), m.types.sym)
+        conns = [b.connectivity for b in m.blocks]
+        colour = _colours(m.graph())
+        rows, cols, values = [], [], []
+        for c in range(int(colour.max()) + 1):
+            for axis in range(3):
+                host = np.zeros((1, m.slots, 3), dtype=precision(m.dtype).T._type_)
+                host[0, colour == c, axis] = 1.0
+                direction.assign(host)
+                for block in m.blocks:
+                    kernel = block.kernels_for(m.dtype, None).tangent_product
+                    args = [block.data, u, u, history, dq, flag, direction, contribution]
+                    self.launch(kernel, (1, block.count), args)
+                out = contribution.numpy()[0]
+                for block, conn in zip(m.blocks, conns):
+                    part = out[block.contribution_offset :][: block.count * block.slots]
+                    part = part.reshape(block.slots, block.count, 3)
+                    elem, local = np.nonzero(colour[conn] == c)
+                    column = 3 * conn[elem, local] + axis
+                    f = part[:, elem, :]
+                    index = 3 * conn[elem].T[:, :, None] + np.arange(3)
+                    rows.append(index.ravel())
+                    cols.append(np.broadcast_to(column[None, :, None], f.shape).ravel())
+                    values.append(f.astype(float).ravel())
+        n = 3 * m.slots
+        data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
+        return sp.csr_matrix(data, shape=(n, n))
+
+    def stresses(self, state: State, body: Any = None) -> list[tuple[Any, np.ndarray]]:
+        """Per block (of a body): Cauchy stress at the points, [world, point, elem, 6] as xx yy zz yz xz xy, Pa.
+
+        Of an energy in parts each block holds its part; they add up.
+        """
+        m = self.model
+        out = []
+        for block in m.blocks:
+            if body is not None and all(part.body is not body for part in block.parts):
+                continue
+            if block.key.tying:
+                if block.key.output_scheme("shear stress") is None:
+                    continue  # the transverse shear of a shell vanishes at its faces, where its stress is wanted
+                block.shear = block.shear or m.shear_block(block)
+                block = block.shear
+            stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
+            J = self._zeros((m.worlds, block.points, block.count), m.types.T)
+            kernel = block.kernels_for(m.dtype, None).point_stress
+            self.launch(kernel, (m.worlds, block.count), [block.data, state.displacement, stress, J])
+            out.append((block, stress.numpy()))
+        return out
+
+    def sample_stress(self, state: State, body: Any) -> np.ndarray:
+        """Cauchy stress at the samples of each mesh node, [world, node x sample, 6], Pa.
+
+        Each part of the energy is fitted per element and evaluated at the samples; parts add up, elements are averaged
+        by volume.
+        """
+        m = self.model
+        family = body.family
+        k = family.node_samples.shape[1]
+        total = np.zeros((m.worlds, len(body.mesh.points) * k, 6))
+        weight = np.zeros(total.shape[1])
+        volumes = assembly.element_volumes(body)
+        for block, stress in self.stresses(state, body):
+            first = 0
+            to_samples = _extrapolation(block.key.rule, family.node_samples.reshape(-1, 3))
+            for part in block.parts:
+                members = slice(first, first + len(part.elements))
+                first += len(part.elements)
+                if part.body is not body:
+                    continue
+                at_samples = np.einsum("nq,bqek->benk", to_samples, stress[:, :, members].astype(float))
+                rows = (body.mesh.cells[part.elements][:, :, None] * k + np.arange(k)).reshape(len(part.elements), -1)
+                v = volumes[part.elements]
+                if block.key.part == 0 and block.key.scheme != "shear stress":
+                    np.add.at(weight, rows, v[:, None])
+                for b in range(m.worlds):
+                    np.add.at(total[b], rows, at_samples[b] * v[:, None, None])
+        return total / np.where(weight > 0.0, weight, 1.0)[None, :, None]
+
+
+def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
+    """Model index and description of the element with the smallest J at points and vertices; u (slots, 3), m."""
+    best, index, text = np.inf, -1, "no element"
+    for block in model.blocks:
+        if model.needs_positive_J and block.key.law in ANY_J:
+            continue  # may turn inside out
+        for part in block.parts:
+            body = part.body
+            rule = block.key.rule
+            points = np.vstack([rule.points, body.family.vertices])
+            for members in chunks(body, part.elements, len(points)):
+                _, ds, J0, _ = geometry(body, members, points)
+                U = u[body.slot_offset + body.connectivity[members]]
+                F = np.eye(3) + np.einsum("esk,eqsl->eqkl", U, gradients(ds, J0))
+                J = np.linalg.det(F).min(axis=1)
+                low = int(np.argmin(np.where(np.isnan(J), -np.inf, J)))
+                if not J[low] >= best:
+                    best, index = float(J[low]), body.element_offset + int(members[low])
+                    text = f"element {int(members[low])} of body {body.name!r} (J = {best:.3g})"
+    return index, text
+
+
+def _extrapolation(rule: Rule, at: np.ndarray) -> np.ndarray:
+    """(n, Q) fit of a field known at the points of a rule, evaluated at parent points (n, 3).
+
+    On a box the product of Lagrange's polynomials through the points; on the simplex a linear least-squares fit, a
+    constant where the points can't carry one.
+    """
+    if rule.counts:
+        out = np.ones((len(at), 1))
+        grid = rule.points.reshape(*rule.counts, 3)
+        for axis in range(3):
+            nodes = np.moveaxis(grid[..., axis], axis, 0).reshape(rule.counts[axis], -1)[:, 0]
+            basis = np.ones((len(at), len(nodes)))
+            for j, k in itertools.permutations(range(len(nodes)), 2):
+                basis[:, j] *= (at[:, axis] - nodes[k]) / (nodes[j] - nodes[k])
+            out = (out[:, :, None] * basis[:, None, :]).reshape(len(at), -1)
+        return out
+    points = rule.points
+    if len(points) < 4:
+        return np.full((len(at), len(points)), 1.0 / len(points))
+    A = np.column_stack([np.ones(len(points)), points])
+    return np.column_stack([np.ones(len(at)), at]) @ np.linalg.pinv(A)
+
+
+def von_mises(s: np.ndarray) -> np.ndarray:
+    """Von Mises stress of Voigt stresses [..., 6]."""
+    xx, yy, zz, yz, xz, xy = np.moveaxis(s, -1, 0)
+    normal = 0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2)
+    return np.sqrt(normal + 3.0 * (yz**2 + xz**2 + xy**2))
+
+
+def _colours(graph: sp.csr_matrix) -> np.ndarray:
+    """Greedy colouring: slots that share an element differ."""
+    n = graph.shape[0]
+    colour = np.full(n, -1)
+    for s in range(n):
+        taken = set(colour[graph.indices[graph.indptr[s] : graph.indptr[s + 1]]].tolist())
+        c = 0
+        while c in taken:
+            c += 1
+        colour[s] = c
+    return colour

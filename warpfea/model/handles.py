@@ -1,0 +1,75 @@
+"""Sets of nodes, faces and elements of a body, and material points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .discretisation import Discretisation
+
+__all__ = ["ElementSet", "MaterialPoint", "NodeSet", "SurfaceSet"]
+
+
+@dataclass(frozen=True, eq=False)
+class NodeSet:
+    """Nodes of a body, by index in the mesh file's order (n,)."""
+
+    body: Discretisation
+    indices: np.ndarray
+    name: str = ""
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSet:
+    """Faces of a body, rows (element, local face) (n, 2)."""
+
+    body: Discretisation
+    faces: np.ndarray
+    name: str = ""
+
+    def __len__(self) -> int:
+        return len(self.faces)
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """(n, 3, 4 or 6) node indices of each face of a solid, outward."""
+        return self.body.mesh.faces(self.faces)
+
+
+@dataclass(frozen=True, eq=False)
+class ElementSet:
+    """Elements of a body by index (n,)."""
+
+    body: Discretisation
+    indices: np.ndarray
+    name: str = ""
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialPoint:
+    """A material point X = sum weights_i X_i of a body, held by body slots.
+
+    Attributes:
+        body: the body.
+        slots: (n,) body slots.
+        weights: (n,) shape functions at the point.
+        X: (3,) reference position, m.
+        gradients: (n, 3) dweights/dX, 1/m: the deformation gradient is sum e_i gradients_i^T.
+        axes: (3, 3) columns: of a beam axis, width, height there; of a shell two tangents and the director; else
+            global.
+    """
+
+    body: Discretisation
+    slots: np.ndarray
+    weights: np.ndarray
+    X: np.ndarray
+    gradients: np.ndarray
+    axes: np.ndarray
+    element: int = -1

@@ -1,0 +1,119 @@
+"""Joints as data: vectors linear in the slots, and scalar rows made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..kernels.terms.constraints import DISTANCE
+from ..laws import TimeLaw
+from .discretisation import Discretisation
+
+__all__ = ["NEGLIGIBLE", "Joint", "Part", "Row", "Vector", "constant"]
+
+NEGLIGIBLE = 1e-13
+"""Weights below this share of a vector's largest are rounding of functions that vanish there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The share of a body in a vector: sum of weights x slot values. `child`: it is the joint's child side."""
+
+    body: Discretisation
+    slots: np.ndarray
+    weights: np.ndarray
+    child: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Vector:
+    """A vector in space that is linear in the slots; value (3,) in the reference configuration, m or 1."""
+
+    value: np.ndarray
+    parts: tuple[Part, ...] = ()
+
+    def __sub__(self, other: Vector) -> Vector:
+        flipped = tuple(Part(p.body, p.slots, -p.weights, p.child) for p in other.parts)
+        return Vector(self.value - other.value, self.parts + flipped)
+
+    def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Model slots, weights and child flags, negligible weights left out. After finalize."""
+        if not self.parts:
+            return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool)
+        slots = np.concatenate([p.body.slot_offset + p.slots for p in self.parts])
+        weights = np.concatenate([p.weights for p in self.parts])
+        child = np.concatenate([np.full(len(p.slots), p.child) for p in self.parts])
+        keep = np.abs(weights) > NEGLIGIBLE * np.abs(weights).max()
+        return slots[keep], weights[keep], child[keep]
+
+
+def constant(value: Any) -> Vector:
+    """A vector that does not move."""
+    return Vector(np.asarray(value, dtype=float))
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A scalar constraint; see kernels/terms/constraints.py for the kinds.
+
+    Attributes:
+        kind: DOT, DISTANCE or TURN.
+        a, b, a2: its vectors.
+        scale: makes metres of it; with `angular` it is taken times the model's size.
+        law: right side over time, or None: `fixed`.
+        component: of the law's value.
+    """
+
+    kind: int
+    a: Vector
+    b: Vector
+    scale: float = 1.0
+    a2: Vector | None = None
+    law: TimeLaw | None = None
+    component: int = 0
+    fixed: float = 0.0
+    angular: bool = False
+
+    @property
+    def terms(self) -> tuple[Vector, Vector, Vector]:
+        """The three vectors; absent ones are constants."""
+        none = constant(np.zeros(3))
+        return self.a, self.b, self.a2 or none
+
+    @property
+    def constant(self) -> float:
+        """A.B of the reference, |A|^2 of a distance. Vectors made perpendicular are so exactly."""
+        A, B = self.a.value, self.b.value
+        if self.kind == DISTANCE:
+            return float(A @ A)
+        dot = float(A @ B)
+        return 0.0 if abs(dot) < 1e-13 * np.linalg.norm(A) * np.linalg.norm(B) else dot
+
+
+@dataclass(eq=False)
+class Joint:
+    """Handle of a joint, weld or single constraint.
+
+    Attributes:
+        name: unique in its model.
+        kind: "revolute", "DP1", "weld", ...
+        rows: its scalar constraints.
+        anchor: where it acts on the child, for the reaction's moment.
+        angle: vectors (a, a2, b) whose angle from a towards a2 is the joint's, or None.
+        travel: vectors (a, b): the joint's travel is a.b, b the parent's axis F n, or None.
+        between: what it ties, for messages.
+    """
+
+    name: str
+    kind: str
+    rows: list[Row] = field(repr=False)
+    anchor: Vector = field(repr=False)
+    between: str = ""
+    angle: tuple[Vector, Vector, Vector] | None = field(default=None, repr=False)
+    travel: tuple[Vector, Vector] | None = field(default=None, repr=False)
+    index: int = -1
+
+    def __repr__(self) -> str:
+        return f"Joint({self.name!r}, {self.kind}, {self.between})"

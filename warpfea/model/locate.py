@@ -1,0 +1,83 @@
+"""The material point at a reference position: which element holds it, and where in its parent domain."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from .assembly import orthonormal
+from .discretisation import Discretisation, element_functions
+from .handles import MaterialPoint
+
+__all__ = ["locate"]
+
+
+def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
+    """Find X (3,), m, in the reference of a body, by Newton's method in every element near it.
+
+    A point outside by no more than `slack` of an element's size is found by the element's functions there.
+
+    Raises:
+        ModelError: X is not three finite numbers, or lies outside of the body.
+    """
+    try:
+        x = np.asarray(X, dtype=float)
+    except (TypeError, ValueError):
+        x = np.zeros(0)
+    if x.shape != (3,) or not np.all(np.isfinite(x)):
+        raise ModelError(f"body {body.name!r}: a point must be three finite numbers (m), got {X!r}")
+    parent = body.family.parent
+    near, size = _near(body, x)
+    best = (np.inf, -1, np.zeros(3))
+    if len(near):
+        E = (
+            body.reference[body.connectivity[near]]
+            + (body.slot_kind[body.connectivity[near]] == 0)[:, :, None] * body.origin
+        )
+        xi = np.tile(parent.center, (len(near), 1))
+        for _ in range(20):
+            s, ds = _own_point(body, near, xi)
+            residual = np.einsum("es,esk->ek", s, E) - x
+            J = np.einsum("esk,esl->ekl", E, ds)
+            step = np.linalg.solve(J, residual[:, :, None])[:, :, 0]
+            last, xi = xi, np.clip(xi - step, -2.0, 3.0)
+            if np.abs(xi - last).max() < 1e-14:
+                break
+        s, _ = _own_point(body, near, xi)
+        miss = np.linalg.norm(np.einsum("es,esk->ek", s, E) - x, axis=1) / size
+        outside = parent.outside(xi) + miss
+        k = int(np.argmin(outside))
+        best = (float(outside[k]), int(near[k]), xi[k])
+    if best[0] > max(slack, 1e-12 * float(np.abs(x).max()) / size):
+        low, high = body.mesh.bounding_box()
+        raise ModelError(
+            f"body {body.name!r}: point {x.tolist()} lies outside of it (its nodes fill the box "
+            f"{np.asarray(low).tolist()} to {np.asarray(high).tolist()} m)"
+        )
+    return point_of(body, best[1], best[2], x)
+
+
+def point_of(body: Discretisation, element: int, xi: np.ndarray, X: np.ndarray) -> MaterialPoint:
+    """The material point at parent coordinates xi (3,) of an element."""
+    s, ds = _own_point(body, np.array([element]), xi[None])
+    conn = body.connectivity[element]
+    J0 = body.reference[conn].T @ ds[0]
+    axes = np.eye(3) if body.family.solid else orthonormal(J0)
+    return MaterialPoint(body, conn, s[0].copy(), X, ds[0] @ np.linalg.inv(J0), axes, element)
+
+
+def _own_point(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Functions (E, S), (E, S, 3) of each element at its own point (E, 3)."""
+    s, ds = element_functions(body, elements[:1], xi)
+    if s.shape[0] == 1 and not body.family.has_gradients:
+        return s[0], ds[0]
+    parts = [element_functions(body, elements[k : k + 1], xi[k : k + 1]) for k in range(len(elements))]
+    return np.stack([p[0][0, 0] for p in parts]), np.stack([p[1][0, 0] for p in parts])
+
+
+def _near(body: Discretisation, x: np.ndarray) -> tuple[np.ndarray, float]:
+    """Elements whose drawn box, grown by a tenth, holds x; and the size of the largest (m)."""
+    low, high, size = body.element_boxes
+    return np.flatnonzero(np.all((low - 0.1 * size <= x) & (high + 0.1 * size >= x), axis=1)), size

@@ -1,0 +1,166 @@
+"""State: the registry of all arrays that vary with time, one row per world.
+
+Features register what they need once; copying, rejection, reset, freezing, checkpoints and the bytes report loop over
+the registry and so know of every array.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import CheckpointError, ModelError
+from ..kernels.common.state import state_kernels
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+
+__all__ = ["ArraySpec", "State"]
+
+MEMORY = ("preconditioner", "operator", "predictor")
+"""What names of arrays begin with that solvers remember; a state can do without."""
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """A registered array: its name, dtype, shape per world, and initial value (broadcast)."""
+
+    name: str
+    dtype: Any
+    shape: tuple[int, ...]
+    initial: Any = 0
+
+
+class State:
+    """Arrays [world, ...] on one device; each is an attribute by its name.
+
+    Attributes:
+        displacement: [world, slot] vec3, m (gradient slots: 1), from the reference.
+        velocity: [world, slot] vec3, m/s.
+        time: [world] float64, s.
+        worlds, device: as in the model.
+    """
+
+    displacement: wp.array
+    velocity: wp.array
+    time: wp.array
+
+    def __init__(self, worlds: int, device: Any) -> None:
+        self.worlds = worlds
+        self.device = device
+        self.specs: dict[str, ArraySpec] = {}
+        self._arrays: dict[str, wp.array] = {}
+        self.sealed = False
+
+    def __getattr__(self, name: str) -> wp.array:
+        arrays = self.__dict__.get("_arrays", {})
+        if name in arrays:
+            return arrays[name]
+        raise AttributeError(f"state has no array {name!r}; it has {sorted(arrays)}")
+
+    def register(self, name: str, dtype: Any, shape: tuple[int, ...] = (), initial: Any = 0) -> wp.array:
+        """Add an array [world, *shape]; `initial` broadcasts to it. A name that is there already keeps its array.
+
+        Raises:
+            ModelError: the name is taken by an array of another kind, or rows are no multiple of 4 bytes.
+        """
+        spec = ArraySpec(name, dtype, tuple(shape), initial)
+        if name in self.specs:
+            old = self.specs[name]
+            if (old.dtype, old.shape) != (spec.dtype, spec.shape):
+                raise ModelError(f"state array {name!r} is registered as {old.dtype}{old.shape}")
+            return self._arrays[name]
+        if self.sealed:
+            raise ModelError(
+                f"state array {name!r}: register it before the Simulation is made, which keeps copies of all"
+            )
+        row = int(np.prod(spec.shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
+        if row % 4:
+            raise ModelError(f"state array {name!r}: a row has {row} bytes, which is no multiple of 4")
+        array = wp.zeros((self.worlds, *spec.shape), dtype=dtype, device=self.device)
+        values = np.asarray(initial)
+        if values.ndim or values != 0:
+            host = array.numpy()
+            host[...] = values
+            array.assign(host)
+        self.specs[name] = spec
+        self._arrays[name] = array
+        return array
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the registered arrays."""
+        return list(self.specs)
+
+    @property
+    def bytes(self) -> dict[str, int]:
+        """Bytes of each array."""
+        return {name: array.size * wp.types.type_size_in_bytes(array.dtype) for name, array in self._arrays.items()}
+
+    def like(self) -> State:
+        """A state with the same registry and values of its own, copied from this one."""
+        out = State(self.worlds, self.device)
+        out.specs = dict(self.specs)
+        out._arrays = {name: wp.clone(array) for name, array in self._arrays.items()}
+        return out
+
+    def copy_rows(self, launch: Launcher, flags: wp.array, source: State, skip: tuple[str, ...] = ()) -> None:
+        """Copy the rows of the worlds with flag 1 from another state, bit for bit."""
+        kernel = state_kernels().copy_rows
+        for name, target in self._arrays.items():
+            if name in skip:
+                continue
+            a, b = _words(source._arrays[name]), _words(target)
+            if b.shape[1]:
+                launch(kernel, b.shape, [flags, a, b])
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Copies of all arrays on the host."""
+        return {name: array.numpy().copy() for name, array in self._arrays.items()}
+
+    def load(self, values: dict[str, np.ndarray]) -> None:
+        """Set all arrays from the host. What solvers remember begins anew where `values` are of another solver.
+
+        Raises:
+            CheckpointError: a missing name or another shape; nothing is set then.
+        """
+        own, given = ({name for name in names if not remembered(name)} for names in (self._arrays, values))
+        if own != given:
+            raise CheckpointError(
+                f"state arrays differ: missing {sorted(own - given)}, unknown {sorted(given - own)}; a state goes on "
+                "with the integrator, the ledger and the constraints that it was made with"
+            )
+        host = {name: array.numpy() for name, array in self._arrays.items()}
+        memory = [name for name in host if remembered(name)]
+        if any(name not in values or values[name].shape != host[name].shape for name in memory):
+            values = {name: value for name, value in values.items() if name not in memory}
+            for name in memory:
+                values[name] = np.zeros_like(host[name])
+                values[name][...] = self.specs[name].initial
+        for name in self._arrays:
+            expected = host[name]
+            if values[name].shape != expected.shape or values[name].dtype != expected.dtype:
+                raise CheckpointError(
+                    f"state array {name!r} is {values[name].dtype}{values[name].shape}, expected "
+                    f"{expected.dtype}{expected.shape}"
+                )
+        for name, array in self._arrays.items():
+            array.assign(values[name])
+
+
+def remembered(name: str) -> bool:
+    """Whether an array is a solver's memory."""
+    return name.partition("_")[0] in MEMORY
+
+
+def _words(array: wp.array) -> wp.array:
+    """The array seen as [world, 32-bit word]."""
+    size = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
+    out: Any = wp.array(
+        ptr=array.ptr, dtype=wp.uint32, shape=(array.shape[0], size // max(array.shape[0], 1)), device=array.device
+    )
+    out._owner = array  # keeps the memory alive
+    return out

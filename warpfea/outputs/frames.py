@@ -1,0 +1,166 @@
+"""What all output writers share: the protocol, due frames, safe file replacement and the drawn surface.
+
+A writer gets the simulation itself and asks it for `time` (B,), `dt`, `model.bodies`, `model.worlds`,
+`model.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for nodal formats,
+`positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warpfea.base.errors import OutputError
+
+__all__ = ["FrameClock", "Surface", "field_label", "grid_offsets", "vertex_normals"]
+
+Array = npt.NDArray[Any]
+
+# name -> (title, units) of the fields that are known by name
+FIELDS: dict[str, tuple[str, str]] = {
+    "von_mises": ("von Mises stress", "Pa"),
+    "displacement": ("displacement", "m"),
+    "velocity": ("velocity", "m/s"),
+    "strain_energy_density": ("strain energy density", "J/m3"),
+    "contact_pressure": ("contact pressure", "Pa"),
+    "J": ("volume ratio J", ""),
+}
+
+
+def field_label(name: str) -> tuple[str, str]:
+    """(title, units) of a field; an unknown name stands for itself, without units."""
+    return FIELDS.get(name, (name.replace("_", " "), ""))
+
+
+def time_of(sim: Any) -> float:
+    """The simulated time (s) of a frame: that of the world which is furthest (frozen worlds stay behind)."""
+    return float(np.max(np.asarray(sim.time, dtype=np.float64)))
+
+
+class FrameClock:
+    """Says when a frame is due: frame k at time k / fps.
+
+    The first state is always due. Then a frame is due with the first state at or after its time, and when one
+    step passes several frame times, once for the latest of them. Writers store the state under its own time,
+    never under the nominal one: what a file says about a time is true at that time, and players interpolate
+    linearly in between.
+    """
+
+    def __init__(self, fps: float) -> None:
+        if not (np.isfinite(fps) and fps > 0):
+            raise OutputError(f"frames per second must be positive and finite, got {fps!r}")
+        self.fps = float(fps)
+        self.last = -np.inf
+        self._next = -np.inf
+
+    def due(self, time: float) -> bool:
+        """Whether the state at `time` (s) is a frame; answers yes once per frame."""
+        frame = time * self.fps
+        slack = 1e-6 + 1e-12 * abs(frame)
+        if frame < self._next - slack:
+            return False
+        self._next = np.floor(frame + slack) + 1.0
+        self.last = time
+        return True
+
+    def code(self, time: float) -> float:
+        """Time code of `time`: time * fps, as a whole number where it is one but for round-off."""
+        frame = time * self.fps
+        nearest = float(np.round(frame))
+        return nearest if abs(frame - nearest) <= 1e-6 + 1e-12 * abs(frame) else frame
+
+
+def grid_offsets(worlds: int, spacing: tuple[float, float], up_axis: str = "Z") -> npt.NDArray[np.float64]:
+    """(B, 3) origins (m) of worlds on a near-square horizontal grid; world 0 stays at the origin."""
+    columns = int(np.ceil(np.sqrt(worlds)))
+    row, column = np.divmod(np.arange(worlds), columns)
+    offsets = np.zeros((worlds, 3))
+    offsets[:, 0] = column * spacing[0]
+    offsets[:, 1 if up_axis == "Z" else 2] = row * spacing[1] * (1.0 if up_axis == "Z" else -1.0)
+    return offsets
+
+
+def vertex_normals(points: Array, triangles: Array) -> npt.NDArray[np.float32]:
+    """(P, 3) unit normals, area-weighted over the triangles of each point; (0, 0, 1) where there are none."""
+    points = points - points.mean(axis=0)
+    corner = [points[triangles[:, k]] for k in range(3)]
+    area = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+    return unit_rows(scatter_rows(triangles.ravel(), np.repeat(area, 3, axis=0), len(points)))
+
+
+def scatter_rows(index: Array, rows: Array, count: int) -> npt.NDArray[np.float64]:
+    """(count, 3) sums of `rows` (n, 3) that share an index, in a fixed order."""
+    return np.stack([np.bincount(index, weights=rows[:, k], minlength=count) for k in range(3)], axis=1)
+
+
+def unit_rows(rows: Array) -> npt.NDArray[np.float32]:
+    """(n, 3) rows scaled to length one; a zero row becomes (0, 0, 1)."""
+    scale = float(np.abs(rows).max(initial=0.0)) or 1.0
+    rows = rows / scale
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    good = length > 1e-20
+    return np.asarray(np.where(good, rows / np.where(good, length, 1.0), (0.0, 0.0, 1.0)), dtype=np.float32)
+
+
+class Surface:
+    """The drawn surfaces of a simulation: which bodies, and where each world is laid out.
+
+    `spacing` (m) is the distance of neighbouring worlds, one number or (first, second horizontal axis);
+    without it, 1.25 times the size of one world when the run starts, at least half of its largest size.
+    """
+
+    def __init__(self, sim: Any, spacing: float | tuple[float, float] | None = None) -> None:
+        self.bodies = [body for body in sim.model.bodies if getattr(body, "skin", None) is not None]
+        self.worlds = int(sim.model.worlds)
+        self.up_axis = str(sim.model.up_axis).upper()
+        if not self.bodies:
+            raise OutputError("nothing to draw: no body has a surface")
+        start = [self.points_of(sim, body) for body in self.bodies]
+        self.counts = [points.shape[1] for points in start]
+        self.offsets = grid_offsets(self.worlds, self._spacing(start, spacing), self.up_axis)
+
+    def _spacing(
+        self, start: list[npt.NDArray[np.float64]], spacing: float | tuple[float, float] | None
+    ) -> tuple[float, float]:
+        if self.worlds == 1:
+            return 0.0, 0.0
+        if spacing is not None:
+            pair = np.broadcast_to(np.asarray(spacing, dtype=np.float64), (2,))
+            if not (np.isfinite(pair).all() and (pair >= 0).all()):
+                raise OutputError(f"spacing must be finite and not negative, got {spacing!r}")
+            return float(pair[0]), float(pair[1])
+        low = np.min([points.min(axis=1) for points in start], axis=0)
+        high = np.max([points.max(axis=1) for points in start], axis=0)
+        size = (high - low).max(axis=0)
+        size = np.maximum(size, 0.5 * size.max())
+        return 1.25 * float(size[0]), 1.25 * float(size[1 if self.up_axis == "Z" else 2])
+
+    @staticmethod
+    def points_of(sim: Any, body: Any) -> npt.NDArray[np.float64]:
+        """(B, P, 3) present surface points (m) without the grid offsets; OutputError if one is not finite."""
+        points = np.asarray(sim.skin_points(body), dtype=np.float64)
+        if not np.isfinite(points).all():
+            world = int(np.argmin(np.isfinite(points).all(axis=(1, 2))))
+            raise OutputError(f"body {body.name!r}, world {world}: positions are not finite at t = {time_of(sim):g} s")
+        return points
+
+    def triangles(self) -> npt.NDArray[np.int32]:
+        """(T, 3) triangles of all worlds and bodies in the order of `points`."""
+        blocks, first = [], 0
+        for body, count in zip(self.bodies, self.counts, strict=True):
+            for _ in range(self.worlds):
+                blocks.append(np.asarray(body.skin.triangles, dtype=np.int32) + first)
+                first += count
+        return np.concatenate(blocks)
+
+    def points(self, sim: Any) -> npt.NDArray[np.float64]:
+        """(P, 3) present points (m) of all bodies and worlds, with the grid offsets."""
+        blocks = [self.points_of(sim, body) + self.offsets[:, None, :] for body in self.bodies]
+        return np.concatenate([block.reshape(-1, 3) for block in blocks])
+
+    def values(self, sim: Any, field: str) -> npt.NDArray[np.float32]:
+        """(P,) values of a scalar field in the order of `points`."""
+        values = [np.asarray(sim.skin_field(field, body), dtype=np.float32).ravel() for body in self.bodies]
+        return np.concatenate(values)

@@ -1,0 +1,282 @@
+"""The ray caster: a picture of a triangle surface, drawn on Warp's CPU device without OpenGL or a display."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warpfea.base.errors import OutputError
+from warpfea.outputs.colormap import to_linear, to_srgb
+from warpfea.outputs.frames import scatter_rows, unit_rows
+
+__all__ = ["VIEW", "Camera", "Renderer", "nice_number"]
+
+Floats = npt.NDArray[np.floating[Any]]
+Image = npt.NDArray[np.uint8]
+VIEW = (-65.0, 20.0)  # default azimuth, elevation (degrees)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera in a frame with z up.
+
+    eye, target: (3,) float64, m. fov: vertical opening (degrees). center: where the target lies in the
+    picture, each in [-1, 1]. size: radius (m) of what is looked at; it sets the scale of ground and shadows.
+    """
+
+    eye: Floats
+    target: Floats
+    fov: float = 24.0
+    center: tuple[float, float] = (0.0, 0.0)
+    size: float = 1.0
+
+    def axes(self) -> tuple[Floats, Floats, Floats]:
+        """Unit vectors forward, right, up."""
+        forward = (self.target - self.eye) / np.linalg.norm(self.target - self.eye)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        if np.linalg.norm(right) < 1e-6:
+            right = np.array([1.0, 0.0, 0.0])
+        right = right / np.linalg.norm(right)
+        return forward, right, np.cross(right, forward)
+
+    @classmethod
+    def framing(
+        cls,
+        points: Floats,
+        *,
+        view: tuple[float, float] = VIEW,
+        aspect: float = 16 / 9,
+        fov: float = 24.0,
+        margins: tuple[float, float, float, float] = (0.06, 0.06, 0.08, 0.08),
+    ) -> Camera:
+        """The camera at (azimuth, elevation) degrees that shows all `points` (P, 3).
+
+        `margins` (left, right, bottom, top) are the shares of the picture kept free.
+        """
+        low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+        size = max(0.5 * float(np.linalg.norm(high - low)), 1e-9)
+        azimuth, elevation = np.radians(view)
+        back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        left, right_, bottom, top = margins
+        share = np.array([1.0 - left - right_, 1.0 - bottom - top])
+        tangent = np.tan(np.radians(0.5 * fov)) * np.array([aspect, 1.0])
+        center = (left - right_, bottom - top)
+        target, distance = 0.5 * (low + high), 2.0 * size
+        for _ in range(30):  # move sideways to centre what is seen, then to the distance where it just fits
+            camera = cls(target + distance * back, target, fov, center, size)
+            forward, right, up = camera.axes()
+            local = (points - camera.eye) @ np.stack([right, up, forward], axis=1)
+            depth = np.maximum(local[:, 2], 0.05 * size)
+            seen = local[:, :2] / depth[:, None] / tangent
+            mid, half = 0.5 * (seen.max(axis=0) + seen.min(axis=0)), 0.5 * np.ptp(seen, axis=0)
+            move = mid * tangent * distance
+            target = target + right * move[0] + up * move[1]
+            distance = max(distance * float(np.clip((half / share).max(), 0.5, 2.0)), 1.02 * size)
+        return cls(target + distance * back, target, fov, center, size)
+
+
+class Renderer:
+    """Draws triangles with smooth normals, soft light and a shadow on the ground.
+
+    Args:
+        triangles: (T, 3) int, outward.
+        reference: (P, 3) points whose dihedral angles tell edges (sharper than 40 degrees) from smooth
+            surface; without it those of the first picture.
+        up_axis: "Z" or "Y"; points are turned so that this axis is up.
+        ground: height (m) of the ground along the up axis, None for no ground.
+
+    The mesh is built once and refitted when points move. Not to be used inside a graph capture.
+    """
+
+    def __init__(
+        self,
+        triangles: npt.NDArray[np.integer[Any]],
+        *,
+        reference: Floats | None = None,
+        up_axis: str = "Z",
+        ground: float | None = None,
+    ) -> None:
+        self.triangles = np.ascontiguousarray(triangles, dtype=np.int32)
+        if self.triangles.ndim != 2 or self.triangles.shape[1] != 3 or not len(self.triangles):
+            raise OutputError(f"triangles must have the shape (T, 3), T > 0, got {self.triangles.shape}")
+        self.up_axis = up_axis
+        self.ground = ground
+        self._reference = None if reference is None else np.asarray(reference, dtype=np.float64)
+        self._groups: tuple[npt.NDArray[np.int64], int] | None = None
+        self._mesh: Any = None
+
+    def turned(self, points: Floats) -> npt.NDArray[np.float64]:
+        """Points (P, 3) as float64 in the frame with z up that cameras use."""
+        p = np.asarray(points, dtype=np.float64)
+        return p if self.up_axis == "Z" else np.stack([p[:, 0], -p[:, 2], p[:, 1]], axis=1)
+
+    def render(
+        self,
+        points: Floats,
+        colors: Floats,
+        camera: Camera | None = None,
+        size: tuple[int, int] = (960, 540),
+    ) -> Image:
+        """A picture (height, width, 3) of points (P, 3) in metres with sRGB colours (P, 3).
+
+        Without a camera, one that frames the points. OutputError if points are not finite or counts differ.
+        """
+        import warp as wp
+
+        from warpfea.kernels.outputs import raycast
+
+        points = self.turned(points)
+        if not np.isfinite(points).all() or self.triangles.max() >= len(points) or len(colors) != len(points):
+            raise OutputError("points must be finite, as many as colours, and as many as triangles refer to")
+        width, height = size
+        camera = camera or Camera.framing(points, aspect=width / height)
+        if self._groups is None:
+            base = points if self._reference is None else self.turned(self._reference)
+            self._groups = smooth_corners(base, self.triangles)
+        unit = (points - camera.target) / camera.size
+        with wp.ScopedDevice("cpu"):
+            scene = self._scene(wp, raycast, unit, np.asarray(colors), camera, size)
+            self._cast_shadow(wp, raycast, scene, unit)
+            image = self._cast(wp, raycast, scene, pixel_grid(width, height)).reshape(height, width, 3)
+            rough = rough_pixels(to_srgb(image))
+            rows, columns = np.nonzero(rough)
+            corners = np.stack([columns, rows], axis=1).astype(np.float32)
+            fine = (corners[:, None, :] + _SUBPIXELS).reshape(-1, 2)
+            image[rough] = self._cast(wp, raycast, scene, fine).reshape(-1, len(_SUBPIXELS), 3).mean(axis=1)
+        return np.asarray(np.round(to_srgb(image) * 255.0), dtype=np.uint8)
+
+    def _scene(self, wp: Any, raycast: Any, unit: Floats, colors: Floats, camera: Camera, size: tuple[int, int]) -> Any:
+        assert self._groups is not None
+        points = np.ascontiguousarray(unit, dtype=np.float32)
+        if self._mesh is None or len(self._mesh.points) != len(points):
+            indices = wp.array(self.triangles.ravel(), dtype=wp.int32)
+            self._mesh = wp.Mesh(wp.array(points, dtype=wp.vec3), indices)
+        else:
+            self._mesh.points.assign(points)
+            self._mesh.refit()
+        corner = unit[self.triangles]
+        area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        group, count = self._groups
+        normals = unit_rows(scatter_rows(group, np.repeat(area, 3, axis=0), count))[group]
+        forward, right, up = camera.axes()
+        tangent = np.tan(np.radians(0.5 * camera.fov))
+        scene = raycast.Scene()
+        scene.mesh = self._mesh.id
+        scene.corner_normals = wp.array(normals, dtype=wp.vec3)
+        scene.colors = wp.array(to_linear(colors).astype(np.float32), dtype=wp.vec3)
+        scene.eye = wp.vec3(*((camera.eye - camera.target) / camera.size))
+        scene.forward = wp.vec3(*forward)
+        scene.right = wp.vec3(*(right * tangent * size[0] / size[1]))
+        scene.up = wp.vec3(*(up * tangent))
+        scene.center = wp.vec2(*camera.center)
+        scene.width, scene.height = float(size[0]), float(size[1])
+        side = 0.55 * up - 0.55 * right - 0.45 * forward + np.array([0.0, 0.0, 0.75])
+        self._light = side / np.linalg.norm(side)
+        scene.light = wp.vec3(*self._light)
+        scene.has_ground = 0
+        if self.ground is not None and camera.eye[2] > self.ground:
+            scene.has_ground = 1
+            scene.ground = float((self.ground - camera.target[2]) / camera.size) - 2e-3
+            scene.grid = nice_number(0.2 * camera.size) / camera.size
+            scene.fade = 2.2
+        return scene
+
+    def _cast_shadow(self, wp: Any, raycast: Any, scene: Any, unit: Floats, cells: int = 160) -> None:
+        """Fill the map of light on the ground, over the area that the surface can darken."""
+        scene.shadow = wp.ones((1, 1), dtype=float)
+        scene.shadow_cell = 1.0
+        if not scene.has_ground:
+            return
+        lights = cone(self._light, 0.14, 40)
+        lights = lights[lights[:, 2] > 0.05]
+        fall = np.maximum(unit[:, 2] - scene.ground, 0.0)[:, None, None]
+        spots = unit[:, None, :2] - fall * (lights[:, :2] / lights[:, 2:])[None, ::4]
+        low, high = spots.min(axis=(0, 1)), spots.max(axis=(0, 1))
+        cell = float(max((high - low).max(), 1e-6)) / (cells - 4)
+        shape = np.ceil((high - low) / cell).astype(int) + 4
+        scene.shadow_low, scene.shadow_cell = wp.vec2(*(low - 2 * cell)), cell
+        shadow = wp.empty(tuple(map(int, shape)), dtype=float)
+        wp.launch(raycast.cast_shadow, shadow.shape, [scene, wp.array(lights, dtype=wp.vec3), shadow])
+        scene.shadow = shadow
+
+    @staticmethod
+    def _cast(wp: Any, raycast: Any, scene: Any, samples: Floats) -> npt.NDArray[np.float32]:
+        out = wp.empty(len(samples), dtype=wp.vec3)
+        if len(samples):
+            wp.launch(raycast.cast, len(samples), [scene, wp.array(samples, dtype=wp.vec2), out])
+        return out.numpy()
+
+
+_SUBPIXELS = np.array(
+    [[(k + 0.5) / 8, ((5 * k + 2) % 8 + 0.5) / 8] for k in range(8)], dtype=np.float32
+)  # 8 rooks: each row and column of an 8 x 8 raster once
+
+
+def pixel_grid(width: int, height: int) -> npt.NDArray[np.float32]:
+    """(height * width, 2) centres of the pixels, row by row."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
+
+
+def rough_pixels(image: Floats, limit: float = 0.025) -> npt.NDArray[np.bool_]:
+    """(height, width) pixels of an sRGB picture that differ from a neighbour; they are sampled again."""
+    rough = np.zeros(image.shape[:2], dtype=bool)
+    for channel in np.moveaxis(image, 2, 0):  # a reduction over an axis of three is slow in numpy
+        down = np.abs(np.diff(channel, axis=0)) > limit
+        across = np.abs(np.diff(channel, axis=1)) > limit
+        rough[1:] |= down
+        rough[:-1] |= down
+        rough[:, 1:] |= across
+        rough[:, :-1] |= across
+    return rough
+
+
+def cone(axis: Floats, spread: float, count: int) -> npt.NDArray[np.float32]:
+    """(count, 3) unit directions spread evenly over a disc of radius `spread` around a unit axis."""
+    side = np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.7 else (0.0, 1.0, 0.0))
+    side /= np.linalg.norm(side)
+    k = np.arange(count)
+    radius, angle = spread * np.sqrt((k + 0.5) / count), 2.399963 * k
+    directions = axis + radius[:, None] * (
+        np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(axis, side)
+    )
+    return unit_rows(directions)
+
+
+def nice_number(x: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is at most x > 0."""
+    power = 10.0 ** np.floor(np.log10(x))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step <= x / power * (1 + 1e-12)))
+
+
+def smooth_corners(
+    points: Floats, triangles: npt.NDArray[np.integer[Any]], angle: float = 40.0
+) -> tuple[npt.NDArray[np.int64], int]:
+    """Groups of triangle corners that share a normal: (3 T,) group of each corner, number of groups.
+
+    Corners at a point share one when their triangles are linked over edges flatter than `angle` (degrees).
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    t = np.asarray(triangles, dtype=np.int64)
+    p = points[t]
+    normal = unit_rows(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]))
+    face = np.tile(np.arange(len(t)), 3)
+    first = np.repeat([0, 1, 2], len(t))
+    ends = np.stack([t[face, first], t[face, (first + 1) % 3]], axis=1)
+    corner = np.stack([3 * face + first, 3 * face + (first + 1) % 3], axis=1)
+    swap = ends[:, 0] > ends[:, 1]
+    ends[swap], corner[swap] = ends[swap][:, ::-1], corner[swap][:, ::-1]
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    ends, corner, face = ends[order], corner[order], face[order]
+    same = (ends[1:] == ends[:-1]).all(axis=1)
+    flat = np.einsum("ij,ij->i", normal[face[1:]], normal[face[:-1]]) > np.cos(np.radians(angle))
+    link = np.nonzero(same & flat)[0]
+    a, b = corner[link].ravel(), corner[link + 1].ravel()
+    graph = coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(3 * len(t), 3 * len(t)))
+    count, group = connected_components(graph, directed=False)
+    return group.astype(np.int64), int(count)

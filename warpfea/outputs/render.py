@@ -1,0 +1,325 @@
+"""Pictures and animations: `PNGWriter` and `GIFWriter` of a run, `render_usd` of a file made by `USDWriter`.
+
+All draw the same way: worlds on the grid of the USD file, a camera that frames everything the run passes
+through, one colour range for all frames, a colour bar and the time.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warpfea.base.errors import OutputError
+from warpfea.base.writer import Output, check_target
+from warpfea.outputs.frames import FrameClock, Surface, field_label, time_of
+from warpfea.outputs.raycaster import VIEW, Camera, Renderer
+from warpfea.outputs.reel import Frame, Reel
+
+__all__ = ["Camera", "GIFWriter", "PNGWriter", "Renderer", "render_usd"]
+
+Floats = npt.NDArray[np.floating[Any]]
+
+
+def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
+    width, height = map(int, size)
+    if not (32 <= width <= 8192 and 32 <= height <= 8192):
+        raise OutputError(f"a picture must have 32 to 8192 pixels each way, got {size!r}")
+    return width, height
+
+
+class _Drawing(Output):
+    """What PNGWriter and GIFWriter share: collecting frames."""
+
+    suffix = ""
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        field: str | None,
+        size: tuple[int, int],
+        view: tuple[float, float],
+        color_range: tuple[float, float] | None,
+        spacing: float | tuple[float, float] | None,
+        ground: bool,
+    ) -> None:
+        self.path = pathlib.Path(path)
+        self.field, self.size, self.view = field, _checked_size(size), view
+        self.color_range, self.spacing, self.ground = color_range, spacing, ground
+        self._reel: Reel | None = None
+
+    def open(self, sim: Any) -> None:
+        self.abort()
+        check_target(self.path, (self.suffix,))
+        self._surface = Surface(sim, self.spacing)
+        start = self._surface.points(sim)
+        self._origin = 0.5 * (start.min(axis=0) + start.max(axis=0))
+        title, units = field_label(self.field) if self.field else ("", "")
+        self._reel = Reel(
+            self._surface.triangles(),
+            self._surface.up_axis,
+            np.asarray(start - self._origin, dtype=np.float32),
+            title,
+            units,
+            self.color_range,
+        )
+
+    def _frame(self, sim: Any) -> Frame:
+        points = np.asarray(self._surface.points(sim) - self._origin, dtype=np.float32)
+        values = self._surface.values(sim, self.field) if self.field else None
+        return Frame(time_of(sim), points, values)
+
+    def abort(self) -> None:
+        """Drop the frames; nothing is on disk before `close`."""
+        self._reel = None
+
+
+class PNGWriter(_Drawing):
+    """Draws one state to `path` (.png).
+
+    Args:
+        field: scalar that is shown in colour, or None for plain grey. size: (width, height), pixels.
+        time: the first state at or after this time (s) is drawn; without it, or if never reached, the last.
+        view: (azimuth, elevation) of the camera, degrees.
+        color_range: (low, high) of the colours, by default the extremes of what is drawn.
+        spacing: of worlds (m). ground: whether to draw the ground, at the lowest point.
+
+    OutputError: bad size, suffix or folder (at `open`), a file that can't be written (at `close`).
+    """
+
+    suffix = ".png"
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        field: str | None = "von_mises",
+        size: tuple[int, int] = (960, 540),
+        time: float | None = None,
+        view: tuple[float, float] = VIEW,
+        color_range: tuple[float, float] | None = None,
+        spacing: float | tuple[float, float] | None = None,
+        ground: bool = True,
+    ) -> None:
+        super().__init__(
+            path, field=field, size=size, view=view, color_range=color_range, spacing=spacing, ground=ground
+        )
+        self.time = time
+
+    def write(self, sim: Any) -> None:
+        if self._reel is None or self.time is None or self._reel.frames:
+            return
+        if time_of(sim) >= self.time - 1e-9 * max(1.0, abs(self.time)):
+            self._reel.frames = [self._frame(sim)]
+
+    def close(self, sim: Any) -> None:
+        if self._reel is None:
+            return
+        try:
+            self._reel.frames = self._reel.frames or [self._frame(sim)]
+            self._reel.save_png(self.path, self.size, self.view, self.ground)
+        finally:
+            self.abort()
+
+
+class GIFWriter(_Drawing):
+    """Draws an animation to `path` (.gif).
+
+    Args:
+        fps: frames per second of the animation, at most 50 (the format counts hundredths of a second).
+        speed: simulated seconds per second of the animation.
+        max_frames: when there are more, every second one is dropped and the rest come half as often.
+        progress: show a bar while drawing; None: when stderr is a terminal.
+        field, size, view, color_range, spacing, ground: see :class:`PNGWriter`.
+
+    Frames (points and field, float32) are kept in memory and drawn at `close`, knowing the colour range.
+    """
+
+    suffix = ".gif"
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        fps: float = 20.0,
+        speed: float = 1.0,
+        field: str | None = "von_mises",
+        size: tuple[int, int] = (640, 360),
+        max_frames: int = 240,
+        view: tuple[float, float] = VIEW,
+        color_range: tuple[float, float] | None = None,
+        spacing: float | tuple[float, float] | None = None,
+        ground: bool = True,
+        progress: bool | None = None,
+    ) -> None:
+        super().__init__(
+            path, field=field, size=size, view=view, color_range=color_range, spacing=spacing, ground=ground
+        )
+        check_rates(fps, speed, max_frames)
+        self.fps, self.speed, self.max_frames, self.progress = fps, speed, max_frames, progress
+
+    def open(self, sim: Any) -> None:
+        super().open(sim)
+        self._clock = FrameClock(self.fps / self.speed)
+
+    def write(self, sim: Any) -> None:
+        if self._reel is not None and self._clock.due(time_of(sim)):
+            self._append(sim)
+
+    def _append(self, sim: Any) -> None:
+        assert self._reel is not None
+        frames = self._reel.frames
+        frames.append(self._frame(sim))
+        if len(frames) > self.max_frames:
+            del frames[1::2]
+            slower = FrameClock(0.5 * self._clock.fps)
+            slower.due(frames[-1].time)
+            self._clock = slower
+
+    def close(self, sim: Any) -> None:
+        if self._reel is None:
+            return
+        try:
+            if time_of(sim) > self._clock.last:
+                self._append(sim)
+            self._reel.save_gif(self.path, self.size, self.view, self.ground, self.speed, self.progress)
+        finally:
+            self.abort()
+
+
+def check_rates(fps: float, speed: float, max_frames: int) -> None:
+    """OutputError for values that an animation can't have."""
+    if not 0 < fps <= 50:
+        raise OutputError(f"a GIF plays up to 50 frames per second, got fps={fps!r}")
+    if not (np.isfinite(speed) and speed > 0):
+        raise OutputError(f"speed must be positive and finite, got {speed!r}")
+    if max_frames < 2:
+        raise OutputError(f"max_frames must be at least 2, got {max_frames!r}")
+
+
+def render_usd(
+    path: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    size: tuple[int, int] | None = None,
+    fps: float = 20.0,
+    speed: float = 1.0,
+    max_frames: int = 240,
+    field: str | None = None,
+    time: float | None = None,
+    view: tuple[float, float] = VIEW,
+    ground: bool = True,
+    progress: bool | None = None,
+) -> pathlib.Path:
+    """Draw a USD file of :class:`warpfea.USDWriter` to `out` (.png or .gif) and return that path.
+
+    Args:
+        field: a field of the file; None: the one that it shows in colour. time: of a PNG (s); None: the last.
+        fps, speed, max_frames: of a GIF, which spans the whole file; more frames are spread over the span.
+        size: (width, height), default (960, 540) for PNG and (640, 360) for GIF.
+
+    OutputError: missing or unreadable file, not written by warpfea, no mesh, no such field, unknown suffix.
+    """
+    target = check_target(out, (".png", ".gif"))
+    animated = target.suffix.lower() == ".gif"
+    size = _checked_size(size or ((640, 360) if animated else (960, 540)))
+    check_rates(fps, speed, max_frames)
+    source = _Source(pathlib.Path(path))
+    if animated:
+        count = int(np.floor((source.end - source.start) * fps / speed * (1 + 1e-9))) + 1
+        times = source.start + np.arange(count) * speed / fps
+        if times[-1] < source.end - 1e-9 * max(1.0, abs(source.end)):
+            times = np.append(times, source.end)
+        if len(times) > max_frames:
+            times = np.linspace(source.start, source.end, max_frames)
+    else:
+        at = source.end if time is None else float(time)
+        slack = 1e-6 * max(1.0, source.end - source.start)
+        if not source.start - slack <= at <= source.end + slack:
+            raise OutputError(f"{path}: time {at:g} s lies outside {source.start:g} .. {source.end:g} s")
+        times = np.array([at])
+    reel = source.reel(field, times)
+    if animated:
+        reel.save_gif(target, size, view, ground, speed, progress)
+    else:
+        reel.save_png(target, size, view, ground)
+    return target
+
+
+class _Source:
+    """A stage written by USDWriter, opened for drawing."""
+
+    def __init__(self, path: pathlib.Path) -> None:
+        from pxr import Tf, Usd, UsdGeom
+
+        self.path = path
+        if not path.is_file():
+            raise OutputError(f"{path}: no such file")
+        try:
+            self.stage = Usd.Stage.Open(str(path))
+        except Tf.ErrorException as error:
+            raise OutputError(f"{path}: not a readable USD file ({error})") from error
+        self.meshes = [UsdGeom.Mesh(prim) for prim in self.stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+        if not self.meshes:
+            raise OutputError(f"{path}: holds no mesh")
+        root = self.stage.GetDefaultPrim()
+        self.about: Any = root.GetCustomDataByKey("warpfea") if root else None
+        if not self.about:
+            raise OutputError(f"{path}: was not written by warpfea")
+        self.rate = self.stage.GetTimeCodesPerSecond()
+        self.start, self.end = (
+            self.stage.GetStartTimeCode() / self.rate,
+            self.stage.GetEndTimeCode() / self.rate,
+        )
+
+    def reel(self, field: str | None, times: Floats) -> Reel:
+        """The frames at `times` (s); values between samples are interpolated linearly by USD."""
+        from pxr import UsdGeom
+
+        name = field or self.about["color"] or None
+        if name is not None and name not in self.about["fields"]:
+            have = ", ".join(self.about["fields"]) or "none"
+            raise OutputError(f"{self.path}: has no field {name!r}; fields: {have}")
+        triangles, first = [], 0
+        for mesh in self.meshes:
+            counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
+            if (counts != 3).any():
+                raise OutputError(f"{self.path}: {mesh.GetPath()} has faces that are not triangles")
+            triangles.append(np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) + first)
+            first += len(mesh.GetPointsAttr().Get(self.start * self.rate))
+        start = self._points(self.start)
+        self.origin = 0.5 * (start.min(axis=0) + start.max(axis=0))
+        reference = np.asarray(start - self.origin, dtype=np.float32)
+        reel = Reel(np.concatenate(triangles), str(UsdGeom.GetStageUpAxis(self.stage)), reference)
+        if name is not None:
+            about = self.about["fields"][name]
+            pair = self.about["colorRange"] if name == self.about["color"] else about["range"]
+            reel.title, reel.units, reel.shown = about["title"], about["units"], (pair[0], pair[1])
+        for time in map(float, times):
+            points = np.asarray(self._points(time) - self.origin, dtype=np.float32)
+            reel.frames.append(Frame(time, points, self._values(name, time) if name else None))
+        return reel
+
+    def _points(self, time: float) -> npt.NDArray[np.float64]:
+        """(P, 3) points of all meshes in the world (m)."""
+        from pxr import UsdGeom
+
+        code = time * self.rate
+        cache = UsdGeom.XformCache(code)
+        blocks = []
+        for mesh in self.meshes:
+            matrix = np.array(cache.GetLocalToWorldTransform(mesh.GetPrim()))
+            local = np.asarray(mesh.GetPointsAttr().Get(code), dtype=np.float64)
+            blocks.append(local @ matrix[:3, :3] + matrix[3, :3])
+        return np.concatenate(blocks)
+
+    def _values(self, name: str, time: float) -> npt.NDArray[np.float32]:
+        from pxr import Tf, UsdGeom
+
+        key = Tf.MakeValidIdentifier(name)
+        primvars = [UsdGeom.PrimvarsAPI(mesh).GetPrimvar(key) for mesh in self.meshes]
+        return np.concatenate([np.asarray(p.Get(time * self.rate), dtype=np.float32) for p in primvars])

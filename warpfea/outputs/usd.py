@@ -1,0 +1,315 @@
+"""USD output: one stage per run, with time-sampled surfaces and fields, checked by USD's own validators.
+
+Layout of a stage (metres, kilograms):
+
+    /World                          Xform, default prim; customData["warpfea"] says what the file holds
+    /World/world_0000               Xform; its translate lays the worlds out on a grid
+    /World/world_0000/<body>        Xform; a double-precision translate per frame, the centre of the body
+    /World/world_0000/<body>/skin   Mesh; points, normals, extent and fields per frame, about that centre
+    /World/Camera /World/Sky /World/Sun
+
+Points are float32 about the body's own centre, so nothing is lost far from the origin. The time code of a
+sample is its time times `fps`, a fraction where no step ended on the frame's time.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warpfea.base.errors import OutputError
+from warpfea.base.writer import Output, check_target, temporary_beside
+from warpfea.outputs.colormap import map_colors
+from warpfea.outputs.frames import FrameClock, Surface, field_label, time_of, vertex_normals
+from warpfea.outputs.usd_check import validate_usd
+
+__all__ = ["SCHEMA", "USDWriter", "validate_usd"]
+
+SCHEMA = 1
+SUFFIXES = (".usdc", ".usda", ".usd")
+_SAVE_BYTES = 32 << 20  # unsaved data (bytes) after which a binary layer goes to disk
+_GREY = (0.55, 0.57, 0.60)
+
+
+class USDWriter(Output):
+    """Writes `path` (.usdc, .usda or .usd).
+
+    Args:
+        path: the target; overwritten if it exists, and only when the new file is complete and valid.
+        fps: frames and time codes per second; :class:`warpfea.outputs.frames.FrameClock` says what is a frame.
+        fields: scalar fields kept as vertex primvars, SI units.
+        color: the field shown as display colour (kept as primvar too), or None for plain grey.
+        color_range: (low, high) of the colours; without it the extremes over the whole run and all worlds.
+        spacing: distance of worlds (m); see :class:`warpfea.outputs.frames.Surface`.
+
+    Frames go into the layer as they come, and binary layers to disk every 32 MB. The state at `close` is
+    always the last frame. OutputError: bad suffix or folder (at `open`), positions that are not finite (at
+    `write`), a file that does not validate (at `close`; the target is then left as it was).
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        fps: float = 60.0,
+        fields: Sequence[str] = ("von_mises", "displacement"),
+        color: str | None = "von_mises",
+        color_range: tuple[float, float] | None = None,
+        spacing: float | tuple[float, float] | None = None,
+    ) -> None:
+        self.path = pathlib.Path(path)
+        self.fps = FrameClock(fps).fps
+        self.color = color
+        self.fields = list(dict.fromkeys([*fields, *([color] if color else [])]))
+        if color_range is not None and not (np.isfinite(color_range).all() and color_range[0] < color_range[1]):
+            raise OutputError(f"color_range must be two finite rising numbers, got {color_range!r}")
+        self.color_range = color_range
+        self.spacing = spacing
+        self._stage: Any = None
+        self._temporary: pathlib.Path | None = None
+
+    def open(self, sim: Any) -> None:
+        from pxr import Tf, Usd, UsdGeom, UsdPhysics
+
+        self.abort()
+        target = check_target(self.path, SUFFIXES)
+        self._surface = Surface(sim, self.spacing)
+        self._clock = FrameClock(self.fps)
+        self._codes: list[float] = []
+        self._range = {name: (np.inf, -np.inf) for name in self.fields}
+        self._box = (np.full(3, np.inf), np.full(3, -np.inf))
+        self._unsaved = 0
+        self._temporary = temporary_beside(target)
+        try:
+            self._stage = stage = Usd.Stage.CreateNew(str(self._temporary))
+        except Tf.ErrorException as error:
+            self.abort()
+            raise OutputError(f"{target}: can't be created ({error})") from error
+        UsdGeom.SetStageUpAxis(stage, self._surface.up_axis)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(self.fps)
+        stage.SetFramesPerSecond(self.fps)
+        root = UsdGeom.Xform.Define(stage, "/World").GetPrim()
+        stage.SetDefaultPrim(root)
+        self._define()
+
+    def _define(self) -> None:
+        """Author all that does not change: transforms, topology, attributes without samples."""
+        from pxr import Gf, Tf, UsdGeom, Vt
+
+        names: list[str] = []
+        for body in self._surface.bodies:
+            name = Tf.MakeValidIdentifier(body.name)
+            while name in names:
+                name += "_"
+            names.append(name)
+        self._meshes: list[list[_Mesh]] = [[] for _ in names]
+        for world in range(self._surface.worlds):
+            place = UsdGeom.Xform.Define(self._stage, f"/World/world_{world:04d}")
+            place.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(
+                Gf.Vec3d(*map(float, self._surface.offsets[world]))
+            )
+            for body, name, meshes in zip(self._surface.bodies, names, self._meshes, strict=True):
+                xform = UsdGeom.Xform.Define(self._stage, place.GetPath().AppendChild(name))
+                xform.GetPrim().SetDisplayName(body.name)
+                mesh = UsdGeom.Mesh.Define(self._stage, xform.GetPath().AppendChild("skin"))
+                triangles = np.ascontiguousarray(body.skin.triangles, dtype=np.int32)
+                mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
+                mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))
+                mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+                mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+                mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+                meshes.append(_Mesh(mesh, xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble), self.fields))
+
+    def write(self, sim: Any) -> None:
+        time = time_of(sim)
+        if self._clock.due(time):
+            self._frame(sim, time)
+
+    def _frame(self, sim: Any, time: float) -> None:
+        from pxr import Tf
+
+        code = self._clock.code(time)
+        try:
+            taken = [
+                (self._surface.points_of(sim, body), {n: self._field(sim, n, body) for n in self.fields})
+                for body in self._surface.bodies
+            ]  # all of it first: a frame that can't be had leaves nothing in the stage
+            for body, meshes, (points, fields) in zip(self._surface.bodies, self._meshes, taken, strict=True):
+                for world, mesh in enumerate(meshes):
+                    values = {name: field[world] for name, field in fields.items()}
+                    low, high = mesh.write(code, points[world], body.skin.triangles, values)
+                    offset = self._surface.offsets[world]
+                    self._box = (
+                        np.minimum(self._box[0], low + offset),
+                        np.maximum(self._box[1], high + offset),
+                    )
+                self._unsaved += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
+            self._codes.append(code)
+            if self._unsaved > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
+                self._save()
+        except Tf.ErrorException as error:
+            raise OutputError(f"{self.path}: can't be written ({error})") from error
+
+    def _field(self, sim: Any, name: str, body: Any) -> npt.NDArray[np.float32]:
+        values = np.ascontiguousarray(sim.skin_field(name, body), dtype=np.float32)
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            low, high = self._range[name]
+            self._range[name] = (min(low, float(finite.min())), max(high, float(finite.max())))
+        return values
+
+    def _save(self) -> None:
+        if not self._stage.GetRootLayer().Save():
+            raise OutputError(f"{self.path}: can't be written")
+        self._unsaved = 0
+
+    def close(self, sim: Any) -> None:
+        if self._stage is None or self._temporary is None:
+            return
+        from pxr import Sdf, Tf
+
+        temporary = self._temporary
+        try:
+            time = time_of(sim)
+            if time > self._clock.last:
+                self._frame(sim, time)
+            self._finish(sim)
+            self._save()
+            self._stage, self._meshes = None, []
+            problems = validate_usd(temporary)
+            if problems:
+                raise OutputError(f"{self.path}: the stage is not valid: " + "; ".join(problems[:10]))
+            os.replace(temporary, self.path)
+        except (OSError, Tf.ErrorException) as error:
+            raise OutputError(f"{self.path}: can't be written ({error})") from error
+        finally:
+            self.abort()
+        stale = Sdf.Layer.Find(str(self.path))
+        if stale is not None:
+            stale.Reload(True)
+
+    def abort(self) -> None:
+        self._stage, self._meshes = None, []
+        if self._temporary is not None:
+            self._temporary.unlink(missing_ok=True)
+            self._temporary = None
+
+    def _finish(self, sim: Any) -> None:
+        """Author what is known at the end only: time span, colours, camera, lights and customData."""
+        stage = self._stage
+        if self._codes:
+            stage.SetStartTimeCode(min(self._codes))
+            stage.SetEndTimeCode(max(self._codes))
+        ranges = {name: pair if pair[0] <= pair[1] else (0.0, 0.0) for name, pair in self._range.items()}
+        shown = self.color_range or (ranges[self.color] if self.color else (0.0, 0.0))
+        for meshes in self._meshes:
+            for mesh in meshes:
+                self._unsaved += mesh.write_colors(self.color, shown)
+                if self._unsaved > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
+                    self._save()
+        _define_view(stage, *self._box, self._surface.up_axis)
+        data: dict[str, Any] = {"schema": SCHEMA, "frames": len(self._codes), "worlds": self._surface.worlds}
+        dt = np.ravel(np.asarray(getattr(sim, "dt", np.nan), dtype=np.float64))
+        data["dt"] = float(dt[0]) if dt.size else float("nan")
+        data["color"] = self.color or ""
+        data["colorRange"] = _pair(shown)
+        data["fields"] = {
+            name: {"title": field_label(name)[0], "units": field_label(name)[1], "range": _pair(ranges[name])}
+            for name in self.fields
+        }
+        stage.GetDefaultPrim().SetCustomDataByKey("warpfea", data)
+
+
+class _Mesh:
+    """The varying attributes of one body in one world."""
+
+    def __init__(self, mesh: Any, translate: Any, fields: Sequence[str]) -> None:
+        from pxr import Sdf, Tf, UsdGeom
+
+        self.translate, self.points = translate, mesh.CreatePointsAttr()
+        self.normals, self.extent = mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
+        self.color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        api = UsdGeom.PrimvarsAPI(mesh)
+        self.fields = {
+            name: api.CreatePrimvar(Tf.MakeValidIdentifier(name), Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
+            for name in fields
+        }
+
+    def write(
+        self, code: float, points: npt.NDArray[Any], triangles: npt.NDArray[Any], values: dict[str, Any]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """One frame of points (P, 3) and fields (P,); returns the corners of their box in the world."""
+        from pxr import Gf, Vt
+
+        low, high = points.min(axis=0), points.max(axis=0)
+        center = 0.5 * (low + high)
+        local = np.ascontiguousarray(points - center, dtype=np.float32)
+        self.translate.Set(Gf.Vec3d(*map(float, center)), code)
+        self.points.Set(Vt.Vec3fArray.FromNumpy(local), code)
+        self.normals.Set(Vt.Vec3fArray.FromNumpy(vertex_normals(local.astype(np.float64), triangles)), code)
+        extent = np.stack([local.min(axis=0), local.max(axis=0)])
+        self.extent.Set(Vt.Vec3fArray.FromNumpy(extent), code)
+        for name, primvar in self.fields.items():
+            primvar.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(values[name])), code)
+        return low, high
+
+    def write_colors(self, name: str | None, shown: tuple[float, float]) -> int:
+        """Display colours (linear light) of every frame from the field's samples; returns the bytes set."""
+        from pxr import Gf, UsdGeom, Vt
+
+        if name is None:
+            self.color.SetInterpolation(UsdGeom.Tokens.constant)
+            self.color.Set(Vt.Vec3fArray([Gf.Vec3f(*_GREY)]))
+            return 12
+        size = 0
+        for code in self.fields[name].GetTimeSamples():
+            colors = map_colors(np.asarray(self.fields[name].Get(code)), *shown, linear=True)
+            self.color.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colors)), code)
+            size += colors.nbytes
+        return size
+
+
+def _pair(pair: tuple[float, float]) -> Any:
+    from pxr import Gf
+
+    return Gf.Vec2d(float(pair[0]), float(pair[1]))
+
+
+def _define_view(stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], up_axis: str) -> None:
+    """A camera that frames the box (m) from the front right above, a sky and a sun."""
+    from pxr import Gf, UsdGeom, UsdLux
+
+    if not np.isfinite(low).all():
+        low, high = -np.ones(3), np.ones(3)
+    center, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
+    up = Gf.Vec3d(0, 0, 1) if up_axis == "Z" else Gf.Vec3d(0, 1, 0)
+
+    def along(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
+        a, e = np.radians([azimuth, elevation])
+        x, y, z = np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)
+        return np.array([x, y, z] if up_axis == "Z" else [x, z, -y])
+
+    def look(xform: Any, eye: npt.NDArray[np.float64]) -> None:
+        view = Gf.Matrix4d().SetLookAt(Gf.Vec3d(*map(float, eye)), Gf.Vec3d(*map(float, center)), up)
+        xform.AddTransformOp().Set(view.GetInverse())
+
+    camera = UsdGeom.Camera.Define(stage, "/World/Camera")
+    camera.CreateFocalLengthAttr(50.0)
+    camera.CreateHorizontalApertureAttr(36.0)
+    camera.CreateVerticalApertureAttr(20.25)
+    distance = 1.05 * radius / np.sin(np.arctan(0.5 * 20.25 / 50.0))
+    look(camera, center + distance * along(-65.0, 20.0))
+    camera.CreateClippingRangeAttr(Gf.Vec2f(float(1e-3 * distance), float(1e3 * distance)))
+    sun = UsdLux.DistantLight.Define(stage, "/World/Sun")
+    look(sun, center + radius * along(-110.0, 50.0))
+    sun.CreateIntensityAttr(2.0)
+    sun.CreateNormalizeAttr(True)
+    sun.CreateAngleAttr(2.0)
+    UsdLux.DomeLight.Define(stage, "/World/Sky").CreateIntensityAttr(0.5)

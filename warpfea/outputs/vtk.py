@@ -1,0 +1,193 @@
+"""VTU series for ParaView: a file per frame, body and world, and a .pvd that lists them with their times."""
+
+from __future__ import annotations
+
+import functools
+import os
+import pathlib
+import re
+from collections.abc import Sequence
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from warpfea.base.errors import OutputError
+from warpfea.base.writer import Output, check_folder, write_whole
+from warpfea.model.surfaces import reference_points
+from warpfea.outputs.frames import FrameClock, time_of
+
+__all__ = ["VTUWriter"]
+
+
+class VTUWriter(Output):
+    """Writes `folder`/<body>_<world>_<frame>.vtu and `folder`/<folder name>.pvd.
+
+    Args:
+        folder: the target folder; made if its parent exists. Files of the same names are overwritten.
+        every: write each n-th accepted step (the default, with 1). fps: or by time, as USD does. Not both.
+        fields: scalar fields at the mesh nodes, SI units.
+
+    Points are the *current* positions in float64, each world where it is simulated (no grid); subtract the
+    point data `displacement` for the reference shape. `velocity` is written where the simulation has it.
+    Element groups are 0/1 cell data named `set:<group>`. In the .pvd, `part` counts bodies and within them
+    worlds. Every file is written whole and renamed, so the series is valid at any time; the .pvd lags by at
+    most a tenth of the frames until `close`, which also writes the last state.
+
+    OutputError: a folder that can't be made or written (at `open`), a file that can't (at `write`).
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        every: int | None = None,
+        fps: float | None = None,
+        fields: Sequence[str] = ("von_mises",),
+    ) -> None:
+        if every is not None and fps is not None:
+            raise OutputError("VTUWriter takes every= or fps=, not both")
+        if every is not None and (int(every) != every or every < 1):
+            raise OutputError(f"every must be a whole number of steps, at least 1, got {every!r}")
+        self.folder = pathlib.Path(folder)
+        self.every = int(every or 1)
+        self.fps = None if fps is None else FrameClock(fps).fps
+        self.fields = [name for name in dict.fromkeys(fields) if name not in ("displacement", "velocity")]
+        self._open = False
+
+    @property
+    def series(self) -> pathlib.Path:
+        """The .pvd file."""
+        return self.folder / f"{self.folder.resolve().name}.pvd"
+
+    def open(self, sim: Any) -> None:
+        if self.folder.exists() and not self.folder.is_dir():
+            raise OutputError(f"{self.folder}: is a file, not a folder")
+        self._made = not self.folder.exists()
+        check_folder(self.folder if not self._made else self.folder.parent, self.folder)
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.folder}: can't be made ({error})") from error
+        self._open = True
+        self._clock = None if self.fps is None else FrameClock(self.fps)
+        self._calls = 0
+        self._last = -np.inf
+        self._frames: list[tuple[float, list[str]]] = []
+        self._listed = 0
+        self._names = self._file_names(sim.model.bodies)
+
+    @staticmethod
+    def _file_names(bodies: Sequence[Any]) -> list[str]:
+        """Bodies' names made fit for file names, still unique."""
+        names: list[str] = []
+        for body in bodies:
+            name = re.sub(r"[^A-Za-z0-9.-]", "_", body.name).strip(".") or "body"
+            while name.lower() in (other.lower() for other in names):
+                name += "-"
+            names.append(name)
+        return names
+
+    def write(self, sim: Any) -> None:
+        time = time_of(sim)
+        due = self._clock.due(time) if self._clock else self._calls % self.every == 0
+        self._calls += 1
+        if due:
+            self._frame(sim, time)
+
+    def _frame(self, sim: Any, time: float) -> None:
+        frame = len(self._frames)
+        files: list[str] = []
+        self._frames.append((time, files))
+        self._last = time
+        for body, name in zip(sim.model.bodies, self._names, strict=True):
+            if getattr(body, "mesh", None) is None:
+                continue
+            points, data, cells = _frame_data(sim, body, self.fields)
+            for world in range(int(sim.model.worlds)):
+                file = f"{name}_{world:04d}_{frame:06d}.vtu"
+                of_world = {key: np.ascontiguousarray(value[world]) for key, value in data.items()}
+                write_whole(self.folder / file, functools.partial(_write_vtu, cells, points[world], of_world))
+                files.append(file)
+        if frame + 1 >= self._listed + max(1, self._listed // 10):
+            self._write_series()
+
+    def _write_series(self) -> None:
+        lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
+        for time, files in self._frames:
+            lines += [
+                f'<DataSet timestep="{time!r}" group="" part="{part}" file={quoteattr(file)}/>'
+                for part, file in enumerate(files)
+            ]
+        lines += ["</Collection>", "</VTKFile>", ""]
+        write_whole(self.series, lambda path: path.write_text("\n".join(lines), encoding="utf-8"))
+        self._listed = len(self._frames)
+
+    def close(self, sim: Any) -> None:
+        if not self._open:
+            return
+        time = time_of(sim)
+        if time > self._last:
+            self._frame(sim, time)
+        self._write_series()
+        self._open = False
+
+    def abort(self) -> None:
+        """Remove the files that this run wrote, and the folder if it made it and it is empty."""
+        if not self._open:
+            return
+        for _, files in self._frames:
+            for file in files:
+                (self.folder / file).unlink(missing_ok=True)
+        if self._listed:
+            self.series.unlink(missing_ok=True)
+        if self._made and not any(self.folder.iterdir()):
+            self.folder.rmdir()
+        self._open = False
+
+
+Cells = tuple[str, np.ndarray, dict[str, np.ndarray]]
+
+
+def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray, dict[str, np.ndarray], Cells]:
+    """Points and point data (worlds first) of a body, and its cells with their groups.
+
+    T4 and T10 are written as their mesh; the other elements as the cells that draw them, with section and thickness.
+    """
+    mesh = body.mesh
+    family = getattr(body, "family", None)
+    if family is None or not family.has_gradients:
+        points = np.asarray(sim.positions(body), dtype=np.float64)
+        data = {"displacement": np.asarray(sim.displacements(body), dtype=np.float64)}
+        if hasattr(sim, "velocities"):
+            data["velocity"] = np.asarray(sim.velocities(body), dtype=np.float64)
+        data |= {field: np.asarray(sim.field(field, body), dtype=np.float64) for field in fields}
+        return points, data, (mesh.cell_type, mesh.cells, _groups(mesh, np.arange(len(mesh.cells))))
+    drawn = body.drawing
+    points = sim.placed(body, drawn.slot_weights)
+    v = sim.state.velocity.numpy()[:, body.slots].astype(float)
+    data = {
+        "displacement": points - reference_points(body, drawn.slot_weights),
+        "velocity": np.stack([drawn.slot_weights @ row for row in v]),
+    }
+    data |= {field: sim.field_on(field, body, drawn) for field in fields}
+    return points, data, (drawn.cell_type, drawn.cells, _groups(mesh, drawn.element))
+
+
+def _groups(mesh: Any, element: np.ndarray) -> dict[str, np.ndarray]:
+    """0/1 flags of the cells of each element group; `element`: the element of each cell."""
+    sets = getattr(mesh, "element_sets", None) or {}
+    return {f"set:{name}": np.isin(element, np.asarray(members)).astype(np.int32) for name, members in sets.items()}
+
+
+def _write_vtu(cells: Cells, points: np.ndarray, data: dict[str, np.ndarray], path: pathlib.Path) -> None:
+    """One VTU file. meshio changes what it is given, so everything passed is a copy."""
+    import meshio
+
+    mesh = meshio.Mesh(
+        np.array(points),
+        [(cells[0], np.array(cells[1]))],
+        point_data={name: np.array(value) for name, value in data.items()},
+        cell_data={name: [np.array(flags)] for name, flags in cells[2].items()},
+    )
+    mesh.write(path, file_format="vtu")

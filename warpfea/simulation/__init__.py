@@ -1,0 +1,1 @@
+"""The step loop, its results, checkpoints and statics."""

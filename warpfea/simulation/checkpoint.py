@@ -1,0 +1,174 @@
+"""Checkpoints: all arrays of a state and what a simulation has recorded, in one .npz file.
+
+The file is written to a temporary name and renamed, so a checkpoint on disk is always whole. Continued from it, a run
+goes on bit for bit as it would have gone on undisturbed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import zipfile
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import CheckpointError, OutputError
+from ..base.writer import Output, check_target, write_whole
+
+__all__ = ["Checkpoint", "load_checkpoint", "read_meta", "save_checkpoint"]
+
+SCHEMA = 1
+SUFFIXES = (".npz",)
+
+
+class Checkpoint(Output):
+    """Writes the present state to `path` (.npz) during a run, each time replacing the one before.
+
+    Args:
+        path: the target.
+        every: steps between checkpoints. The state at the end of the run is always written.
+
+    Raises:
+        OutputError: a bad suffix, folder or `every`.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, every: int = 100) -> None:
+        if isinstance(every, bool) or int(every) != every or every < 1:
+            raise OutputError(f"Checkpoint: every = {every!r} must be a whole number of steps, at least 1")
+        self.path = pathlib.Path(path)
+        self.every = int(every)
+        self._open = False
+
+    def open(self, sim: Any) -> None:
+        check_target(self.path, SUFFIXES)
+        self._open = True
+        self._calls = 0
+        self._written = -1
+
+    def write(self, sim: Any) -> None:
+        if self._calls and self._calls % self.every == 0:
+            self._save(sim)
+        self._calls += 1
+
+    def close(self, sim: Any) -> None:
+        if self._open and self._written != sim.steps:
+            self._save(sim)
+        self._open = False
+
+    def abort(self) -> None:
+        """Nothing is left behind at any time."""
+        self._open = False
+
+    def _save(self, sim: Any) -> None:
+        save_checkpoint(sim, self.path)
+        self._written = sim.steps
+
+
+def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
+    """Write the simulation's state to `path` (.npz). OutputError if that can't be done."""
+    target = check_target(path, SUFFIXES)
+    meta = {
+        "schema": SCHEMA,
+        "fingerprint": sim.model.fingerprint(),
+        "dtype": sim.model.dtype,
+        "worlds": sim.model.worlds,
+        "slots": sim.model.slots,
+        "integrator": sim.integrator.name,
+        "gravity": sim.model.loads.gravity_host.tolist(),
+        "dt": sim.dt,
+        "steps": sim.steps,
+        "max_residual": sim.max_residual,
+        "max_violation": sim.max_violation,
+        "probes": [probe.name for probe in sim.model.probes],
+    }
+    arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
+    arrays |= {f"total.{name}": values for name, values in sim.totals.items()}
+    if sim._history:
+        arrays["history"] = np.stack(sim._history)
+    text = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
+
+    def write(temporary: pathlib.Path) -> None:
+        with open(temporary, "wb") as file:
+            np.savez(file, meta=text, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+
+    write_whole(target, write)
+
+
+def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a checkpoint says of itself: dtype, worlds, integrator, dt (s), steps, ... CheckpointError if unreadable."""
+    return _read(pathlib.Path(path))[0]
+
+
+def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
+    """Continue from a checkpoint: state, probes' records and totals. The step dt stays the simulation's own.
+
+    Raises:
+        CheckpointError: unreadable or truncated, or of another model, precision, number of worlds or integrator. The
+            simulation is then as before.
+    """
+    file = pathlib.Path(path)
+    meta, arrays = _read(file)
+    _compare(file, meta, sim)
+    state = {name.removeprefix("state."): a for name, a in arrays.items() if name.startswith("state.")}
+    arrays.setdefault("total.rough", np.zeros(sim.model.worlds, int))  # of files before it was counted
+    totals = {name: arrays.get(f"total.{name}") for name in sim.totals}
+    history = arrays.get("history", np.zeros((0, 0, 0)))
+    shape = {name: None if a is None else a.shape for name, a in totals.items()}
+    if any(s != (sim.model.worlds,) for s in shape.values()) or history.ndim != 3:
+        raise CheckpointError(f"{file}: iteration totals or probe records are damaged")
+    try:
+        sim.state.load(state)
+        sim.stepper.forget()
+    except CheckpointError as error:
+        raise CheckpointError(f"{file}: {error}") from None
+    sim.totals = {name: np.array(a) for name, a in totals.items()}
+    sim.steps = int(meta["steps"])
+    sim.max_residual = float(meta["max_residual"])
+    sim.max_violation = float(meta.get("max_violation", 0.0))
+    sim._history = list(history)
+    sim.last = sim._idle_report()
+
+
+def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
+    """CheckpointError naming the first thing in which checkpoint and simulation differ."""
+    expected = {
+        "dtype": ("precision", sim.model.dtype),
+        "worlds": ("number of worlds", sim.model.worlds),
+        "integrator": ("integrator", sim.integrator.name),
+        "slots": ("number of slots", sim.model.slots),
+        "probes": ("probes", [probe.name for probe in sim.model.probes]),
+        "fingerprint": ("model", sim.model.fingerprint()),
+        "gravity": ("gravity", sim.model.loads.gravity_host.tolist()),
+    }
+    for key, (what, value) in expected.items():
+        if meta.get(key) == value:
+            continue
+        if key == "fingerprint":
+            raise CheckpointError(
+                f"{file}: the checkpoint is of another model: mesh, materials, supports or loads differ"
+            )
+        hint = "; the model or its parameters differ" if key == "slots" else ""
+        raise CheckpointError(
+            f"{file}: {what} of the checkpoint is {meta.get(key)!r}, of the simulation {value!r}{hint}"
+        )
+
+
+def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    if not file.is_file():
+        raise CheckpointError(f"{file}: no such checkpoint")
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        meta = json.loads(arrays.pop("meta").tobytes())
+        schema = meta["schema"]
+    except OSError as error:
+        raise CheckpointError(f"{file}: not a readable checkpoint ({error.strerror or error})") from error
+    except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{file}: not a readable checkpoint, such as wf.Checkpoint writes") from error
+    if schema != SCHEMA:
+        raise CheckpointError(f"{file}: schema {schema!r} of the checkpoint is unknown, this version reads {SCHEMA}")
+    return meta, arrays

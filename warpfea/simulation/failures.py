@@ -1,0 +1,119 @@
+"""What to tell of a step that was refused for good, and of joints that are open at the start."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..base.errors import ConstraintError, ConvergenceError
+from ..kernels.solvers.newton import (
+    FAIL_CONSTRAINT,
+    FAIL_CURVATURE,
+    FAIL_GROWTH,
+    FAIL_ITERATIONS,
+    FAIL_JACOBIAN,
+    FAIL_LINE_SEARCH,
+    FAIL_NAN,
+)
+from ..model.evaluation import lowest_jacobian
+from ..solvers import NewtonPCG
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["check_closed", "step_error"]
+
+REASONS = {
+    FAIL_ITERATIONS: "Newton's method did not converge",
+    FAIL_LINE_SEARCH: "the line search found no decrease",
+    FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
+    FAIL_NAN: "a force or energy was not finite",
+    FAIL_CURVATURE: "no descent direction was found",
+    FAIL_GROWTH: "the residual grew more than tenfold",
+}
+OPEN = 1e-4
+"""Violation at the start, over the model's size, that a dynamic run refuses to snap shut."""
+
+
+def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
+    """The error for a world whose step was refused after all halvings."""
+    assert sim.last is not None
+    work = sim.stepper.work
+    code = int(sim.last.failure[world])
+    time = float(sim.last.time[world])
+    halvings = min(int(sim.last.halvings[world]), sim.solver.max_halvings)
+    if code == FAIL_CONSTRAINT:
+        return _unsatisfied(sim, world, time, halvings)
+    count = int(work.newton.iterations.numpy()[world]) + 1
+    history = work.newton.history.numpy()[world, :count].tolist()
+    if code == FAIL_JACOBIAN:
+        element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
+    else:
+        element, where = _worst_element(sim.model, work.g.numpy()[world])
+    reason = REASONS.get(code, "unknown reason")
+    direct = sim.stepper.newton.direct
+    if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
+        reason = "H is singular (a body or mechanism that nothing holds?)"
+    return ConvergenceError(
+        f"step from t = {time:.6g} s with dt = {sim.dt:g} s was not accepted in world {world}: "
+        f"{reason} after {halvings} halvings; relative residuals "
+        f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}",
+        time=time, world=world, residuals=history, element=element, state=sim.state,
+    )  # fmt: skip
+
+
+def check_closed(sim: Any, mask: np.ndarray | None = None) -> None:
+    """Raise ConstraintError where a dynamic run would begin with open joints and snap them shut; in worlds (B,)."""
+    if sim.model.constraints is None or sim.integrator.static:
+        return
+    for world, values in enumerate(sim.stepper.work.multipliers.value.numpy()):
+        if mask is not None and not mask[world]:
+            continue
+        names, worst = _violated(sim.model, values, OPEN * sim.model.size)
+        if names:
+            time = float(sim.time[world])
+            raise ConstraintError(
+                f"joint or constraint {names[0]!r} is {worst[0]:.3g} m off at the start in world {world}, "
+                f"t = {time:.6g} s, and would snap shut in the first step; begin its drive at the present value, move "
+                "the bodies, or assemble them with solve_static",
+                joints=names, violations=worst, world=world, time=time, state=sim.state,
+            )  # fmt: skip
+
+
+def _unsatisfied(sim: Any, world: int, time: float, halvings: int) -> ConstraintError:
+    """The error for constraints that stay violated although the forces balance."""
+    tol = sim.stepper.newton.constraint_tol
+    names, values = _violated(sim.model, sim.stepper.work.multipliers.value.numpy()[world], tol)
+    listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
+    few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
+    return ConstraintError(
+        f"step from t = {time:.6g} s with dt = {sim.dt:g} s: constraints could not be satisfied in world {world} after "
+        f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or with "
+        f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}",
+        joints=names, violations=values, time=time, world=world, state=sim.state,
+    )  # fmt: skip
+
+
+def _violated(model: Model, values: np.ndarray, tol: float) -> tuple[list[str], list[float]]:
+    """Names of the joints whose rows (rows,) exceed the tolerance (m), the worst first, and by how much, m."""
+    constraints = model.constraints
+    assert constraints is not None
+    worst = np.array([np.abs(values[rows]).max() for rows in constraints.rows_of])
+    order = [k for k in np.argsort(-worst, kind="stable") if not worst[k] <= tol]
+    return [constraints.joints[k].name for k in order], [float(worst[k]) for k in order]
+
+
+def _worst_element(m: Model, residual: np.ndarray) -> tuple[int, str]:
+    """Model index and a description of the element whose slots carry the largest residual (slots, 3)."""
+    g = np.abs(residual * m.free_host).max(axis=1)
+    g = np.where(np.isfinite(g), g, np.inf)
+    best, index, text = -1.0, -1, "element unknown"
+    for block in m.blocks:
+        for part in block.parts:
+            values = g[part.conn + part.body.slot_offset].max(axis=1)
+            k = int(np.argmax(values))
+            if values[k] > best:
+                best, index = float(values[k]), part.body.element_offset + int(part.elements[k])
+                text = f"element {int(part.elements[k])} of body {part.body.name!r} (residual {best:.3g} N)"
+    return index, text

@@ -1,0 +1,56 @@
+"""The first iterate of a step, see kernels/step/predictor.py."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from ..kernels.step.predictor import PREDICTOR_ROWS, predictor_kernels, predictor_struct
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..model.state import State
+    from ..solvers.residual import Reducer
+    from ..terms.workspace import Workspace
+
+__all__ = ["Predictor"]
+
+
+class Predictor:
+    """Extrapolation of velocities, of the order that served the last step best; its past is part of the state."""
+
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State, module: wp.Module,
+        *, multistep: bool,
+    ) -> None:  # fmt: skip
+        self.model, self.work, self.launch, self.reduce, self.state = model, work, launch, reduce, state
+        self.kernels = predictor_kernels(model.dtype, module)
+        self.dim = (model.worlds, model.slots)
+        self.control: Any = predictor_struct()()
+        for name in ("order", "count"):
+            setattr(self.control, name, work.array(f"predictor {name}", (model.worlds,), wp.int32))
+        self.control.sums = work.array("predictor sums", (PREDICTOR_ROWS, model.worlds), wp.float64)
+        self.control.kept = state.register("predictor", wp.float64, (4,))
+        # multistep schemes keep v_{n-1} themselves
+        self.own = not multistep
+        field = model.types.vec3, (model.slots,)
+        before = state.register("predictor_before", *field) if self.own else state.previous_velocity
+        self.past = before, state.register("predictor_first", *field)
+
+    def begin(self) -> None:
+        """Put the iterate into work.v, where predict has put v_n."""
+        m, w, step = self.model, self.work, self.work.step
+        self.launch(self.kernels.begin, m.worlds, [self.control, step, w.newton])
+        args = [self.control, step, m.topology.free, self.state.velocity, *self.past, w.v]
+        self.launch(self.kernels.extrapolate, self.dim, args)
+
+    def commit(self) -> None:
+        """The attempt was accepted, and is not yet the state."""
+        m, w, step = self.model, self.work, self.work.step
+        args = [self.control, step, m.topology.free, m.is_position, w.diagonal, w.v, self.state.velocity, *self.past]
+        self.launch(self.kernels.compare, self.dim, [*args, w.rows])
+        self.reduce(w.rows, PREDICTOR_ROWS, step.accepted, self.control.sums)
+        self.launch(self.kernels.shift, self.dim, [step, int(self.own), self.state.velocity, *self.past])
+        self.launch(self.kernels.learn, m.worlds, [self.control, step])

@@ -1,0 +1,97 @@
+"""What a simulation knows of its present state: positions, velocities, fields, the drawn surface."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..model.bodies import Body
+from ..model.evaluation import von_mises
+from ..model.state import State
+from ..model.surfaces import reference_points
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["Results"]
+
+
+class Results:
+    """Results of the present state of a model. Nodal ones are in the mesh file's order, worlds first."""
+
+    model: Model
+    state: State
+
+    def _rows(self, body: Body, values: np.ndarray) -> np.ndarray:
+        """Slot values to mesh nodes, (B, nodes, 3); nodes that no element uses get 0."""
+        out = np.zeros((self.model.worlds, len(body.mesh.points), 3))
+        used = body.mesh.used_nodes
+        out[:, used] = values[:, body.slot_offset + body.node_slot[used]]
+        return out
+
+    def displacements(self, body: Body) -> np.ndarray:
+        """(B, nodes, 3) m, in the mesh file's node order."""
+        return self._rows(body, self.state.displacement.numpy())
+
+    def positions(self, body: Body) -> np.ndarray:
+        """(B, nodes, 3) m."""
+        return body.mesh.points + self.displacements(body)
+
+    def velocities(self, body: Body) -> np.ndarray:
+        """(B, nodes, 3) m/s."""
+        return self._rows(body, self.state.velocity.numpy())
+
+    def placed(self, body: Body, weights: Any) -> np.ndarray:
+        """(B, P, 3) m: present places of material points given by sparse weights (P, slots of the body)."""
+        u = self.state.displacement.numpy()[:, body.slots].astype(float)
+        return reference_points(body, weights) + np.stack([weights @ row for row in u])
+
+    def skin_points(self, body: Body) -> np.ndarray:
+        """(B, skin points, 3) m: the drawn surface."""
+        return self.placed(body, body.skin.slot_weights)
+
+    def skin_field(self, name: str, body: Body) -> np.ndarray:
+        """(B, skin points) scalars of a field at the drawn surface."""
+        return self.field_on(name, body, body.skin)
+
+    def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
+        """(B, P) scalars of a field at the points of a Skin or Drawing of the body."""
+        if name == "displacement":
+            moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
+            return np.linalg.norm(moved, axis=2)
+        stress = self._stress(name, body)  # the tensor is interpolated: a bent section shows its neutral axis
+        return von_mises(np.stack([drawn.node_weights @ row for row in stress]))
+
+    def field(self, name: str, body: Body) -> np.ndarray:
+        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress) or "displacement" (m, magnitude).
+
+        The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
+        """
+        if not isinstance(body, Body):
+            raise ModelError(f"field: expected field(name, body), got field({name!r}, {body!r})")
+        if name == "displacement":
+            return np.linalg.norm(self.displacements(body), axis=2)
+        samples = von_mises(self._stress(name, body))
+        return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
+
+    def _stress(self, name: str, body: Body) -> np.ndarray:
+        """(B, nodes x samples, 6) Cauchy stress, Pa, behind a field."""
+        if name != "von_mises":
+            raise ModelError(f"field {name!r} is unknown; there are von_mises, displacement")
+        return self.model.evaluation.sample_stress(self.state, body)
+
+    def node_gradients(self, body: Body) -> np.ndarray:
+        """(B, nodes, 3, 3) deformation gradient F at the nodes of a body with gradient slots; NaN at others.
+
+        Of a beam or shell, F turns the node's axes (body.node_axes) into the present ones.
+        """
+        if not body.family.has_gradients:
+            raise ModelError(f"body {body.name!r}: element {body.family.name} has no gradients at its nodes")
+        out = np.full((self.model.worlds, len(body.mesh.points), 3, 3), np.nan)
+        u = self.state.displacement.numpy()[:, body.slots].astype(float)
+        nodes = np.flatnonzero(body.node_slot_count == 4)
+        rows = body.node_slot[nodes][:, None] + np.arange(1, 4)
+        out[:, nodes] = np.eye(3) + np.einsum("bnkc,nkd->bncd", u[:, rows], body.reference[rows])
+        return out

@@ -1,0 +1,519 @@
+"""Simulation: the step loop as users drive it."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import solvers
+from ..base.errors import ConstraintError, ConvergenceError, ModelError
+from ..kernels.step.step import LEDGER, REPORT, STATUS
+from ..kernels.terms.constraints import JOINT_COLUMNS
+from ..model.handles import NodeSet
+from ..model.joints import Joint
+from ..model.state import State
+from ..solvers import Jacobi, NewtonPCG
+from . import integrators
+from .failures import check_closed, step_error
+from .results import Results
+from .run_loop import close_all, interruptible, step_bar
+from .stepper import Stepper
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["JointRecord", "ProbeRecord", "Simulation", "StepReport"]
+
+
+@dataclass(frozen=True, eq=False)
+class StepReport:
+    """What a step took, each an array [world].
+
+    Attributes:
+        converged: the step was accepted and is within the solver's tolerance. With wf.Jacobi a world may go on without:
+            False with status 0.
+        newton, pcg: iterations, refused attempts included; Jacobi's count as newton.
+        residual: |g| over the largest force, of the last attempt.
+        halvings: refused attempts.
+        status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
+        min_J: smallest det F; a value <= 0 means that an element turned inside out (SVK only; others refuse it).
+        time: s.
+        residual_force: |g| over the free components, N, of the last attempt.
+        violation: largest of the constraints, m.
+        outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
+    """
+
+    converged: np.ndarray
+    newton: np.ndarray
+    pcg: np.ndarray
+    residual: np.ndarray
+    halvings: np.ndarray
+    status: np.ndarray
+    min_J: np.ndarray
+    time: np.ndarray
+    failure: np.ndarray
+    violation: np.ndarray
+    outer: np.ndarray
+    residual_force: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class JointRecord:
+    """A joint over time: time (steps,); force (worlds, steps, 3), N, and moment about its anchor, N m, on the child in
+    world axes; violation (worlds, steps), m, the largest of its rows."""
+
+    time: np.ndarray
+    force: np.ndarray
+    moment: np.ndarray
+    violation: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ProbeRecord:
+    """A probe over time: time (steps,), position, displacement and velocity (worlds, steps, 3), in m and m/s."""
+
+    time: np.ndarray
+    position: np.ndarray
+    displacement: np.ndarray
+    velocity: np.ndarray
+
+
+def check_model(model: Any) -> None:
+    """Raise ModelError for what is not a Model, such as a builder."""
+    from ..model.model import Model
+
+    if not isinstance(model, Model):
+        raise ModelError(f"expected a Model, got {type(model).__name__}; builder.finalize() makes one")
+
+
+class Simulation(Results):
+    """Steps a model through time.
+
+    Args:
+        model: from ModelBuilder.finalize.
+        state: where it starts; by default model.state(). It is advanced in place.
+        dt: step, s. `sim.dt` may be set later.
+        integrator: "backward_euler" or "bdf2".
+        solver: "newton-pcg" or "jacobi", or options: wf.NewtonPCG(...), wf.Jacobi(...).
+        constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
+            float64, 1e-5 in float32.
+        ledger: keep the energy ledger.
+        record: keep what probes and joints tell of every step, else of the last alone.
+        capture: record a step as one graph, on the GPU and on the CPU; never done with linear="direct".
+        on_compile: called with (modules ready, modules in all, name) while kernels compile.
+        on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
+            several only once all have failed.
+
+    Raises:
+        ModelError: dt or an option out of range.
+        ConstraintError: joints that are open at the start.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        state: State | None = None,
+        *,
+        dt: float,
+        integrator: str = "backward_euler",
+        solver: NewtonPCG | Jacobi | str | None = None,
+        constraint_tol: float | None = None,
+        ledger: bool = True,
+        record: bool = True,
+        capture: bool = True,
+        on_failure: str | None = None,
+        on_compile: Callable[[int, int, str], None] | None = None,
+    ) -> None:
+        scheme, options = integrators.get(integrator), solvers.get(solver)
+        self._start(model, state, scheme, options, ledger, capture, on_compile, constraint_tol)
+        self.dt = dt
+        if on_failure not in (None, "raise", "freeze"):
+            raise ModelError(f"on_failure = {on_failure!r} is neither 'raise' nor 'freeze'")
+        self.on_failure = on_failure
+        self.record = record
+
+    @classmethod
+    def _static(
+        cls, model: Model, state: State, solver: NewtonPCG, dt: float, constraint_tol: float | None
+    ) -> Simulation:
+        """The same loop for load steps of statics."""
+        self = cls.__new__(cls)
+        self._start(model, state, integrators.INTEGRATORS["static"], solver, False, True, None, constraint_tol)
+        self.dt = dt
+        self.on_failure = "raise"
+        return self
+
+    def _start(
+        self,
+        model: Model,
+        state: State | None,
+        scheme: Any,
+        solver: NewtonPCG | Jacobi,
+        ledger: bool,
+        capture: bool,
+        on_compile: Callable[[int, int, str], None] | None = None,
+        constraint_tol: float | None = None,
+    ) -> None:
+        check_model(model)
+        if constraint_tol is None:
+            constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
+        if not (isinstance(constraint_tol, (int, float, np.floating)) and 0.0 < constraint_tol < 1.0):
+            raise ModelError(f"constraint_tol = {constraint_tol!r} must lie between 0 and 1")
+
+        self.model = model
+        self.state = model.state() if state is None else state
+        got, expected = self.state.displacement, (model.worlds, model.slots)
+        if got.shape != expected or got.dtype != model.types.vec3 or got.device != model.device:
+            raise ModelError(
+                f"the state is of another model: displacement {got.shape} of {got.dtype.__name__} on {got.device}, "
+                f"expected {expected} of {model.types.vec3.__name__} on {model.device}"
+            )
+        self.integrator = scheme
+        self.solver = solver
+        began = clock.perf_counter()
+        self.stepper = Stepper(
+            model, self.state, scheme, solver,
+            ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, on_compile=on_compile,
+        )  # fmt: skip
+        self.compile_s = clock.perf_counter() - began
+        check_closed(self)
+        self.steps = 0
+        self.last: StepReport | None = None
+        self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough")}
+        self.max_residual = 0.0
+        self.max_violation = 0.0
+        self.record = True
+        self._stepped = np.zeros(model.worlds, dtype=bool)
+        self._history: list[np.ndarray] = []
+
+    # stepping
+
+    @property
+    def dt(self) -> float:
+        """Step, s."""
+        return self._dt
+
+    @dt.setter
+    def dt(self, value: float) -> None:
+        if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
+            raise ModelError(f"dt = {value!r} must be a positive finite time (s)")
+        self._dt = float(value)
+        self.stepper.work.step.dt.fill_(self._dt)
+
+    @property
+    def time(self) -> np.ndarray:
+        """[world], s."""
+        return self.state.time.numpy().copy()
+
+    @property
+    def methods(self) -> dict[str, str]:
+        """What "auto" stands for here: "solver", and of NewtonPCG "linear", "operator" and "preconditioner"."""
+        return dict(self.stepper.newton.methods)
+
+    @property
+    def status(self) -> np.ndarray:
+        """[world]: 0 running, 1 failed, 2 frozen."""
+        return self.state.status.numpy().copy()
+
+    def step(self, count: int = 1) -> StepReport:
+        """Advance `count` steps of dt; the report is that of the last.
+
+        Raises:
+            ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
+            ConstraintError: the same, and it is the constraints that can't be satisfied; it names them.
+            ModelError: `count` is not a positive whole number.
+        """
+        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+            raise ModelError(f"step({count!r}): the number of steps must be a whole number, at least 1")
+        for _ in range(count):
+            self.stepper.run()
+            report = self.stepper.work.report.numpy()
+            self._digest(report)
+        assert self.last is not None
+        return self.last
+
+    def _digest(self, rows: np.ndarray) -> None:
+        column = {name: rows[:, k] for k, name in enumerate(REPORT)}
+        status = column["status"].astype(int)
+        before = self.last.status if self.last is not None else np.zeros(len(rows), int)
+        fresh = (status == STATUS["failed"]) & (before != STATUS["failed"])
+        self.last = StepReport(
+            converged=(status == STATUS["running"]) & (column["rough"] == 0.0),
+            newton=column["newton"].astype(int),
+            pcg=column["pcg"].astype(int),
+            residual=column["residual"].copy(),
+            halvings=column["halvings"].astype(int),
+            status=status,
+            min_J=column["min_J"].copy(),
+            time=column["time"].copy(),
+            failure=column["failure"].astype(int),
+            violation=column["violation"].copy(),
+            outer=column["outer"].astype(int),
+            residual_force=column["residual_force"].copy(),
+        )
+        self.steps += 1
+        good = status == STATUS["running"]
+        self._stepped |= good
+        self._stepped &= status != STATUS["failed"]
+        self.totals["newton"] += self.last.newton
+        self.totals["pcg"] += self.last.pcg
+        self.totals["rough"] += good & ~self.last.converged
+        if good.any():
+            self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
+            self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
+        if self._recorded:
+            if not self.record:
+                self._history.clear()
+            self._history.append(self._row(rows))
+        if fresh.any():
+            fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
+            if fatal:
+                if not good.any():  # no world advanced
+                    self.steps -= 1
+                    if self._recorded:
+                        self._history.pop()
+                raise self._failure(int(np.flatnonzero(fresh)[0]))
+
+    def _row(self, rows: np.ndarray) -> np.ndarray:
+        """What is kept of a report: time, probes, and joints, which a world that did not step does not tell."""
+        row = rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy()
+        row[~self._stepped, 1 + 6 * len(self.model.probes) :] = np.nan
+        return row
+
+    @property
+    def _recorded(self) -> bool:
+        """Whether there is anything to record of each step."""
+        return bool(self.model.probes or self.model.constraints)
+
+    def _failure(self, world: int) -> ConvergenceError | ConstraintError:
+        """The error for a failed world; its status is cleared so that a caller may try again with another dt."""
+        error = step_error(self, world)
+        status = self.state.status.numpy()
+        status[status == STATUS["failed"]] = STATUS["running"]
+        self.state.status.assign(status)
+        self.last = None
+        return error
+
+    def run(
+        self,
+        t_end: float,
+        *,
+        outputs: Sequence[Any] = (),
+        on_step: Callable[[Simulation], Any] | None = None,
+        progress: bool | None = None,
+    ) -> StepReport:
+        """Step until t_end (s), writing outputs. Ctrl-C ends after the step in hand, with valid files.
+
+        Args:
+            t_end: end time, s; a last step that would overshoot by less than half a step is not taken.
+            outputs: writers (USDWriter, VTUWriter, Checkpoint, ...).
+            on_step: called after each step; ends the run when it returns False.
+            progress: show a bar on stderr; by default when stderr is a terminal.
+
+        Raises:
+            ConvergenceError, ConstraintError, OutputError: the outputs hold what came before.
+            KeyboardInterrupt: after Ctrl-C, once outputs are closed.
+        """
+        if not math.isfinite(t_end):
+            raise ModelError(f"t_end = {t_end!r} must be finite")
+        if not isinstance(outputs, (list, tuple)) or not all(hasattr(out, "write") for out in outputs):
+            raise ModelError(f"run: outputs must be a list of writers such as USDWriter(path), got {outputs!r}")
+        alive = self.status == STATUS["running"]
+        now = float(self.time[alive].min()) if alive.any() else t_end
+        total = max(0, round((t_end - now) / self._dt))
+        opened: list[Any] = []
+        with interruptible() as interrupted, step_bar(total, t_end, progress) as bar:
+            try:
+                for out in outputs:
+                    opened.append(out)
+                    out.open(self)
+                for out in opened:
+                    out.write(self)
+            except BaseException:  # nothing has been done yet: leave no half-empty files
+                for out in opened:
+                    out.abort()
+                raise
+            try:
+                for _ in range(total):
+                    report = self.step()
+                    for out in opened:
+                        out.write(self)
+                    bar(report)
+                    if (
+                        (on_step is not None and on_step(self) is False)
+                        or interrupted()
+                        or (report.status != STATUS["running"]).all()
+                    ):
+                        break
+            except BaseException:
+                close_all(opened, self)
+                raise
+            close_all(opened, self, quiet=False)
+            if interrupted():
+                raise KeyboardInterrupt
+        if self.last is None:
+            self.last = self._idle_report()
+        return self.last
+
+    def _idle_report(self) -> StepReport:
+        B = self.model.worlds
+        zero, none = np.zeros(B, int), np.zeros(B)
+        return StepReport(
+            self.status == 0, zero, zero, none, zero, self.status, none, self.time, zero, none, zero, none
+        )
+
+    def freeze(self, worlds: Any) -> None:
+        """Leave worlds (indices or mask) as they are from now on."""
+        status = self.state.status.numpy()
+        status[worlds] = STATUS["frozen"]
+        self.state.status.assign(status)
+
+    def reset(self, mask: Any = None, state: State | None = None) -> None:
+        """Set worlds back to a state, by default to the model's initial one; mask [world], by default all."""
+        B = self.model.worlds
+        mask = np.ones(B, bool) if mask is None else np.asarray(mask, dtype=bool)
+        if mask.shape != (B,):
+            raise ModelError(f"reset: mask has shape {mask.shape}, expected ({B},)")
+        source = self.model.state() if state is None else state
+        fresh = source.numpy()
+        values = self.state.numpy()
+        for name, array in values.items():
+            spec = self.state.specs[name]
+            array[mask] = fresh[name][mask] if name in fresh else np.asarray(spec.initial)
+        self.state.load(values)
+        self.stepper.forget(mask)
+        self._stepped[mask] = False
+        if self.model.constraints:
+            self.stepper.begin_constraints()
+            check_closed(self, mask)
+        if self.stepper.ledger:
+            self.stepper.begin_ledger(mask)
+
+    # results of the whole run; those of the present state are in Results
+
+    def probe(self, name: str) -> ProbeRecord:
+        """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""
+        names = [p.name for p in self.model.probes]
+        if name not in names:
+            raise ModelError(f"probe {name!r} is unknown; there are {names}")
+        k = names.index(name)
+        table = self._table([0, *range(1 + 6 * k, 7 + 6 * k)])
+        d, v = table[:, :, 1:4], table[:, :, 4:7]
+        return ProbeRecord(table[:, :, 0].max(axis=0), self.model.probes[k].X + d, d, v)
+
+    def _table(self, columns: list[int]) -> np.ndarray:
+        """(B, steps, columns) of what was recorded: time, then the columns of the report from the probes on."""
+        if self._history:
+            return np.stack([rows[:, columns] for rows in self._history], axis=1)
+        return np.zeros((self.model.worlds, 0, len(columns)))
+
+    def energies(self) -> dict[str, np.ndarray]:
+        """Energy ledger, each (B,), J.
+
+        work_joints is the force at the end of each substep times the drive's travel, as the scheme has it; `integrator`
+        takes what that differs from the exact work, and may be negative.
+
+        kinetic, strain and potential (of gravity, from the reference) are current values. work (by loads, supports,
+        fields and driven joints, also given apart), viscous, contact, friction and integrator add up from the start;
+        ledger_residual is change of energy + losses - work, which equals `unbalanced`, the sum of g . dq that the
+        solver's tolerance left.
+        """
+        if not self.stepper.ledger:
+            raise ModelError("energies: the simulation was made with ledger=False")
+        table = self.state.ledger.numpy()
+        out = {name: table[:, k].copy() for k, name in enumerate(LEDGER)}
+        out["work"] = out["work_loads"] + out["work_supports"] + out["work_fields"] + out["work_joints"]
+        out["contact"] = np.zeros(len(table))
+        out["friction"] = np.zeros(len(table))
+        return out
+
+    def reaction(self, nodes: NodeSet) -> np.ndarray:
+        """Force of the supports on the prescribed components of nodes at the last accepted step, (B, 3), N.
+
+        NaN for a world whose last step was refused, or that was reset or resumed and has not stepped since.
+        """
+        if not isinstance(nodes, NodeSet):
+            raise ModelError(f"reaction: expected nodes (body.nodes), got {nodes!r}")
+        g = self.stepper.work.g.numpy() * (1.0 - self.model.free_host)
+        first = nodes.body.node_slot[nodes.indices]
+        rows = nodes.body.slot_offset + first[first >= 0]
+        total = g[:, rows].sum(axis=1).astype(float)
+        total[~self._stepped] = np.nan
+        return total
+
+    def joint_record(self, joint: Joint | str) -> JointRecord:
+        """What has been recorded of a joint (handle or name), one entry per step."""
+        first = 1 + 6 * len(self.model.probes) + JOINT_COLUMNS * self._joint(joint).index
+        columns = [0, *range(first, first + JOINT_COLUMNS)]
+        table = self._table(columns)
+        return JointRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
+
+    def joint_force(self, joint: Joint | str) -> np.ndarray:
+        """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
+
+        (B, 6) in world axes; `joint_record` has them over time. NaN as for `reaction`.
+        """
+        k = self._joint(joint).index
+        first = len(REPORT) + 6 * len(self.model.probes) + JOINT_COLUMNS * k
+        out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
+        out[~self._stepped] = np.nan
+        return out
+
+    def violation(self, joint: Joint | str) -> np.ndarray:
+        """Largest violation of a joint's rows in the present state, (B,), m; angles count times the model's size."""
+        k = self._joint(joint).index
+        constraints = self.model.constraints
+        assert constraints is not None
+        values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
+        # where the last step has brought it, the right sides are that step's: statics runs in a time of its own
+        column = len(REPORT) + 6 * len(self.model.probes) + JOINT_COLUMNS * k + 6
+        return np.where(self._stepped, self.stepper.work.report.numpy()[:, column], values)
+
+    def joint_value(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
+        """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
+
+        (B,), in the present state; a driven angle counts its full turns, another lies between -pi and pi. `what`:
+        "angle", "travel" or "length", where a joint has several. Travel is along the parent's axis, per unit of its
+        reference.
+        """
+        known = self._joint(joint)
+        constraints = self.model.constraints
+        assert constraints is not None
+        return constraints.measure(known, what, self.state)
+
+    def _joint(self, joint: Joint | str) -> Joint:
+        """A joint of this model, by handle or name."""
+        known = self.model.constraints.joints if self.model.constraints else []
+        for other in known:
+            if other is joint or other.name == joint:
+                return other
+        names = [j.name for j in known]
+        raise ModelError(
+            f"expected a joint of this model (a handle from add_joint, add_constraint or weld, or a name), "
+            f"got {joint!r}; it has {names}"
+        )
+
+    def contact_report(self, *pair: Any) -> Any:
+        """Contact is not part of this version."""
+        raise NotImplementedError("contact_report: contact is not part of this version")
+
+    def resume(self, path: Any) -> None:
+        """Continue from a checkpoint, bit for bit. Raises CheckpointError if it is of another model."""
+        from .checkpoint import load_checkpoint
+
+        load_checkpoint(self, path)
+        self._stepped[:] = False
+
+    def bytes(self) -> dict[str, int]:
+        """Bytes on the device: constants, scratch, and each array of the state (twice where steps may be halved)."""
+        out = {f"model.{k}": v for k, v in self.model.bytes.items()}
+        out |= {f"work.{k}": v for k, v in self.stepper.work.bytes.items()}
+        for label, state in (("state", self.state), ("backup", self.stepper.backup)):
+            if state is not None:
+                out |= {f"{label}.{k}": v for k, v in state.bytes.items()}
+        return out

@@ -1,0 +1,116 @@
+"""Static equilibrium by load steps, with the residual of a step without inertia (h = 1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..model.state import State
+from ..solvers import NewtonPCG
+from .simulation import Simulation, StepReport, check_model
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["StaticResult", "solve_static"]
+
+
+@dataclass(frozen=True, eq=False)
+class StaticResult:
+    """A static solution.
+
+    Attributes:
+        state: State at full load, with time 0: `Simulation(model, static.state, dt=...)` goes on from it.
+        report: StepReport of the last load step.
+        simulation: the loop that found it: positions, displacements, field, reaction, ...
+        newton, pcg: iterations of all load steps, [world].
+    """
+
+    state: State
+    report: StepReport
+    simulation: Simulation
+    newton: np.ndarray
+    pcg: np.ndarray
+
+    def probe(self, name: str) -> Any:
+        """The probe `name`, with one entry per load step; the last is at full load."""
+        return self.simulation.probe(name)
+
+    def displacements(self, body: Any) -> np.ndarray:
+        """(B, nodes, 3) m."""
+        return self.simulation.displacements(body)
+
+    def positions(self, body: Any) -> np.ndarray:
+        """(B, nodes, 3) m."""
+        return self.simulation.positions(body)
+
+    def reaction(self, nodes: Any) -> np.ndarray:
+        """Force of the supports, (B, 3), N."""
+        return self.simulation.reaction(nodes)
+
+    def joint_force(self, joint: Any) -> np.ndarray:
+        """Force and moment of a joint on its child, (B, 6), N and N m."""
+        return self.simulation.joint_force(joint)
+
+    def violation(self, joint: Any) -> np.ndarray:
+        """Largest violation of a joint, (B,), m."""
+        return self.simulation.violation(joint)
+
+    def node_gradients(self, body: Any) -> np.ndarray:
+        """(B, nodes, 3, 3) deformation gradient at the nodes of a body with gradient slots."""
+        return self.simulation.node_gradients(body)
+
+    def field(self, name: str, body: Any) -> np.ndarray:
+        """(B, nodes) scalars."""
+        return self.simulation.field(name, body)
+
+
+def solve_static(
+    model: Model,
+    *,
+    load_steps: int = 10,
+    tol: float | None = None,
+    solver: NewtonPCG | None = None,
+    state: State | None = None,
+    constraint_tol: float | None = None,
+    progress: bool | None = False,
+) -> StaticResult:
+    """Find the static equilibrium.
+
+    A pseudo-time runs from 0 to 1 in `load_steps` equal parts. Constant loads, gravity and drives grow in proportion to
+    it; laws over time are taken at it. A load step that fails is halved. Viscosity plays no part.
+
+    Args:
+        load_steps: number of load steps.
+        tol: relative residual, by default the solver's.
+        solver: NewtonPCG options; by default with room for slender bodies, max_pcg = 20000.
+        constraint_tol: as of Simulation.
+        state: start; by default model.state(). It is copied.
+
+    Raises:
+        ModelError: a body is not supported, or an option is out of range.
+        ConvergenceError: a load step was not accepted after all halvings.
+        ConstraintError: the same, and it is the constraints that can't be satisfied.
+    """
+    if not (isinstance(load_steps, (int, np.integer)) and load_steps >= 1):
+        raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number")
+    check_model(model)
+    model.check_static_supports()
+    if not isinstance(solver, (NewtonPCG, type(None))):
+        raise ModelError(f"solve_static: solver = {solver!r} must be wf.NewtonPCG(...): an equilibrium is to be found")
+    options = solver or NewtonPCG(max_pcg=20000, max_newton=50)
+    if tol is not None:
+        if not (math.isfinite(tol) and 0.0 < tol < 1.0):
+            raise ModelError(f"solve_static: tol = {tol!r} must lie between 0 and 1")
+        options = replace(options, tol=tol)
+    start = model.state() if state is None else state.like()
+    start.time.zero_()
+    sim = Simulation._static(model, start, options, 1.0 / load_steps, constraint_tol)
+    sim.run(1.0, progress=progress)
+    assert sim.last is not None
+    start.time.zero_()  # what starts from the equilibrium starts at t = 0
+    return StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"])

@@ -1,0 +1,340 @@
+"""Where the time of a step goes: the recorded step as a whole, and its launches one by one.
+
+The whole step is timed as it runs, one graph per step. Then the same steps are done again from the same state without
+the graph, each launch timed alone: on the GPU by events around the kernel, on the CPU by the host's clock. What an
+empty kernel takes by the same means is taken off each launch. What the whole step takes beyond its kernels is
+`between_ms`: the starting of kernels, the conditions of loops, clearing of flags, the reading of the report.
+
+Bytes are those of the arrays a launch can reach, each counted once. Traffic is smaller where a kernel touches an array
+in part, or finds it in a cache, and larger where it reads an array several times.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import gc
+import statistics
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ...base.checks import is_count
+from ...base.errors import ModelError
+from ...base.launch import PARTS, kernel_name
+from ...kernels.common.probe import probe_kernels
+from ...simulation.simulation import Simulation
+
+__all__ = ["KernelTime", "Profile", "Recorder", "copy_bandwidth", "launch_bytes", "profile"]
+
+WARM_UP = 2
+EMPTY_LAUNCHES = 200
+COPY_BYTES = {"cpu": 2**27, "cuda": 2**30}
+COPIES = 10
+
+
+@dataclass(frozen=True)
+class KernelTime:
+    """Launches of one kernel for one part, per step.
+
+    Attributes:
+        part: what they are for, see `PARTS`. kernel: module.kernel.
+        launches: per step. ms: time per step beyond that of empty launches. bytes: of the arrays they reach, per step.
+    """
+
+    part: str
+    kernel: str
+    launches: float
+    ms: float
+    bytes: float
+
+    @property
+    def GBps(self) -> float | None:
+        """1e9 bytes per second; None where the time is too short to tell."""
+        return self.bytes / self.ms / 1e6 if self.ms > 0.0 else None
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What `profile` found.
+
+    Attributes:
+        step_ms: time of each step as one graph, with the reading of its report, ms.
+        kernels: kernels per part, the longest first.
+        newton, pcg: iterations per step.
+        copy_GBps: bytes read and written per second, 1e9, by a copy of a large array on the device.
+        empty_launch_us: time of an empty kernel, taken off each launch, us.
+    """
+
+    step_ms: tuple[float, ...]
+    kernels: tuple[KernelTime, ...]
+    newton: float
+    pcg: float
+    copy_GBps: float
+    empty_launch_us: float
+
+    @property
+    def parts(self) -> dict[str, KernelTime]:
+        """Sums over the kernels of each part, in the order of `PARTS`; parts without launches are left out."""
+        out = {}
+        for name in PARTS:
+            rows = [k for k in self.kernels if k.part == name]
+            if rows:
+                sums = {key: sum(getattr(k, key) for k in rows) for key in ("launches", "ms", "bytes")}
+                out[name] = KernelTime(name, "", **sums)
+        return out
+
+    @property
+    def kernels_ms(self) -> float:
+        """All kernels of a step, ms."""
+        return sum(k.ms for k in self.kernels)
+
+    @property
+    def between_ms(self) -> float:
+        """What a step of the mean length takes beyond its kernels, ms; 0 where timed alone they took longer."""
+        return max(statistics.mean(self.step_ms) - self.kernels_ms, 0.0)
+
+    @property
+    def total_ms(self) -> float:
+        """What shares are of: the kernels and what lies between them, ms."""
+        return self.kernels_ms + self.between_ms
+
+    @property
+    def launches(self) -> float:
+        """Launches per step."""
+        return sum(k.launches for k in self.kernels)
+
+
+@dataclass
+class _Booked:
+    """Sums over launches."""
+
+    launches: int = 0
+    seconds: float = 0.0
+    bytes: int = 0
+
+
+class Recorder:
+    """Does launches one by one and books time and bytes by part and kernel.
+
+    Commands are kept, so that little happens between two launches that come again: caches stay warm.
+    """
+
+    def __init__(self, device: Any) -> None:
+        self.device = wp.get_device(device)
+        self._pending: list[_Booked] = []
+        self._booked: dict[tuple[str, str], _Booked] = {}
+        self._known: dict[Any, tuple[wp.Launch, _Booked, int, list[Any]]] = {}
+
+    def __call__(
+        self, part: str, kernel: wp.Kernel, size: Sequence[int], inputs: list[Any], make: Callable[[], wp.Launch]
+    ) -> None:
+        """Do the launch; on the CPU time it."""
+        key = (part, kernel, *size, *map(_identity, inputs))
+        known = self._known.get(key)
+        if known is None:
+            booked = self._booked.setdefault((part, kernel_name(kernel)), _Booked())
+            # the inputs are held, so that the identity of a struct stays its own
+            known = self._known[key] = make(), booked, launch_bytes(inputs, _members(kernel)), inputs
+        command, booked, reached, _ = known
+        if self.device.is_cuda:
+            self._pending.append(booked)
+            command.launch()
+        else:
+            began = clock.perf_counter()
+            command.launch()
+            booked.seconds += clock.perf_counter() - began
+        booked.launches += 1
+        booked.bytes += reached
+
+    def clear(self) -> None:
+        """Forget what was booked; commands are kept."""
+        self._pending.clear()
+        for booked in self._booked.values():
+            booked.launches, booked.seconds, booked.bytes = 0, 0.0, 0
+
+    def measure(self, work: Callable[[], object]) -> None:
+        """Call `work`, whose launches come here; on the GPU collect their times."""
+        if not self.device.is_cuda:
+            collects = gc.isenabled()
+            gc.disable()  # what the host tidies up meanwhile would be booked on a launch
+            try:
+                work()
+            finally:
+                if collects:
+                    gc.enable()
+            return
+        wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
+        try:
+            work()
+        finally:
+            results = wp.timing_end()
+        self.collect([r.elapsed for r in results])
+
+    def collect(self, elapsed_ms: list[float]) -> None:
+        """Book the times of the pending launches, in their order. ModelError where others were timed too."""
+        if len(elapsed_ms) != len(self._pending):
+            raise ModelError(
+                f"profile: {len(elapsed_ms)} kernels were timed and {len(self._pending)} launched; others run that "
+                "do not pass the Launcher"
+            )
+        for booked, ms in zip(self._pending, elapsed_ms):
+            booked.seconds += 1e-3 * ms
+        self._pending.clear()
+
+    def kernels(self, steps: int, empty: float) -> tuple[KernelTime, ...]:
+        """What was booked, per step, less `empty` seconds per launch; the longest first."""
+        rows = []
+        for (part, kernel), b in self._booked.items():
+            if b.launches:
+                ms = 1e3 * max(b.seconds - b.launches * empty, 0.0)
+                rows.append(KernelTime(part, kernel, b.launches / steps, ms / steps, b.bytes / steps))
+        return tuple(sorted(rows, key=lambda row: -row.ms))
+
+
+def _identity(value: Any) -> Any:
+    """What tells arguments of a launch apart."""
+    if isinstance(value, wp.array):
+        return value.ptr, value.shape, value.strides
+    return value if isinstance(value, (int, float)) else id(value)
+
+
+def launch_bytes(inputs: list[Any], members: set[str] | None = None) -> int:
+    """Bytes of the arrays among arguments and in their structs, each once; `members`: the only ones of structs."""
+    found: dict[int, int] = {}
+
+    def visit(value: Any) -> None:
+        if isinstance(value, wp.array):
+            if value.ptr:
+                count = int(np.prod([n for n, stride in zip(value.shape, value.strides) if stride], dtype=np.int64))
+                size = count * wp.types.type_size_in_bytes(value.dtype)
+                found[value.ptr] = max(found.get(value.ptr, 0), size)
+        elif hasattr(value, "_cls"):
+            for name in value._cls.vars:
+                if members is None or name in members:
+                    visit(getattr(value, name))
+
+    for value in inputs:
+        visit(value)
+    return sum(found.values())
+
+
+@functools.cache
+def _members(kernel: wp.Kernel) -> set[str] | None:
+    """Names of all members that a kernel and the functions it calls mention; None if that can't be told."""
+    names: set[str] = set()
+    seen: set[int] = set()
+    waiting = [kernel.adj]
+    try:
+        while waiting:
+            adjoint = waiting.pop()
+            if id(adjoint) in seen:
+                continue
+            seen.add(id(adjoint))
+            names |= {node.attr for node in ast.walk(adjoint.tree) if isinstance(node, ast.Attribute)}
+            for function in adjoint.get_references()[2]:
+                waiting += [f.adj for f in (function, *function.user_overloads.values()) if f.adj is not None]
+    except (AttributeError, TypeError):
+        return None
+    return names
+
+
+def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] | None = None) -> Profile:
+    """Profile the `steps` steps that follow a warm-up of two; the simulation is at their end then, as after `step`.
+
+    Args:
+        sim: a simulation that records its steps (capture=True).
+        steps: that are timed, as graphs and then again launch by launch.
+        on_step: called after each of the 2 steps + 3 that are done.
+
+    Raises:
+        ModelError: steps out of range, or a simulation whose steps are not recorded.
+        ConvergenceError, ConstraintError: a step failed.
+    """
+    if not (is_count(steps) and steps >= 1):
+        raise ModelError(f"profile: steps = {steps!r} must be a whole number, at least 1")
+    stepper = sim.stepper
+    if stepper.graph is None:
+        raise ModelError("profile: the simulation was made with capture=False, or with linear='direct'")
+
+    def do(count: int, run: Callable[[], object]) -> list[float]:
+        times = []
+        for _ in range(count):
+            began = clock.perf_counter()
+            run()
+            times.append(1e3 * (clock.perf_counter() - began))
+            if on_step is not None:
+                on_step()
+        return times
+
+    do(WARM_UP - 1, sim.step)
+    start = sim.state.numpy()
+    do(1, sim.step)
+    before = {name: total.sum() for name, total in sim.totals.items()}
+    step_ms = do(steps, sim.step)
+    per_step = {name: float(total.sum() - before[name]) / steps for name, total in sim.totals.items()}
+    recorder = Recorder(sim.model.device)
+    stepper.launch.recorder = recorder
+    try:
+        sim.state.load(start)
+        stepper.forget()
+        do(1, stepper.sequence)  # makes the commands, and what does not belong to the state
+        recorder.clear()
+        do(steps, lambda: recorder.measure(stepper.sequence))
+    finally:
+        stepper.launch.recorder = None
+    empty = _empty_launch(sim.model.device)
+    return Profile(
+        step_ms=tuple(step_ms),
+        kernels=recorder.kernels(steps, empty),
+        newton=per_step["newton"],
+        pcg=per_step["pcg"],
+        copy_GBps=copy_bandwidth(sim.model.device),
+        empty_launch_us=1e6 * empty,
+    )
+
+
+def _empty_launch(device: Any) -> float:
+    """Seconds that an empty launch takes by the recorder's means: the median of single ones."""
+    device = wp.get_device(device)
+    flags = wp.zeros(1, dtype=wp.int32, device=device)
+    command = wp.launch(probe_kernels().empty, dim=1, inputs=[flags], device=device, record_cmd=True)
+    command.launch()
+    if device.is_cuda:
+        wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
+        for _ in range(EMPTY_LAUNCHES):
+            wp.synchronize_device(device)  # small kernels that are launched one by one meet an idle device too
+            command.launch()
+        return 1e-3 * statistics.median(r.elapsed for r in wp.timing_end())
+    times = []
+    for _ in range(EMPTY_LAUNCHES):
+        began = clock.perf_counter()
+        command.launch()
+        times.append(clock.perf_counter() - began)
+    return statistics.median(times)
+
+
+def copy_bandwidth(device: Any) -> float:
+    """1e9 bytes per second, read and written, of a copy from one large array to another: the best of several."""
+    device = wp.get_device(device)
+    size = COPY_BYTES["cuda" if device.is_cuda else "cpu"]
+    if device.is_cuda:
+        size = min(size, device.free_memory // 4)
+    source, target = (wp.zeros(int(size), dtype=wp.uint8, device=device) for _ in range(2))
+    times = []
+    for _ in range(1 + COPIES):
+        if device.is_cuda:
+            first, last = (wp.Event(device, enable_timing=True) for _ in range(2))
+            device.stream.record_event(first)
+            wp.copy(target, source)
+            device.stream.record_event(last)
+            times.append(1e-3 * wp.get_event_elapsed_time(first, last))
+        else:
+            began = clock.perf_counter()
+            wp.copy(target, source)
+            times.append(clock.perf_counter() - began)
+    return 2e-9 * size / min(times[1:])

@@ -1,0 +1,141 @@
+"""All arrays that a step writes, allocated once when the simulation is made."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.common.lanes import WARP
+from ..kernels.common.reduce import CHUNK
+from ..kernels.common.structs import balance_struct
+from ..kernels.solvers.newton import COMPONENT_ROWS, LANES, control_struct
+from ..kernels.solvers.pcg import LANES as GROUP_LANES
+from ..kernels.solvers.pcg import pcg_struct
+from ..kernels.step.gather import RESIDUAL_ROWS
+from ..kernels.step.step import LEDGER_ROWS, REPORT, step_struct
+from ..kernels.terms.constraints import JOINT_COLUMNS, SUM_ROWS
+from .multipliers import allocate
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["Workspace"]
+
+
+class Workspace:
+    """Scratch of a simulation. Features that a scene does not use get an array of one item."""
+
+    def __init__(self, model: Model, *, max_newton: int, ledger: bool) -> None:
+        self.device = model.device
+        self.bytes: dict[str, int] = {}
+        B, n, vec3 = model.worlds, model.slots, model.types.vec3
+
+        def field(name: str) -> wp.array:
+            return self.array(name, (B, n), vec3)
+
+        # the iterate and what it is measured from
+        self.v, self.u, self.base = field("v"), field("u"), field("base")
+        self.q_tilde, self.v_tilde = field("q_tilde"), field("v_tilde")
+        # conjugate gradients
+        self.direction, self.r, self.z, self.p, self.Hp = (field(k) for k in ("direction", "r", "z", "p", "Hp"))
+        # the parts of the residual, and the diagonal of H
+        self.g, self.inertia, self.internal = field("g"), field("inertia"), field("internal")
+        # with constraints PCG solves for the gradient of the augmented potential
+        self.gradient = field("gradient") if model.constraints else self.g
+        self.dead, self.dead_magnitude = field("dead"), field("dead_magnitude")
+        self.diagonal = field("diagonal")
+        loads = model.loads
+        self.inverse = self.array("inverse", (B, n), model.types.mat33)
+        self.contribution = self.array("contribution", (B, model.contributions), vec3)
+        self.block_contribution = self.array("block_contribution", (B, model.contributions), model.types.sym)
+        none = self.array("none", (1, 1), vec3)
+        nonpotential = loads.nonpotential
+        self.nonpotential = field("nonpotential") if nonpotential else none
+        self.nonpotential_held = field("nonpotential_held") if nonpotential else none
+        self.nonpotential_contribution = (
+            self.array("nonpotential_contribution", (B, loads.nonpotential_entries), vec3) if nonpotential else none
+        )
+        turning = bool(loads.followers)
+        self.nonpotential_tangent = (
+            self.array("nonpotential_tangent", (B, loads.nonpotential_entries), vec3)
+            if turning
+            else self.nonpotential_contribution
+        )
+        forms = {b.key.damping for b in model.blocks}
+        self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
+        self.explicit = field("explicit") if "explicit" in forms else none
+        self.explicit_power = self.array(
+            "explicit_power", (B, model.element_count) if "explicit" in forms else (1, 1), wp.float64
+        )
+        self.explicit_work = self.array("explicit_work", (1, B), wp.float64)
+        # scratch for kernels whose sums are not wanted
+        self.spare_rows = self.array("spare_rows", (2, B, n) if model.constraints else (1, 1, 1), wp.float64)
+        # sums of the conjugate gradients come per warp
+        self.warp = WARP if model.device.is_cuda else 1
+        self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
+        self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
+        self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
+        longest = max(n, model.element_count, model.constraints.count if model.constraints else 0)
+        chunks = -(-longest // CHUNK) if longest > CHUNK else 1
+        self.partial = self.array("partial", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, chunks), wp.float64)
+        self.law_value = self.array("law_value", (B, max(loads.law_count, 1)), wp.vec3d)
+        self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
+        self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
+        self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
+        joints = len(model.constraints.joints) if model.constraints else 0
+        self.report = self.array(
+            "report", (B, len(REPORT) + 6 * len(model.probes) + JOINT_COLUMNS * joints), wp.float64
+        )
+        self.any_flag = self.array("any_flag", (5,), wp.int32)
+        C = model.component_count
+        sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
+        self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
+        self.multipliers: Any = allocate(model, self)
+        self.constraint_work = self.array("constraint_work", (2, B) if model.constraints else (1, 1), wp.float64)
+        optional = () if model.constraints else ("constraint_sums", "stepped", "outer", "open")
+        self.newton = self.struct(
+            control_struct(), B, skip=("violation", *optional),
+            history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
+            constraint_sums=(SUM_ROWS, B),
+        )  # fmt: skip
+        self.newton.components = C
+        if model.constraints:
+            self.newton.violation = self.multipliers.violation
+        self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
+        self.step = self.struct(step_struct(), B)
+        self.balance = balance_struct(model.dtype)()
+        for name in balance_struct(model.dtype).vars:
+            of_step = name in ("mass_factor", "dq_dv")
+            setattr(self.balance, name, getattr(self.step if of_step else self, name))
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """Zeroed array; its bytes are counted. ModelError where it is too large to be addressed."""
+        step = wp.types.type_size_in_bytes(dtype)
+        for k in range(len(shape) - 1, 0, -1):
+            step *= shape[k]
+            if shape[k - 1] > 1 and step >= 2**31:
+                raise ModelError(
+                    f"{name}: an array of {' x '.join(map(str, shape))} items has {step / 2**30:.1f} GiB between two "
+                    "neighbours, and at most 2 can be addressed: take fewer worlds, or smaller bodies"
+                )
+        out = wp.zeros(shape, dtype=dtype, device=self.device)
+        self.bytes[name] = int(np.prod(shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
+        return out
+
+    def struct(self, kind: Any, worlds: int, skip: tuple[str, ...] = (), **shapes: tuple[int, ...]) -> Any:
+        """A control struct with an array [world] for each array field, unless a shape is given."""
+        out = kind()
+        special = {
+            "elem_sums": (2, worlds),
+            "slope_sum": (1, worlds),
+            "follower_sum": (1, worlds),
+            "any_active": (1,),
+            "any_running": (1,),
+        } | shapes
+        for name, var in kind.vars.items():
+            if isinstance(var.type, wp.array) and name not in skip:
+                setattr(out, name, self.array(f"{kind.key}.{name}", special.get(name, (worlds,)), var.type.dtype))
+        return out
