@@ -26,12 +26,12 @@ def chain(
 ) -> wf.ModelBuilder:
     """A chain, hung from the ground, swings with a heavy weight at its end; each link is one 3243 beam element.
 
-    The links' hinges turn about y and across it by turns. A chain is a hard case for solvers: the pull of the weight
-    passes every joint.
+    Revolute hinges turn about y and about the direction across y and the chain, alternately. A chain is a hard case for
+    solvers: every joint carries the pull of the weight.
 
     Args:
-        links: their number.
-        joint: between the links.
+        links: number of links.
+        joint: kind of the joints between the links.
         mass_ratio: mass of the weight over that of a link.
         length: of a link, m.
         side: of a link's square section, m.
@@ -47,7 +47,7 @@ def chain(
     section = wf.Rectangle(side, side)
     material = wf.SVK(E=E, nu=nu, density=density)
     mass = mass_ratio * density * length * side**2
-    stretch = 9.81 * mass * math.cos(start) / (E * side**2)  # under the pull that the weight begins with
+    stretch = 9.81 * mass * math.cos(start) / (E * side**2)  # strain of a link under the pull of the weight at t = 0
 
     def stretched(X: np.ndarray) -> np.ndarray:
         way = X @ along

@@ -21,13 +21,13 @@ def double_pendulum(
 ) -> wf.ModelBuilder:
     """Two soft T10 links, hung one behind the other on hinges, are let go from the horizontal, and bend as they swing.
 
-    The links lie side by side along the axis of their hinge, y. A hinge takes hold of all nodes at the end of a link:
-    their mean place and turn count.
+    The links lie side by side along the axis of their hinge, y. A hinge acts on all nodes at the end of a link, by
+    their mean position and rotation.
 
     Args:
         length: of a link from hinge to hinge, m.
         width: of a link, along the hinges, m.
-        depth: of a link, along gravity, m; it reaches half of it beyond its hinges.
+        depth: of a link, along gravity, m; a link extends half of it beyond its hinges.
         cells: along a link; each is cut into six tetrahedra.
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.
@@ -36,7 +36,7 @@ def double_pendulum(
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     rubber = wf.SVK(E=E, nu=nu, density=density)
     size = (length + depth, width, depth)
-    hold = max(depth, 0.5 * size[0] / cells) + 1e-6 * length  # two layers of nodes at least tell how an end turns
+    hold = max(depth, 0.5 * size[0] / cells) + 1e-6 * length  # at least two layers of nodes: one alone has no rotation
 
     def link(name: str, low: np.ndarray) -> wf.Body:
         mesh = wf.mesh.box(size, cells=(cells, 1, 1), origin=low, name=name)

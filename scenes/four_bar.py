@@ -26,10 +26,11 @@ def four_bar(
     density: float = 1200.0,
     elements: int = 8,
 ) -> wf.ModelBuilder:
-    """A crank drives a rocker by a coupler that bends: four revolute joints, three beams of 3243.
+    """A crank drives a rocker through a coupler that bends: four revolute joints, three bars of 3243 beams.
 
-    The linkage lies in the plane x-z, at rest until the crank starts to turn about -y; it reaches its speed evenly.
-    It closes for any angle of the crank while the shortest and the longest bar together are shorter than the others.
+    The linkage lies in the plane x-z, at rest until the crank starts to turn about -y, with constant acceleration up to
+    its speed. It closes for any angle of the crank if the shortest and the longest bar (the ground counts) together are
+    shorter than the other two.
 
     Args:
         crank: its length, m.
@@ -38,7 +39,7 @@ def four_bar(
         ground: distance of the fixed pivots, m.
         side: of the coupler's square section, m; those of crank and rocker are 1.6 times as wide and high.
         speed: of the crank, rad/s.
-        ramp: time in which the crank reaches it, s.
+        ramp: time in which the crank reaches its speed, s.
         start: angle of the crank at t = 0, rad.
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.

@@ -24,15 +24,15 @@ def hook(
 
     The mesh (hook.msh, made from the hook.geo beside it) has 3119 T10 elements, straight and curved, and the groups
     "fixed", the top of the shank, and "pull", the saddle where the sling lies. The pull grows, is held, and is released
-    within 0.01 s; gravity acts all the time. All is seen in slow motion, 240 frames per second.
+    within 0.01 s; gravity acts all the time. The animation is in slow motion, at 240 frames per second of the motion.
 
     Args:
         pull: largest traction of the sling on its saddle (5.6e-4 m^2), Pa.
-        hold: when the sling is let go, s.
+        hold: time at which the sling is let go, s.
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.
         density: kg/m^3.
-        quadrature: force rule; tet8 is dearer, and the tip ends 0.1 percent elsewhere.
+        quadrature: force rule; tet8 costs more and moves the tip at the end by 0.1 percent.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     body = b.add_solid(MESH, material=wf.SVK(E=E, nu=nu, density=density), quadrature=quadrature)

@@ -1,4 +1,4 @@
-"""A plate on four rods, turned to and fro at its hub."""
+"""A plate on four rods, turned back and forth at its hub."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def hung_plate(
     density: float = 1000.0,
     eta: float = 1e3,
 ) -> wf.ModelBuilder:
-    """A square plate of 3443 shells hangs by its corners on four rods and is turned to and fro at its middle.
+    """A square plate of 3443 shells hangs by its corners on four rods and is turned back and forth at its middle.
 
     The rods are distance joints to the ground above the corners; they are not drawn. A driven revolute joint holds the
     hub at its height: as the plate turns, the rods slant and lift the corners. The hub is all nodes within its radius,
-    so that the joint feels how the plate turns there, and not how a single node shears.
+    so that the joint drives the rotation of the plate there, and not the shear of a single node.
 
     Args:
         size: length of the sides, m.

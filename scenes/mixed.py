@@ -22,8 +22,8 @@ def mixed(
 ) -> wf.ModelBuilder:
     """Five cantilevers of one size and material bend under gravity: beam 3243, shell 3443, ENMC, H3843 and T10.
 
-    All are bodies of one model, built in at x = 0 and let go at t = 0; their tips (a probe each) move together. At the
-    wall all is held but the gradient along the bar: that is its strain there, which the wall does not prescribe.
+    All are bodies of one model, built in at x = 0 and let go at t = 0; their tips (a probe each) move together. The
+    wall holds all slots but the gradient along the bar, which is the strain there and not for a wall to prescribe.
 
     Args:
         length: of the bars, m.

@@ -26,9 +26,9 @@ def rollup(
 ) -> wf.ModelBuilder:
     """A built-in beam of 3243 elements is rolled up by a moment at its end, turns x 2 pi E I / length; 1 is a circle.
 
-    The moment grows evenly during `duration` and is then held; damping keeps the motion near to equilibrium. The axis
-    of the moment is fixed in space, and beyond a quarter of a turn a beam under such a moment would buckle out of its
-    plane: here all nodes are held in the plane. With nu the locking of "full" is seen: the beam stays open.
+    The moment grows linearly during `duration` and is then held; damping keeps the motion near equilibrium. The axis of
+    the moment is fixed in space, and beyond a quarter of a turn a beam under such a moment would buckle out of its
+    plane: here all nodes are held in the plane. With nu > 0 integration "full" locks, and the beam stays open.
 
     Args:
         length: of the beam, m.

@@ -27,12 +27,12 @@ def spin(
     """A soft dumb-bell of ANCF tetrahedra spins about its middle axis of inertia, stretches and turns over.
 
     Rotation about the axis of the middle moment of inertia (y) is unstable: a slight tilt grows until the body turns
-    over, again and again (Dzhanibekov's nut, the tennis racket). Nothing holds the body and nothing pulls on it, so its
-    angular momentum stays.
+    over, again and again (Dzhanibekov's nut, the tennis racket). No force acts on the body from outside, so its
+    angular momentum is constant.
 
     Args:
         size: of the box around the body, m; the lengths must differ.
-        waist: width of the middle in parts of the width of the ends.
+        waist: width of the middle over the width of the ends.
         cells: along each direction; each is cut into six tetrahedra.
         element: ENMC, FN, FN18, or T10.
         rate: of the spin, rad/s.

@@ -6,7 +6,7 @@ import warp as wp
 
 import warpfea as wf
 
-LAW = wf.SVK(E=1e7, nu=0.3)
+LAW = wf.SVK(E=1e7, nu=0.3, density=1000.0)
 
 
 @wp.func
@@ -114,7 +114,8 @@ def test_the_worst_element_is_counted_by_body_and_not_by_energy_part():
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     beam = add_beam(b, (0, 5, 0), 1.0, 4)
     soft = b.add_solid(
-        wf.mesh.box((1, 0.4, 0.4), cells=(2, 1, 1), element="T4"), material=wf.NeoHookean.from_E_nu(E=1e6, nu=0.3)
+        wf.mesh.box((1, 0.4, 0.4), cells=(2, 1, 1), element="T4"),
+        material=wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0),
     )
     b.clamp(beam.start)
     b.clamp(soft.nodes("x-"))

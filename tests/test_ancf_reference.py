@@ -1,9 +1,8 @@
 """The ANCF elements against references made without warpfea: the committed numbers, and some of them live.
 
-tests/ancf_report.py makes tests/results/ancf_reference.json; what it takes minutes to compute is read from there.
+`warpfea study ancf` makes tests/results/ancf_reference.json; what it takes minutes to compute is read from there.
 """
 
-import importlib.util
 import itertools
 import json
 import pathlib
@@ -12,11 +11,9 @@ import numpy as np
 import pytest
 
 import warpfea as wf
+from warpfea.studies.reports import ancf as report
 
 HERE = pathlib.Path(__file__).resolve().parent
-spec = importlib.util.spec_from_file_location("ancf_report", HERE / "ancf_report.py")
-report = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(report)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +88,7 @@ def test_frequencies(parts):
         if r["integration"] == "tied":
             assert max(r["from_theory"]) < 0.01, r
         if r["integration"] == "full" or r["nu"] == 0.0:
-            # the third pair of bending modes of the beam lies 1.3 % off without the tied shear: see the table in README
+            # the third pair of bending modes of the beam lies 1.3 % off without the tied shear: see tests/README.md
             count = 5 if r["element"] == "3443" or r["integration"] == "tied" or r["nu"] == 0.3 else 4
             assert max(r["from_kinematic_limit"][:count]) < 0.01, r
 

@@ -129,7 +129,9 @@ def test_the_interface(hook_file, tmp_path, monkeypatch):
 
 def test_statics_and_worlds():
     b = wf.ModelBuilder()
-    box = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(4, 1, 1)), material=wf.SVK(E=1e6, nu=0.3), name="box")
+    box = b.add_solid(
+        wf.mesh.box((1, 0.2, 0.2), cells=(4, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1000.0), name="box"
+    )
     b.clamp(box.nodes("x-"))
     b.add_probe("tip", box.surface("x+"))
     static = wf.solve_static(b.finalize(device="cpu"), load_steps=10, tol=1e-10)

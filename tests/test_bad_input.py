@@ -6,7 +6,7 @@ import warp as wp
 
 import warpfea as wf
 
-LAW = wf.SVK(E=1e6, nu=0.3)
+LAW = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 MESH = wf.mesh.box((1, 0.5, 0.5), cells=(2, 1, 1))
 
 

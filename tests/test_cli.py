@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -210,6 +211,79 @@ def test_a_run_resumes_from_its_checkpoint_bit_for_bit(folder, capfd):
             assert rest[key] == whole[key], key
 
 
+def test_the_summary_tells_size_and_mass(folder, capfd):
+    code, out, _ = run(capfd, *SHORT, "--json", "a.json")
+    assert code == 0
+    (line,) = [line for line in out.splitlines() if line.startswith("size")]
+    summary = json.loads((folder / "a.json").read_text())
+    low, high = np.array(summary["bounding_box"])
+    assert line.split(None, 1)[1].startswith(" x ".join(f"{side:.4g}" for side in high - low) + " m, ")
+    assert f"{summary['mass']:.4g} kg" in line
+    assert summary["mass"] > 0
+    assert (summary["analysis"], summary["load"]) == ("dynamic", None)
+
+
+def test_a_mesh_in_mm_warns(folder, capfd):
+    words = ["info", "part.msh", "--material", "svk:E=2e11,nu=0.3,density=7850", "--clamp", "x-", "--device", "cpu"]
+    assert run(capfd, *words)[2] == ""
+    code, out, err = run(capfd, *words, "--scale", "1000")
+    assert code == 0
+    assert "weighs 3.14e+11 kg: is part.msh in metres; a mesh in mm needs scale=1e-3" in err
+    assert "1000 x 200 x 200 m" in out
+
+
+# statics
+
+STATIC = ["run", "part.msh", "--static", "--clamp", "x-", "--traction", "x+:0,0,-100", "--device", "cpu"]
+LIGHT = ["--material", "svk:E=1e7,nu=0.3", "--gravity", "0,0,0"]
+
+
+def test_statics_from_the_command_line(folder, capfd):
+    outputs = ["--png", "a.png", "--usd", "a.usdc", "--vtu", "series", "--gif", "a.gif", "--json", "a.json"]
+    code, out, err = run(capfd, *STATIC, *LIGHT, "--load-steps", "4", *outputs)
+    assert (code, err) == (0, "")
+    for words in ("done, static, at 100 % of the load, 4 load steps", "no density", "probe x+", "a.png"):
+        assert words in out
+    summary = json.loads((folder / "a.json").read_text())
+    assert tuple(summary) == KEYS
+    assert (summary["analysis"], summary["load"], summary["steps"], summary["status"]) == ("static", 1.0, 4, "done")
+    assert summary["dt"] is summary["t_end"] is summary["mass"] is None
+    assert set(summary["energies"]) == {"strain"}
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = b.add_solid("part.msh", material=wf.SVK(E=1e7, nu=0.3))
+    b.clamp(body.nodes("x-"))
+    b.add_traction(body.surface("x+"), (0, 0, -100))
+    b.add_probe("x+", body.surface("x+"))
+    static = wf.solve_static(b.finalize(device="cpu"), load_steps=4)
+    np.testing.assert_array_equal(summary["probes"]["x+"]["displacement"], static.probe("x+").displacement[0, -1])
+    assert summary["energies"]["strain"] > 0
+    assert validate_usd("a.usdc") == []
+    assert (folder / "series" / "series.pvd").read_text().count("<DataSet") == 5
+    code, _, _ = run(capfd, "render", "a.usdc", "-o", "b.png")
+    assert code == 0
+
+
+def test_statics_of_a_scene_has_ten_load_steps(folder, capfd):
+    code, out, _ = run(capfd, "run", "mine.py:good", "--static", "--device", "cpu", "--json", "-")
+    assert code == 0
+    assert json.loads(out)["steps"] == 10
+
+
+def test_statics_that_fails_exits_3(folder, capfd):
+    code, out, err = run(capfd, "run", "mine.py:bursts", "--static", "--device", "cpu", "--json", "a.json")
+    assert code == 3
+    assert err.startswith("warpfea: error: load step from ")
+    assert "not converged, static" in out
+    assert json.loads((folder / "a.json").read_text())["load"] < 1.0
+
+
+def test_density_is_asked_for_where_it_counts(folder, capfd):
+    for words in (["run", *STATIC[1:2], *STATIC[3:], *LIGHT], [*STATIC, *LIGHT[:2]]):
+        code, _, err = run(capfd, *words)
+        assert code == 2
+        assert "'part': the material SVK has no density" in err
+
+
 # other commands
 
 
@@ -249,6 +323,91 @@ def test_info_tells_features_and_costs(folder, capfd):
     assert "gravity" in info["features"]
     assert any(k.endswith("matrix_product") for k in info["kernels"])
     assert info["bytes_per_unknown"] > 100
+
+
+def test_info_shows_the_groups_of_a_mesh_without_a_material(folder, capfd):
+    code, out, err = run(capfd, "info", "part.msh")
+    assert (code, err) == (0, "")
+    for words in (
+        "12 tetra10",
+        "1 x 0.2 x 0.2 m, volume 0.04 m^3",
+        "body (12 elements)",
+        "x- (2 faces)",
+        "x- (9 nodes)",
+    ):
+        assert words in out
+    code, out, _ = run(capfd, "info", "part.msh", "--scale", "1e-3", "--json", "-")
+    assert code == 0
+    mesh = json.loads(out)["mesh"]
+    assert mesh["element_groups"] == {"body": 12}
+    assert mesh["surface_groups"]["x-"] == 2
+    assert mesh["node_groups"]["x-"] == 9
+    np.testing.assert_allclose(mesh["bounding_box"], [[0, 0, 0], [1e-3, 2e-4, 2e-4]], atol=1e-18)
+    code, out, _ = run(capfd, "info", "part.msh", "--material", SVK, "--clamp", "x-", "--device", "cpu")
+    assert code == 0
+    for words in ("x- (2 faces)", "launches", "40 kg"):
+        assert words in out
+
+
+def test_info_of_surface_groups_only_and_of_a_shell(folder, capfd):
+    writers = load_writers()
+    box = wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1))
+    parts = writers.Parts.of(box)
+    writers.write(parts, folder / "part.msh", "msh22")
+    text = (folder / "part.msh").read_text()
+    assert '"body"' in text
+    lines = text.splitlines()
+    tag = next(line.split()[1] for line in lines if line.endswith('"body"'))
+    bare = [line for line in lines if not line.endswith('"body"')]
+    for k, line in enumerate(bare):  # tetrahedra without a tag
+        words = line.split()
+        if len(words) > 10 and words[1] == "11" and words[3] == tag:
+            bare[k] = " ".join([*words[:3], "0", *words[4:]])
+    start = bare.index("$PhysicalNames")
+    bare[start + 1] = str(int(bare[start + 1]) - 1)
+    (folder / "bare.msh").write_text("\n".join(bare) + "\n")
+    code, out, _ = run(capfd, "info", "bare.msh")
+    assert code == 0
+    assert "element groups  none" in out
+    assert "x- (2 faces)" in out
+    code, _, err = run(capfd, "run", "bare.msh", "--clamp", "x-")
+    assert code == 2
+    assert "element groups found: none (its surface groups: x-" in err
+    assert "Physical Volume" in err
+    code, _, err = run(capfd, "run", "bare.msh", "--material", f"body={SVK}")
+    assert code == 2
+    assert "the volume has no group" in err
+
+
+def test_pictures_take_field_view_and_range(folder, capfd, monkeypatch):
+    from warpfea.outputs import reel
+
+    shown = []
+    label = reel.label
+
+    def note(image, time, bar):
+        shown.append(bar)
+        return label(image, time, bar)
+
+    monkeypatch.setattr(reel, "label", note)
+    look = ["--field", "displacement", "--range", "-1e-3,2e-3", "--view", "-60,10", "--quiet"]
+    assert run(capfd, *SHORT, "--png", "a.png", "--gif", "a.gif", "--usd", "a.usdc", *look)[0] == 0
+    assert {(bar[0], bar[1], bar[2]) for bar in shown} == {(-1e-3, 2e-3, "displacement")}
+    shown.clear()
+    render = ["render", "a.usdc", "-o", "b.png", "--quiet"]
+    assert run(capfd, *render)[0] == 0
+    assert shown[-1][:3] == (-1e-3, 2e-3, "displacement")
+    assert run(capfd, *render, "--field", "von_mises", "--range", "0,5")[0] == 0
+    assert shown[-1][:3] == (0.0, 5.0, "von Mises stress")
+    assert run(capfd, *render, "--field", "none")[0] == 0
+    assert shown[-1] is None
+    assert run(capfd, *SHORT, "--png", "c.png", "--field", "none", "--quiet")[0] == 0
+    assert shown[-1] is None
+    first, second = ((folder / name).read_bytes() for name in ("a.png", "b.png"))
+    assert first != second
+    code, _, err = run(capfd, *render, "--field", "vonmises")
+    assert code == 4
+    assert "did you mean 'von_mises'" in err
 
 
 def test_render_draws_a_usd_file(folder, capfd):
@@ -292,7 +451,7 @@ def test_the_bar_of_the_compilation_goes_to_stderr(capfd):
     wf.Simulation(model, dt=1e-3, on_compile=lambda *news: ready.append(news))
     done, total, names = zip(*ready)
     assert done == tuple(range(1, total[0] + 1))
-    assert "warpfea.kernels.common.reduce" in names
+    assert "warpfea.kernels.reduce" in names
     capfd.readouterr()
     with compile_bar(True) as update:
         for news in ready:
@@ -328,6 +487,26 @@ BAD = {
     "unknown command": (["fly"], ["fly"]),
     "no scene": (["run"], ["SCENE"]),
     "unknown option": ([*SHORT, "--colour", "red"], ["--colour"]),
+    "misspelt option": ([*SHORT, "--chekpoint", "o.npz"], ["--chekpoint", "did you mean '--checkpoint'"]),
+    "misspelt command": (["rnu", "hook"], ["'rnu'", "did you mean 'run'"]),
+    "misspelt scene": (["run", "cantilver", *OUT], ["did you mean 'cantilever'"]),
+    "misspelt scene in file": (["run", "mine.py:goood", *OUT], ["did you mean 'good'"]),
+    "misspelt parameter": ([*SHORT, "--set", "lenght=1", *OUT], ["did you mean 'length'"]),
+    "misspelt field": ([*SHORT, "--png", "o.png", "--field", "von_misses"], ["did you mean 'von_mises'"]),
+    "misspelt law": ([*MESH, "--material", "neohookean:mu=1,k=1,density=1", *OUT], ["did you mean 'neo_hookean'"]),
+    "misspelt constant": ([*MESH, "--material", "svk:E=1e7,nu=0.3,densty=1", *OUT], ["did you mean 'density'"]),
+    "surface without volume": (["run", "bracket.stl", *OUT], ["bracket.stl", ".msh (Gmsh", ".vtu", ".inp", "Gmsh for"]),
+    "shape without mesh": (["info", "bracket.step"], [".step", ".msh"]),
+    "unknown format": (["run", "part.nas", *OUT], ["part.nas: .nas is not a format", ".msh"]),
+    "info of a missing mesh": (["info", "none.msh"], ["none.msh"]),
+    "load steps of a motion": ([*SHORT, "--load-steps", "3"], ["--load-steps is for --static"]),
+    "static with dt": (["run", "cantilever", "--static", "--dt", "1e-3"], ["--dt is for a motion"]),
+    "static with a checkpoint": (["run", "cantilever", "--static", "--checkpoint", "o.npz"], ["--checkpoint is for"]),
+    "static with jacobi": (["run", "cantilever", "--static", "--solver", "jacobi"], ["--solver jacobi"]),
+    "static of what falls": (["run", "part.msh", "--static", "--material", SVK, "--device", "cpu"], ["not supported"]),
+    "field without picture": ([*SHORT, "--field", "displacement"], ["--field is for pictures"]),
+    "view without picture": ([*SHORT, "--usd", "o.usdc", "--view", "1,2"], ["--view is for pictures"]),
+    "range that falls": ([*SHORT, "--png", "o.png", "--range", "2,1"], ["--range", "'2,1'"]),
     "abbreviated option": (["run", "hook", "--devic", "cpu"], ["--devic"]),
     "unknown scene": (["run", "crane", *OUT], ["'crane'", "cantilever", "hook", "twist"]),
     "missing file": (["run", "none.py", *OUT], ["none.py", "no such file"]),
@@ -381,7 +560,7 @@ BAD = {
     "render a wrong size": (["render", "bad.usdc", "-o", "o.png", "--size", "big"], ["--size", "'big'"]),
     "bench too small": (["bench", "--unknowns", "10"], ["--unknowns 10", "270"]),
     "bench text": (["bench", "--unknowns", "many"], ["--unknowns", "'many'"]),
-    "later command": (["study", "hook"], ["study", "not part of this version"]),
+    "no such study": (["study", "hook"], ["'hook'", "ancf-tets"]),
     "later command with options": (["sweep", "--set", "E=1"], ["sweep", "not part of this version"]),
 }
 
@@ -476,6 +655,92 @@ def test_ctrl_c_exits_130_with_valid_files(folder, capfd, monkeypatch):
     code, out, _ = run(capfd, *SHORT, "--resume", "o.npz", "--json", "-")
     assert (code, json.loads(out)["steps"]) == (0, 5)
     assert not [name for name in os.listdir(folder) if ".part" in name]
+
+
+@pytest.mark.parametrize("when", ["step", "close"])
+def test_ctrl_c_after_the_last_step_is_too_late_to_interrupt(folder, capfd, monkeypatch, when):
+    if when == "step":
+        step = wf.Simulation.step
+
+        def interrupted(self, count=1):
+            if self.steps == 4:
+                signal.raise_signal(signal.SIGINT)
+            return step(self, count)
+
+        monkeypatch.setattr(wf.Simulation, "step", interrupted)
+    else:
+        close = wf.USDWriter.close
+
+        def closed(self, sim):
+            signal.raise_signal(signal.SIGINT)
+            close(self, sim)
+
+        monkeypatch.setattr(wf.USDWriter, "close", closed)
+    code, out, err = run(capfd, *SHORT, *OUT)
+    assert (code, err) == (0, "")
+    assert "done at t = 0.01 s, 5 steps" in out
+    assert json.loads((folder / "o.json").read_text())["status"] == "done"
+    assert validate_usd("o.usdc") == []
+
+
+def test_ctrl_c_during_the_report_does_not_take_it_away(folder, capfd, monkeypatch):
+    from warpfea.cli import run as command
+
+    human = command.human
+
+    def late(*args):
+        signal.raise_signal(signal.SIGINT)
+        return human(*args)
+
+    monkeypatch.setattr(command, "human", late)
+    code, out, err = run(capfd, *SHORT)
+    assert (code, err) == (0, "")
+    assert "done at t = 0.01 s" in out
+
+
+def test_a_resumed_run_goes_on_with_its_animation(folder, capfd):
+    words = [*SHORT[:-2], "--quiet", "--fps", "500", "--vtu", "series"]
+    assert run(capfd, *words, "--t-end", "0.012", "--usd", "whole.usdc")[0] == 0
+    whole = (folder / "series" / "series.pvd").read_text()
+    shutil.rmtree(folder / "series")
+    assert run(capfd, *words, "--t-end", "0.006", "--usd", "o.usdc", "--checkpoint", "c.npz")[0] == 0
+    rest = [*words, "--t-end", "0.012", "--resume", "c.npz"]
+    assert run(capfd, *rest, "--usd", "o.usdc")[0] == 0
+    assert validate_usd("o.usdc") == []
+    from pxr import Usd
+
+    for name in ("whole.usdc", "o.usdc"):
+        stage = Usd.Stage.Open(name)
+        assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 6.0)
+        assert stage.GetDefaultPrim().GetCustomDataByKey("warpfea")["frames"] == 7
+    assert (folder / "series" / "series.pvd").read_text() == whole
+    # the file goes beyond the checkpoint now
+    before = (folder / "o.usdc").read_bytes()
+    code, _, err = run(capfd, *rest, "--usd", "o.usdc")
+    assert code == 4
+    assert "o.usdc: can't go on with this file" in err
+    assert (folder / "o.usdc").read_bytes() == before
+
+
+def test_a_gif_is_not_overwritten_by_its_second_half(folder, capfd):
+    assert run(capfd, *SHORT, "--checkpoint", "c.npz", "--quiet", "--gif", "o.gif")[0] == 0
+    before = (folder / "o.gif").read_bytes()
+    rest = [*SHORT[:-1], "0.014", "--resume", "c.npz", "--quiet"]
+    code, _, err = run(capfd, *rest, "--gif", "o.gif")
+    assert code == 2
+    assert "o.gif" in err
+    assert "another name" in err
+    assert (folder / "o.gif").read_bytes() == before
+    assert run(capfd, *rest, "--gif", "rest.gif")[0] == 0
+
+
+@pytest.mark.skipif(not pathlib.Path("/proc").is_dir(), reason="no folder that takes no files")
+def test_a_folder_that_takes_no_files_is_named(folder, capfd, monkeypatch):
+    monkeypatch.setattr(wf.Simulation, "__init__", lambda *_, **__: pytest.fail("a simulation was made"))
+    code, out, err = run(capfd, *SHORT, "--usd", "/proc/o.usdc")
+    assert (code, out) == (4, "")
+    assert err.startswith("warpfea: error: /proc/o.usdc: the folder /proc ")
+    assert "pxr" not in err
 
 
 def test_resuming_a_finished_run_is_refused(folder, capfd):

@@ -7,7 +7,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation as Turn
 
 import warpfea as wf
+from warpfea.model import assembly
 from warpfea.model.assembly import rigid_modes
+from warpfea.simulation.checkpoint import save_checkpoint
 
 LAW = wf.SVK(E=1e7, nu=0.3, density=1000.0)
 ANCHOR = np.array([1.0, 0.05, 0.1])
@@ -347,7 +349,7 @@ def test_multipliers_survive_a_checkpoint(tmp_path):
     model, joint = joined("revolute", ("ground", "beam"), ([0, 1], [0, 1.0]), axis=(0, 1, 0))
     sim = wf.Simulation(model, dt=0.01)
     sim.step(5)
-    wf.checkpoint.save_checkpoint(sim, tmp_path / "c.npz")
+    save_checkpoint(sim, tmp_path / "c.npz")
     sim.step(5)
     other = wf.Simulation(model, model.state(), dt=0.01)
     other.resume(tmp_path / "c.npz")
@@ -546,7 +548,7 @@ def test_single_constraints_match_their_definition_and_differences(case, sort):
             return np.array(point, dtype=float)
         if isinstance(point, wf.MaterialPoint):
             return point.weights @ (x + u)[point.body.slots[point.slots]]
-        slots, weights = wf.assembly.surface_weights(point)
+        slots, weights = assembly.surface_weights(point)
         return weights @ (x + u)[point.body.slots[slots]] / weights.sum()
 
     P = [place(point) for point in points]

@@ -1,6 +1,5 @@
 """CUDA against the CPU: run where there is a device, read from the committed result everywhere."""
 
-import importlib.util
 import json
 import pathlib
 
@@ -8,11 +7,9 @@ import numpy as np
 import pytest
 
 import warpfea as wf
+from warpfea.studies.reports import devices as report
 
 HERE = pathlib.Path(__file__).resolve().parent
-spec = importlib.util.spec_from_file_location("device_report", HERE / "device_report.py")
-report = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(report)
 
 BOUND = {"float64": 1e-10, "float32": 1e-4}
 
@@ -40,8 +37,8 @@ def test_cuda_equals_cpu(case):
 
 @pytest.mark.cuda
 def test_cuda_worlds_equal_their_own_run():
-    one = report.run("S3 svk damped incremental", "cuda:0", steps=20)[3].state.numpy()
-    many = report.run("S3 svk damped incremental", "cuda:0", steps=20, worlds=5)[3].state.numpy()
+    one = report.simulate("S3 svk damped incremental", "cuda:0", steps=20)[3].state.numpy()
+    many = report.simulate("S3 svk damped incremental", "cuda:0", steps=20, worlds=5)[3].state.numpy()
     for name, values in many.items():
         for world in range(5):
             assert values[world].tobytes() == one[name][0].tobytes(), (name, world)
@@ -49,14 +46,14 @@ def test_cuda_worlds_equal_their_own_run():
 
 @pytest.mark.cuda
 def test_cuda_repeats_bit_for_bit():
-    first, second = (report.run("curved rod, all loads", "cuda:0", steps=10)[0] for _ in range(2))
+    first, second = (report.simulate("curved rod, all loads", "cuda:0", steps=10)[0] for _ in range(2))
     assert first.tobytes() == second.tobytes()
 
 
 @pytest.mark.cuda
 def test_cuda_refuses_and_keeps_the_state():
     b = wf.ModelBuilder(gravity=(0, 0, 0))
-    law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3)
+    law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
     body = b.add_solid(wf.mesh.box((1, 0.4, 0.4), cells=(4, 2, 2)), material=law)
     b.clamp(body.nodes("x-"))
     b.set_initial(body, velocity=(-300.0, 0, 0))
@@ -94,8 +91,8 @@ def test_float32_agrees_with_float64(shift):
     mesh = report.s3_mesh().transformed(transform=(np.eye(3), (shift, -shift, shift)))
     report.CASES["moved"] = lambda: report.cantilever(mesh=mesh)
     try:
-        exact = report.run("moved", "cpu", steps=500, tol=1e-9)[0]
-        single = report.run("moved", "cpu", "float32", steps=500)[0]
+        exact = report.simulate("moved", "cpu", steps=500, tol=1e-9)[0]
+        single = report.simulate("moved", "cpu", "float32", steps=500)[0]
     finally:
         del report.CASES["moved"]
     assert np.abs(single - exact).max() < 1e-4 * np.abs(exact).max()
@@ -107,7 +104,7 @@ def test_float32_statics_agree(data, shift):
     tips = []
     for dtype in ("float64", "float32"):
         b = wf.ModelBuilder(gravity=(0, 0, 0))
-        body = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3))
+        body = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000.0))
         b.clamp(body.nodes(lambda X: X[:, 0] < shift + 1e-6))
         end = body.surface(lambda X: X[:, 0] > shift + 1 - 1e-6)
         b.add_traction(end, (0, 0, -1050.0))

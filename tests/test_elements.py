@@ -13,7 +13,7 @@ import pytest
 import warpfea as wf
 from warpfea import elements
 from warpfea.elements import quadrature
-from warpfea.model.model import assembly
+from warpfea.model import assembly
 
 RHO = 7.0
 LAWS = {

@@ -1,4 +1,4 @@
-"""The committed tables of tests/joint_report.py: cost with m joints on both devices, stability of extreme cases."""
+"""The committed tables of `warpfea study joints`: cost with m joints on both devices, stability of extreme cases."""
 
 import json
 import pathlib

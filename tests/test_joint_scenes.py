@@ -1,14 +1,11 @@
-"""Scenes of mechanisms: they build, run and hold their joints; the command line tells of joints; README's code."""
+"""Scenes of mechanisms: they build, run and hold their joints; the command line tells of joints."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import pathlib
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -219,26 +216,3 @@ def test_constraints_that_conflict_exit_3_and_are_named(capfd, tmp_path):
     assert "rod B" in err
     assert "joint rod A" in out
     assert json.loads((tmp_path / "s.json").read_text())["status"] == "not converged"
-
-
-# README
-
-
-def readme_code():
-    """Python blocks of the section on joints."""
-    section = (ROOT / "README.md").read_text().split("\n## Joints and constraints\n")[1].split("\n## ")[0]
-    return re.findall(r"```python\n(.*?)```", section, re.DOTALL)
-
-
-def test_readme_shows_how_joints_are_made_and_read():
-    text = "\n".join(readme_code())
-    for name in ("add_joint", "drive", "GROUND", "joint_force", "joint_record", "joint_value", "violation", "weld"):
-        assert name in text, name
-
-
-@pytest.mark.parametrize("code", readme_code(), ids=lambda code: str(len(code)))
-def test_readme_code_runs(code, tmp_path):
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
-    (tmp_path / "example.py").write_text(code)
-    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, env=env, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr

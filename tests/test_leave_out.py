@@ -42,7 +42,7 @@ def cost(feature=None, **simulation):
         other = b.add_solid(mesh, material=law, name="other")
         b.clamp(other.nodes("x-"))
     if feature == "second law":
-        other = b.add_solid(mesh, material=wf.NeoHookean(mu=1e6, k=1e6), name="other")
+        other = b.add_solid(mesh, material=wf.NeoHookean(mu=1e6, k=1e6, density=1000.0), name="other")
         b.clamp(other.nodes("x-"))
     model = b.finalize(device="cpu")
     sim = wf.Simulation(model, dt=1e-3, **simulation)
@@ -97,7 +97,7 @@ def test_bare_step_uses_few_modules():
 
 def test_table_path_only_where_elements_are_curved():
     b = wf.ModelBuilder()
-    b.add_solid(wf.mesh.sphere(1.0, cells=4), material=wf.SVK(E=1e6, nu=0.3))
+    b.add_solid(wf.mesh.sphere(1.0, cells=4), material=wf.SVK(E=1e6, nu=0.3, density=1000.0))
     kinds = {block["affine"] for block in b.finalize(device="cpu").info()["blocks"]}
     assert kinds == {True, False}
     assert np.isfinite(b.finalize(device="cpu").info()["mass"])

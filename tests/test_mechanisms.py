@@ -1,9 +1,8 @@
 """Joints against mechanisms computed without warpfea: the committed numbers, and small versions of them live.
 
-tests/mechanism_report.py makes tests/results/mechanisms.json; what it takes minutes to compute is read from there.
+`warpfea study mechanisms` makes tests/results/mechanisms.json; what it takes minutes to compute is read from there.
 """
 
-import importlib.util
 import itertools
 import json
 import pathlib
@@ -11,11 +10,9 @@ import pathlib
 import pytest
 
 import warpfea as wf
+from warpfea.studies.reports import mechanisms as report
 
 HERE = pathlib.Path(__file__).resolve().parent
-spec = importlib.util.spec_from_file_location("mechanism_report", HERE / "mechanism_report.py")
-report = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(report)
 
 
 @pytest.fixture(scope="module")
@@ -232,6 +229,6 @@ def test_free_fall_live():
 @pytest.mark.parametrize("penalty", [100.0, 1e4])
 def test_classical_multipliers_of_a_stiff_pair(penalty):
     """A pair at E = 2 GPa that falls without any force in it, with the classical augmented Lagrangian."""
-    row = report._plain("cpu", 2e9, "revolute", "T10", "backward_euler", {"multipliers": "outer", "penalty": penalty})
+    row = report.fall_of_a_pair("cpu", 2e9, "revolute", "T10", "backward_euler", report.OUTER | {"penalty": penalty})
     assert row["converged"], row["why"]
     assert row["error"] < 1e-10

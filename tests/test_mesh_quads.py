@@ -364,7 +364,7 @@ BAD = {
         lambda: _changed(brick(), cells=[brick().cells[0], brick().cells[1, [4, 5, 6, 7, 0, 1, 2, 3]]]),
         r"part: element 1 is inverted: smallest det J0 = -3 m\^3, volume -3 m\^3 \(1 such element, first: 1\)",
     ),
-    "hex corner": (  # volume positive, one corner nonpotential through
+    "hex corner": (  # volume positive, one corner pushed through
         lambda: _changed(ONE, move={7: (0.3, 0.3, 0.3)}),
         r"0 is inverted at a corner, centre or quadrature point \(too distorted\): smallest det J0 = -1\.1 m\^3, "
         r"volume 0\.475 m\^3",

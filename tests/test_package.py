@@ -1,4 +1,7 @@
-"""Packaging: the folders of the top level install as sub-packages, from a wheel, in place, and from a clone."""
+"""Packaging: the folders of the top level install as sub-packages, from a wheel, in place, and from a clone.
+
+The floors of the house: imports only go down, and the CUDA tests need neither meshio nor usd-core.
+"""
 
 import ast
 import importlib.metadata
@@ -6,6 +9,7 @@ import importlib.util
 import os
 import pathlib
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -15,6 +19,8 @@ import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CLEAN = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
+"""The environment, in which Python finds what is installed and nothing else."""
 
 
 def python(code, cwd):
@@ -26,11 +32,21 @@ def python(code, cwd):
 
 
 def test_packages_lists_every_folder():
-    listed = set(PROJECT["tool"]["setuptools"]["packages"])
-    found = {"warpfea.kernels", "warpfea.scenes"}
-    for init in (ROOT / "warpfea").rglob("__init__.py"):
-        found.add(".".join(init.parent.relative_to(ROOT).parts))
-    assert listed == found
+    listed = PROJECT["tool"]["setuptools"]["packages"]
+    assert len(listed) == len(set(listed))
+    found = set()
+    for name, folder in PROJECT["tool"]["setuptools"]["package-dir"].items():
+        for init in (ROOT / folder).rglob("__init__.py"):
+            found.add(".".join([name, *init.parent.relative_to(ROOT / folder).parts]))
+    assert {"warpfea.kernels.common", "warpfea.scenes", "warpfea.studies.bench"} < found
+    assert set(listed) == found
+
+
+def test_every_folder_with_modules_is_a_package():
+    """A folder without __init__.py would work here and be missing from a wheel."""
+    for folder in PROJECT["tool"]["setuptools"]["package-dir"].values():
+        for module in (ROOT / folder).rglob("*.py"):
+            assert (module.parent / "__init__.py").is_file(), module
 
 
 def test_an_unrelated_kernels_package_is_left_alone(tmp_path):
@@ -65,16 +81,27 @@ def test_nothing_else_of_the_checkout_is_importable():
             __import__(f"warpfea.{name}")
 
 
+def copy_sources(target):
+    """What a wheel is made of, without what earlier builds left behind."""
+    target.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, target)
+    for name in ("warpfea", "kernels", "scenes"):
+        shutil.copytree(ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return target
+
+
 def test_wheel_runs_a_scene_from_another_folder(tmp_path):
     wheels = tmp_path / "wheels"
-    build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", str(wheels), str(ROOT)]
-    subprocess.run(build, check=True, capture_output=True)
+    sources = copy_sources(tmp_path / "sources")
+    build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", str(wheels), str(sources)]
+    subprocess.run(build, check=True, capture_output=True, env=CLEAN)
     (wheel,) = wheels.glob("*.whl")
     # an empty environment; only the dependencies are borrowed from this one, and its own warpfea is not
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True, env=CLEAN)
     inside = tmp_path / "venv" / "bin" / "python"
     install = [sys.executable, "-m", "pip", "--python", str(inside), "install", "-q", "--no-deps", str(wheel)]
-    subprocess.run(install, check=True, capture_output=True)
+    subprocess.run(install, check=True, capture_output=True, env=CLEAN)
     (site,) = (tmp_path / "venv").glob("lib/python3*/site-packages")
     assert {p.name for p in site.iterdir() if not p.name.endswith(".dist-info")} == {"warpfea"}
     (site / "borrowed.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
@@ -85,19 +112,25 @@ def test_wheel_runs_a_scene_from_another_folder(tmp_path):
         "from warpfea.cli import main;"
         "sys.exit(main(['run', 'cantilever', '--t-end', '0.01', '--set', 'cells=2', '--json', 'out.json']))"
     )
-    out = subprocess.run([str(inside), "-c", code], cwd=elsewhere, capture_output=True, text=True, check=False)
+    call = [str(inside), "-c", code]
+    out = subprocess.run(call, cwd=elsewhere, capture_output=True, text=True, check=False, env=CLEAN)
     assert out.returncode == 0, out.stderr
     assert (elsewhere / "out.json").exists()
 
 
-KERNEL_FILES = sorted((ROOT / "kernels").glob("*.py"))
+KERNELS = ROOT / "kernels"
+KERNEL_FILES = sorted(KERNELS.rglob("*.py"))
 
 
-@pytest.mark.parametrize("path", KERNEL_FILES, ids=[p.stem for p in KERNEL_FILES])
+def name_of(path):
+    return str(path.relative_to(KERNELS))
+
+
+@pytest.mark.parametrize("path", KERNEL_FILES, ids=name_of)
 def test_kernels_import_nothing_from_the_host_side(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
-            assert node.level <= 1, ast.unparse(node)
+            assert node.level <= len(path.relative_to(KERNELS).parts), ast.unparse(node)
             if node.level == 0:
                 assert node.module.split(".")[0] in ("warp", "collections", "typing"), ast.unparse(node)
         if isinstance(node, ast.Import):
@@ -119,7 +152,7 @@ def literal_floats(function):
             yield node, isinstance(parent, ast.Call)
 
 
-@pytest.mark.parametrize("path", [p for p in KERNEL_FILES if p.stem != "raycast"], ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", [p for p in KERNEL_FILES if p.stem != "raycast"], ids=name_of)
 def test_no_bare_float_literals_in_device_code(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef) and any("wp." in ast.unparse(d) for d in node.decorator_list):
@@ -127,7 +160,7 @@ def test_no_bare_float_literals_in_device_code(path):
                 assert wrapped, f"{path.name}:{literal.lineno} {node.name}: wrap {literal.value} in the scalar type"
 
 
-@pytest.mark.parametrize("path", [p for p in KERNEL_FILES if p.stem != "raycast"], ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", [p for p in KERNEL_FILES if p.stem != "raycast"], ids=name_of)
 def test_kernels_are_short_and_say_what_they_do(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef) and any("kernel" in ast.unparse(d) for d in node.decorator_list):
@@ -135,7 +168,71 @@ def test_kernels_are_short_and_say_what_they_do(path):
             assert node.end_lineno - node.lineno < 80, node.name
 
 
+def _of_folders(suffix):
+    """Files of all folders of the project but its tests' data and results."""
+    for folder in ("warpfea", "kernels", "scenes"):
+        yield from (ROOT / folder).rglob(f"*.{suffix}")
+    yield from (ROOT / "tests").glob(f"*.{suffix}")
+
+
 def test_text_speaks_of_the_project_alone():
     words = re.compile("|".join(["/wo" + "rk/", "/ro" + "ot/", "pypi" + r"\.org", "closing " + "note"]))
-    for path in [*ROOT.glob("*.md"), *(ROOT / "warpfea").rglob("*.py"), *KERNEL_FILES, *(ROOT / "scenes").glob("*.py")]:
+    for path in [p for suffix in ("md", "py", "toml") for p in (*ROOT.glob(f"*.{suffix}"), *_of_folders(suffix))]:
         assert not words.search(path.read_text()), path
+
+
+# floors
+
+
+def test_no_import_is_excused():
+    """Imports for type checking count too, and none is ignored."""
+    linter = PROJECT["tool"]["importlinter"]
+    assert "exclude_type_checking_imports" not in linter
+    for contract in linter["contracts"]:
+        assert not {"ignore_imports", "unmatched_ignore_imports_alerting"} & set(contract), contract["name"]
+    layers = next(c for c in linter["contracts"] if c.get("containers") == ["warpfea"])
+    assert layers["exhaustive"]
+
+
+def test_imports_only_go_down(tmp_path):
+    """import-linter on a copy with kernels and scenes where they are installed; `.ci/run` does it on the package."""
+    pytest.importorskip("importlinter")
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    for name, folder in sorted(PROJECT["tool"]["setuptools"]["package-dir"].items()):
+        target = flat.joinpath(*name.split("."))
+        shutil.copytree(ROOT / folder, target, ignore=shutil.ignore_patterns("__pycache__"))
+    code = "import sys; from importlinter.cli import lint_imports_command; sys.exit(lint_imports_command())"
+    words = ["--config", str(ROOT / "pyproject.toml"), "--no-cache", "--no-logo"]
+    env = CLEAN | {"PYTHONPATH": str(flat)}
+    call = [sys.executable, "-c", code, *words]
+    out = subprocess.run(call, cwd=flat, capture_output=True, text=True, check=False, env=env)
+    assert out.returncode == 0, out.stdout[-4000:] + out.stderr[-2000:]
+    assert "0 broken" in out.stdout
+
+
+# the tests where meshio and usd-core are missing
+
+BLOCKER = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("meshio", "pxr"):
+            raise ModuleNotFoundError(f"No module named {name!r} (blocked)", name=name)
+
+sys.meta_path.insert(0, Blocker())
+"""
+
+
+def test_cuda_tests_collect_without_meshio_and_usd(tmp_path):
+    """As on a machine with a GPU and little else: every file is imported, and the tests marked `cuda` are found."""
+    (tmp_path / "sitecustomize.py").write_text(BLOCKER)
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    call = [sys.executable, "-c", "import meshio"]
+    assert "blocked" in subprocess.run(call, capture_output=True, text=True, check=False, env=env).stderr
+    call = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "cuda", "--collect-only", "tests"]
+    out = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False, env=env)
+    assert out.returncode == 0, out.stdout[-4000:]
+    for name in ("test_device.py", "test_profile.py", "test_jacobi.py"):
+        assert f"tests/{name}::" in out.stdout

@@ -1,4 +1,4 @@
-"""The first iterate of a step: extrapolated by the order that served the last step best."""
+"""The predictor: the first iterate of a step, extrapolated in the order that fitted the last step best."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from warpfea.simulation.predictor import Predictor
 from warpfea.studies.bench.problems import PROBLEMS
 
 
-def order(sim):
+def next_order(sim):
     return int(sim.state.predictor.numpy()[0, 0])
 
 
@@ -42,11 +42,11 @@ def falling(law):
     return b
 
 
-def test_other_steps_than_the_last_have_no_past():
-    """After a change of the step, or of the state, v_n is all that is known."""
+def test_a_changed_step_or_state_has_no_past():
+    """After a change of the step size, or of the state, only v_n is known."""
     sim = wf.Simulation(falling(wf.SVK(E=1e5, nu=0.3, density=1000.0)).finalize(device="cpu"), dt=1e-3)
     sim.step(6)
-    assert order(sim) > 0
+    assert next_order(sim) > 0
     sim.dt = 5e-4
     sim.step()
     kept = sim.state.predictor.numpy()[0]
@@ -54,13 +54,13 @@ def test_other_steps_than_the_last_have_no_past():
     assert kept[0] == 0.0
     assert kept[2] == 5e-4
     sim.step(4)
-    assert order(sim) > 0
+    assert next_order(sim) > 0
     sim.reset()
     assert not sim.state.predictor.numpy().any()
 
 
 def test_the_best_order_is_that_of_the_smallest_error():
-    """A polynomial of degree d in time is met by order d and above; noise is left to v_n."""
+    """A polynomial of degree d in time is reproduced by order d and above; for noise v_n is best."""
     sim = wf.Simulation(falling(wf.SVK(E=1e3, nu=0.3, density=1000.0)).finalize(device="cpu"), dt=1e-3, capture=False)
     sim.step()
     predictor, w = sim.stepper.predictor, sim.stepper.work
@@ -77,14 +77,14 @@ def test_the_best_order_is_that_of_the_smallest_error():
             array.assign(velocity(3.0 - k))
         predictor.control.count.fill_(2)
         predictor.commit()
-        assert order(sim) == expected
+        assert next_order(sim) == expected
         np.testing.assert_array_equal(predictor.past[0].numpy(), sim.state.velocity.numpy())
 
 
-def test_impacts_are_not_refused_for_it(monkeypatch):
+def test_impacts_do_not_halve_more_steps(monkeypatch):
     def build():
         b = wf.ModelBuilder(gravity=(0, 0, 0))
-        law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3)
+        law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
         body = b.add_solid(wf.mesh.box((1, 0.4, 0.4), cells=(4, 2, 2)), material=law)
         b.clamp(body.nodes("x-"))
         b.set_initial(body, velocity=(-8.0, 3.0, 0))

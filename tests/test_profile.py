@@ -21,15 +21,43 @@ from warpfea.studies.profile.profiling import Recorder, launch_bytes, profile
 WORDS = ["profile", "cantilever", "--set", "cells=2", "--device", "cpu", "--steps", "2"]
 
 
+TICK = 1e-3
+
+
+class Ticks:
+    """A clock that goes on by a millisecond at each reading: times are counts, whatever else the machine does."""
+
+    def __init__(self):
+        self.readings = 0
+
+    def perf_counter(self):
+        self.readings += 1
+        return TICK * self.readings
+
+
 @pytest.fixture(autouse=True)
-def small_copies(monkeypatch):
+def counting(monkeypatch, request):
+    """Small copies, and the clock of the profile replaced, but for CUDA, whose times come from events."""
     monkeypatch.setitem(profiling.COPY_BYTES, "cpu", 2**22)
+    if "cuda" not in request.keywords:
+        monkeypatch.setattr(profiling, "clock", Ticks())
 
 
 def simulation(name, device, **values):
     scene = find(name)
     model = scene.build(scene.resolve(values)).finalize(device=device)
     return wf.Simulation(model, dt=scene.dt, integrator=scene.integrator)
+
+
+def launches_of(name, device, steps, after, **values):
+    """Launches of the steps that follow `after` steps, counted without a graph and without a profile."""
+    scene = find(name)
+    model = scene.build(scene.resolve(values)).finalize(device=device)
+    sim = wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, capture=False)
+    sim.step(after)
+    before = sim.stepper.launch.launches
+    sim.step(steps)
+    return sim.stepper.launch.launches - before
 
 
 def check(found, steps):
@@ -42,12 +70,11 @@ def check(found, steps):
             sum(getattr(k, key) for k in found.kernels)
         )
     assert found.kernels_ms + found.between_ms == pytest.approx(found.total_ms)
-    assert found.total_ms >= 0.999 * np.mean(found.step_ms)
-    assert 0.0 < found.kernels_ms < 5.0 * np.mean(found.step_ms)  # loosely: the machine is shared
+    assert found.total_ms >= 0.999 * np.mean(found.step_ms)  # by definition of what lies between
     assert found.launches > found.pcg >= found.newton >= 1.0
     assert found.parts["product"].launches >= found.pcg
-    assert found.copy_GBps > 0.1
-    assert 0.0 < found.empty_launch_us < 1000.0
+    assert found.copy_GBps > 0.0
+    assert found.empty_launch_us > 0.0
     assert [k.ms for k in found.kernels] == sorted((k.ms for k in found.kernels), reverse=True)
 
 
@@ -60,6 +87,7 @@ def test_profile_adds_up_and_leaves_the_run_as_it_was(device):
     recorded = sim.stepper.launch.launches
     found = profile(sim, steps=2, on_step=lambda: calls.append(1))
     check(found, 2)
+    assert 2 * found.launches == launches_of("cantilever", device, 2, profiling.WARM_UP, cells=2)
     assert len(calls) == profiling.WARM_UP + 2 + 1 + 2
     assert "loads" in found.parts  # gravity
     assert "constraints" not in found.parts
@@ -70,6 +98,22 @@ def test_profile_adds_up_and_leaves_the_run_as_it_was(device):
     assert sim.stepper.launch.recorder is None
     assert sim.stepper.launch.launches == recorded
     assert np.array_equal(sim.step().pcg, plain.step().pcg)
+
+
+def test_each_launch_takes_its_time_less_that_of_an_empty_one(device, monkeypatch):
+    """With a clock that counts, a launch is one reading long, a step is one, and an empty launch is one."""
+    assert profiling._empty_launch(device) == pytest.approx(TICK)
+    monkeypatch.setattr(profiling, "_empty_launch", lambda device: 0.25 * TICK)
+    found = profile(simulation("cantilever", device, cells=2), steps=2)
+    assert found.step_ms == pytest.approx([1.0, 1.0])
+    assert found.empty_launch_us == pytest.approx(250.0)
+    assert found.copy_GBps == pytest.approx(2e-9 * 2**22 / TICK)
+    for k in found.kernels:
+        assert k.ms == pytest.approx(0.75 * k.launches)
+    assert found.kernels_ms == pytest.approx(0.75 * found.launches)
+    assert found.between_ms == 0.0
+    few = profiling.Profile((400.0, 600.0), found.kernels[:1], 1.0, 1.0, 1.0, 1.0)
+    assert few.between_ms == pytest.approx(500.0 - few.kernels_ms)
 
 
 def test_joints_are_a_part(device):
@@ -90,6 +134,7 @@ def test_profile_on_cuda():
     found = profile(simulation("cantilever", "cuda:0"), steps=2)
     check(found, 2)
     assert all(k.launches > 0 for k in found.kernels)
+    assert found.kernels_ms > 0.0
 
 
 def test_bad_options_are_named(device):

@@ -1,4 +1,4 @@
-"""What the README tells of growth, of the operator and of one core stands in the committed results."""
+"""What tests/README.md tells of growth, of the operator and of one core stands in the committed results."""
 
 import json
 import pathlib
@@ -12,7 +12,7 @@ RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 
 def load(name):
     path = RESULTS / name
-    assert path.exists(), f"{path} is missing: see the README's section on speed for the command"
+    assert path.exists(), f"{path} is missing: see tests/README.md for the command"
     content = json.loads(path.read_text())
     assert content["command"].startswith("warpfea bench --")
     assert len(content["commit"]) >= 40

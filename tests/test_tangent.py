@@ -117,7 +117,7 @@ def straight_and_distorted():
     return wf.mesh.Mesh(points, mesh.cells, "tetra10")
 
 
-def massive_model(material, form, dtype, rule):
+def straight_model(material, form, dtype, rule):
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     damping = wf.KelvinVoigt(2e4, 3e4, form=form) if form else None
     body = b.add_solid(straight_and_distorted(), material=law(material, damping=damping), quadrature=rule)
@@ -176,7 +176,7 @@ def separate_product(model, u, v, p, mass_factor):
     ],
 )
 def test_both_forms_of_the_product_agree(material, form, dtype, rule, data):
-    body, model = massive_model(material, form, dtype, rule)
+    body, model = straight_model(material, form, dtype, rule)
     (block,) = model.blocks
     assert block.key.vertex
     general = with_mass_kernel(dtype, material, 10, block.points, form, False, block.cluster)
@@ -192,7 +192,7 @@ def test_both_forms_of_the_product_agree(material, form, dtype, rule, data):
 
 
 def test_the_size_of_clusters_changes_nothing(data):
-    body, model = massive_model("svk", None, "float64", "tet4")
+    body, model = straight_model("svk", None, "float64", "tet4")
     (block,) = model.blocks
     u, v, p = np.random.default_rng(2).uniform(-0.1, 0.1, (3, 2, *body.reference.shape))
     expected = with_mass_product(model, block.with_mass_product("float64", None), u, v, p)
@@ -202,7 +202,7 @@ def test_the_size_of_clusters_changes_nothing(data):
 
 
 def test_a_translation_strains_no_straight_element():
-    body, model = massive_model("svk", None, "float64", "tet4")
+    body, model = straight_model("svk", None, "float64", "tet4")
     (block,) = model.blocks
     shape = (2, *body.reference.shape)
     u, far = np.zeros(shape), np.broadcast_to([1e6 / 3, -1e5 / 7, 1e3 / 11], shape)
@@ -217,7 +217,7 @@ def test_a_translation_strains_no_straight_element():
     ("rule", "expected"), [("tet4", True), ("tet5_paper", True), ("tet8", False), ("tet14", False)]
 )
 def test_which_straight_elements_take_the_form_of_vertices(rule, expected):
-    _, model = massive_model("svk", None, "float64", rule)
+    _, model = straight_model("svk", None, "float64", rule)
     assert model.blocks[0].key.affine
     assert model.blocks[0].key.vertex == expected
 

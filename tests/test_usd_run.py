@@ -9,7 +9,9 @@ def test_points_equal_the_positions_at_three_times(tmp_path):
     from pxr import Usd, UsdGeom
 
     b = wf.ModelBuilder()
-    body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(3, 1, 1)), material=wf.SVK(E=1e5, nu=0.3), name="bar")
+    body = b.add_solid(
+        wf.mesh.box((1, 0.2, 0.2), cells=(3, 1, 1)), material=wf.SVK(E=1e5, nu=0.3, density=1000.0), name="bar"
+    )
     b.clamp(body.nodes("x-"))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1.0 / 60.0)
     kept = {}

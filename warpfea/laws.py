@@ -15,12 +15,12 @@ __all__ = ["TimeLaw", "time_law"]
 
 @dataclass(frozen=True, eq=False)
 class TimeLaw:
-    """A value over time: samples, linear in between and held beyond; one sample for a constant; or a function.
+    """A value over time: samples, interpolated linearly and constant outside of them; or a function of t.
 
     Attributes:
-        times: (n,) s; empty for a function.
-        values: (n, 3); scalars stand in the first column.
-        function: wp.func of t, or None.
+        times: (n,) s; one for a constant, empty for a function.
+        values: (n, 3) in the unit of what the law drives; of scalar laws the first column.
+        function: wp.func of t (s), or None.
         scalar: whether the value is a scalar.
     """
 
@@ -39,15 +39,15 @@ def _widen(values: np.ndarray, scalar: bool) -> np.ndarray:
 
 
 def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
-    """Read a time law given by a user.
+    """The time law that a user has given.
 
     Args:
-        value: number or 3-vector; (times (n,), values (n,) or (n, 3)); or a wp.func of t.
+        value: number or 3-vector; (times (n,), values (n,) or (n, 3)); or a wp.func of t; times in s.
         what: name used in errors.
         scalar: a scalar law instead of a vector law.
 
     Raises:
-        ModelError: wrong shape, times that do not increase, or a value that is not finite.
+        ModelError: a Python function, a wrong shape, times that do not increase, or a value that is not finite.
     """
     if isinstance(value, wp.Function):
         return TimeLaw(np.zeros(0), np.zeros((0, 3)), value, scalar)

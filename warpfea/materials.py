@@ -13,7 +13,7 @@ from .base.errors import ModelError
 
 __all__ = ["SVK", "KelvinVoigt", "Material", "MooneyRivlin", "NeoHookean"]
 
-Density = float | np.ndarray | Callable[[np.ndarray], np.ndarray]
+Density = float | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
 
 def _positive(owner: str, **values: float) -> None:
@@ -29,7 +29,7 @@ def _non_negative(owner: str, **values: float) -> None:
 
 
 def _check_density(owner: str, density: Density) -> None:
-    if callable(density):
+    if density is None or callable(density):
         return
     values = np.asarray(density, dtype=float)
     if values.ndim > 1 or not np.all(np.isfinite(values)) or not np.all(values > 0.0):
@@ -75,10 +75,10 @@ class KelvinVoigt:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Base of the laws: a density and optional damping."""
+    """Base of the laws: a density, which statics without gravity does without, and optional damping."""
 
     law: ClassVar[str]
-    density: Any = field(default=1000.0, kw_only=True)
+    density: Any = field(default=None, kw_only=True)
     damping: KelvinVoigt | None = field(default=None, kw_only=True)
 
     def coefficients(self) -> tuple[float, float, float]:
@@ -103,7 +103,8 @@ class SVK(Material):
     Args:
         E: Young's modulus, Pa.
         nu: Poisson's ratio, -1 < nu < 0.5.
-        density: kg/m^3 of the reference configuration; a number, one per element, or f(X (n, 3)) -> (n,).
+        density: kg/m^3 of the reference configuration; a number, one per element, or f(X (n, 3)) -> (n,). There is no
+            default: motion, gravity, body forces and the mass matrix need one; statics without gravity does not.
         damping: KelvinVoigt or None.
 
     Raises:
@@ -121,7 +122,7 @@ class SVK(Material):
         _check_damping("SVK", self.damping)
 
     @classmethod
-    def from_E_nu(cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None) -> SVK:
+    def from_E_nu(cls, *, E: float, nu: float, density: Any = None, damping: KelvinVoigt | None = None) -> SVK:
         """The same as the constructor; every law has it."""
         return cls(E=E, nu=nu, density=density, damping=damping)
 
@@ -162,7 +163,7 @@ class MooneyRivlin(Material):
 
     @classmethod
     def from_E_nu(
-        cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None, ratio: float = 0.25
+        cls, *, E: float, nu: float, density: Any = None, damping: KelvinVoigt | None = None, ratio: float = 0.25
     ) -> MooneyRivlin:
         """From Young's modulus and Poisson's ratio at rest; `ratio` = mu01 / (mu10 + mu01)."""
         _positive("MooneyRivlin", E=E)
@@ -205,7 +206,7 @@ class NeoHookean(Material):
         _check_damping("NeoHookean", self.damping)
 
     @classmethod
-    def from_E_nu(cls, *, E: float, nu: float, density: Any = 1000.0, damping: KelvinVoigt | None = None) -> NeoHookean:
+    def from_E_nu(cls, *, E: float, nu: float, density: Any = None, damping: KelvinVoigt | None = None) -> NeoHookean:
         """From Young's modulus and Poisson's ratio at rest."""
         _positive("NeoHookean", E=E)
         _check_nu("NeoHookean", nu)

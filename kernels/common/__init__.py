@@ -1,1 +1,1 @@
-"""What kernels share: types, structs, lanes, sums."""
+"""What kernels share: number types, structs, sums over threads, inverses of 3x3 blocks."""

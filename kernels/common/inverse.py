@@ -11,12 +11,16 @@ __all__ = ["inverse_function"]
 
 @functools.cache
 def inverse_function(dtype: str):
-    """Inverse of a diagonal block on its free components; where it is not safely positive, of its diagonal."""
+    """The device function `free_inverse` in one precision: inverse of a 3x3 diagonal block on its free components.
+
+    A block that is not safely positive definite is replaced by its diagonal, so that the inverse is always positive.
+    """
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
 
     @wp.func
     def positive_inverse(A: mat33, least: T) -> mat33:
+        """A^-1 where the leading minors of A are safely positive, else the inverse of |diag A|, at least `least`."""
         d1 = A[0, 0]
         d2 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
         d3 = wp.determinant(A)
@@ -31,6 +35,7 @@ def inverse_function(dtype: str):
 
     @wp.func
     def free_inverse(A: mat33, least: T, free: vec3) -> mat33:
+        """Inverse of A on the components where `free` is 1; rows and columns of prescribed components are zero."""
         M = A
         for i in range(3):
             for j in range(3):

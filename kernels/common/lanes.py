@@ -1,4 +1,4 @@
-"""Threads that share a row: partial sums of the lanes of a row added in a fixed order, on the CPU one lane alone."""
+"""Sums over the threads (lanes) that share a row, in a fixed order; on the CPU one thread does a whole row."""
 
 import functools
 import types as _types
@@ -10,6 +10,7 @@ from .types import precision
 __all__ = ["WARP", "lane_functions"]
 
 WARP = 32
+"""Threads of a warp."""
 
 
 @wp.func_native(
@@ -19,7 +20,8 @@ WARP = 32
     #endif
     """
 )
-def sync(): ...
+def sync():
+    """Barrier for the threads of a block; nothing on the CPU."""
 
 
 @wp.func_native(
@@ -30,7 +32,9 @@ def sync(): ...
     return x;
     """
 )
-def lane_sum_float64(x: wp.float64, lanes: int) -> wp.float64: ...
+def lane_sum_float64(x: wp.float64, lanes: int) -> wp.float64:
+    """Sum of x over a run of `lanes` threads, in its first thread; x itself on the CPU."""
+    ...
 
 
 @wp.func_native(
@@ -41,21 +45,25 @@ def lane_sum_float64(x: wp.float64, lanes: int) -> wp.float64: ...
     return x;
     """
 )
-def lane_sum_float32(x: wp.float32, lanes: int) -> wp.float32: ...
+def lane_sum_float32(x: wp.float32, lanes: int) -> wp.float32:
+    """Sum of x over a run of `lanes` threads, in its first thread; x itself on the CPU."""
+    ...
 
 
 @functools.cache
 def lane_functions(dtype: str) -> _types.SimpleNamespace:
-    """`sync` of a block's threads, and sums over runs of lanes, a power of two up to WARP: `lane_sum(v, lanes)` of
-    vectors, `row_sum(x, lanes)` of float64, `scalar_sum` of the precision itself.
+    """Device functions for threads that share a row.
 
-    Every thread of a warp must come to a sum: launches pad their rows to whole warps. The first lane has the sum.
+    `sync()` is the barrier of a block. `lane_sum(v, lanes)` sums vectors, `row_sum(x, lanes)` float64 numbers and
+    `scalar_sum(x, lanes)` numbers of this precision over runs of `lanes` threads, a power of two up to WARP. The first
+    thread of a run gets the sum. Every thread of a warp must take part, so launches pad their rows to whole warps.
     """
     vec3 = precision(dtype).vec3
     scalar_sum = {"float64": lane_sum_float64, "float32": lane_sum_float32}[dtype]
 
     @wp.func
     def lane_sum(v: vec3, lanes: int) -> vec3:
+        """Sum of v over a run of `lanes` threads, in its first thread; v itself on the CPU."""
         return vec3(scalar_sum(v[0], lanes), scalar_sum(v[1], lanes), scalar_sum(v[2], lanes))
 
     return _types.SimpleNamespace(sync=sync, lane_sum=lane_sum, row_sum=lane_sum_float64, scalar_sum=scalar_sum)

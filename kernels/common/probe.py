@@ -1,4 +1,4 @@
-"""A kernel that does nothing: what a launch costs by itself."""
+"""A kernel that does nothing, to measure what a launch costs by itself."""
 
 import functools
 import types as _types

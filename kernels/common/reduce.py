@@ -1,4 +1,4 @@
-"""Sums per world in an order that depends on the length of a row alone, not on the number of worlds."""
+"""Sums per world, in an order that depends on the length of a row alone, not on how many worlds there are."""
 
 import functools
 import types as _types
@@ -10,6 +10,7 @@ from .types import kernel_module
 __all__ = ["CHUNK", "reduce_kernels"]
 
 TILE = 1024
+"""Numbers that a block adds up at once."""
 CHUNK = 16384
 """Rows up to this length are summed by one block; longer ones in chunks of this length first."""
 

@@ -1,4 +1,4 @@
-"""Copies of state rows per world, whatever their type: rows are seen as 32-bit words."""
+"""Copies of the state of chosen worlds; arrays of any type are copied as rows of 32-bit words."""
 
 import functools
 import types as _types

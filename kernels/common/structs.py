@@ -1,4 +1,4 @@
-"""What kernels of slots share: who contributes to a slot, patterns of matrices, the balance of forces."""
+"""Structs that many kernels take: contributions to slots, patterns of matrices, the balance of forces."""
 
 import functools
 
@@ -11,56 +11,59 @@ __all__ = ["additions_struct", "balance_struct", "pattern_struct", "topology_str
 
 @functools.cache
 def pattern_struct():
-    """Rows of a matrix of 3x3 blocks."""
+    """The sparsity pattern of a matrix of 3x3 blocks, by rows of slots (CSR)."""
 
     @wp.struct
     class Pattern:
         start: wp.array(dtype=wp.int32)  # [slot + 1]
-        column: wp.array(dtype=wp.int32)  # [entry] slot
-        upper: wp.array(dtype=wp.vec4i)  # entry, its mirror, row, column; of the diagonal and above
+        column: wp.array(dtype=wp.int32)  # [entry] slot of the column
+        upper: wp.array(dtype=wp.vec4i)  # (entry, its transpose, row, column); diagonal and above
 
     return Pattern
 
 
 @functools.cache
 def topology_struct(dtype: str):
-    """Who contributes to a slot, the scalar mass matrix in CSR, and which components are free."""
+    """What the gather of a slot reads: its contributions, its row of the mass matrix (CSR), its free components."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
     @wp.struct
     class Topology:
         start: wp.array(dtype=wp.int32)  # [slot + 1]
-        entry: wp.array(dtype=wp.int32)  # indices into the contributions
+        entry: wp.array(dtype=wp.int32)  # contributions that a slot sums, in a fixed order
         mass_start: wp.array(dtype=wp.int32)  # [slot + 1]
         mass_column: wp.array(dtype=wp.int32)
         mass_value: wp.array(dtype=T)  # kg
         free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
-        held: wp.array(dtype=wp.uint8)  # [slot] bit k is set where component k is prescribed
+        held: wp.array(dtype=wp.uint8)  # [slot] bit k is set where component k is prescribed: `free` in one byte
+        pool_start: wp.array(dtype=wp.int32)  # [slot + 1] of the pool of terms; with pooled terms
+        pool_entry: wp.array(dtype=wp.int32)  # indices into the pool
 
     return Topology
 
 
 @functools.cache
 def balance_struct(dtype: str):
-    """The balance of forces at an iterate, [world, slot]: what it is made of, and its parts."""
+    """The balance of forces at an iterate, Eq. (17): what it is made of and its parts, [world, slot]; forces in N."""
     vec3 = precision(dtype).vec3
 
     @wp.struct
     class Balance:
-        u: wp.array2d(dtype=vec3)
-        v: wp.array2d(dtype=vec3)
-        v_tilde: wp.array2d(dtype=vec3)
+        u: wp.array2d(dtype=vec3)  # displacements, m
+        v: wp.array2d(dtype=vec3)  # velocities, m/s
+        v_tilde: wp.array2d(dtype=vec3)  # the inertia term is c_M M (v - v_tilde)
         dead: wp.array2d(dtype=vec3)  # loads that do not depend on the iterate, and the sum of their magnitudes
         dead_magnitude: wp.array2d(dtype=vec3)
-        nonpotential: wp.array2d(dtype=vec3)  # forces without a potential, and those that Phi holds in a line search
+        nonpotential: wp.array2d(dtype=vec3)  # forces without a potential, and what a line search holds of them
         nonpotential_held: wp.array2d(dtype=vec3)
-        direction: wp.array2d(dtype=vec3)  # of the search
-        diagonal: wp.array2d(dtype=vec3)  # D
+        direction: wp.array2d(dtype=vec3)  # p, along which the line search moves v
+        diagonal: wp.array2d(dtype=vec3)  # D, the diagonal of H, which weights the norms
         inertia: wp.array2d(dtype=vec3)
         internal: wp.array2d(dtype=vec3)
-        g: wp.array2d(dtype=vec3)
-        gradient: wp.array2d(dtype=vec3)
+        g: wp.array2d(dtype=vec3)  # the residual
+        gradient: wp.array2d(dtype=vec3)  # of the augmented potential: what the Newton step is solved for
+        pool: wp.array2d(dtype=vec3)  # [world, entry] forces of pooled terms
         rows: wp.array3d(dtype=wp.float64)  # [row, world, slot] to be summed
         mass_factor: wp.array(dtype=wp.float64)  # [world]
         dq_dv: wp.array(dtype=wp.float64)
@@ -70,7 +73,7 @@ def balance_struct(dtype: str):
 
 @functools.cache
 def additions_struct(dtype: str):
-    """What a product needs besides the elements' part: factors, and the tangents of follower loads."""
+    """What a product needs besides the elements' part: factors, tangents of follower loads and of pooled terms."""
     vec3 = precision(dtype).vec3
 
     @wp.struct
@@ -78,8 +81,11 @@ def additions_struct(dtype: str):
         start: wp.array(dtype=wp.int32)  # of follower loads: [slot + 1]
         entry: wp.array(dtype=wp.int32)  # indices into their contributions
         contribution: wp.array2d(dtype=vec3)
+        pool_start: wp.array(dtype=wp.int32)  # as of Topology; with pooled terms
+        pool_entry: wp.array(dtype=wp.int32)
+        pool: wp.array2d(dtype=vec3)  # [world, entry] K p of pooled terms
         mass_factor: wp.array(dtype=wp.float64)  # [world]
         dq_dv: wp.array(dtype=wp.float64)
-        warp: wp.int32  # threads that a partial sum stands for
+        warp: wp.int32  # threads whose values make one partial sum
 
     return Additions

@@ -1,1 +1,1 @@
-"""Elements and materials on the device."""
+"""Elements and materials on the device: forces, tangent products, matrices, stresses."""

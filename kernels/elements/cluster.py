@@ -1,9 +1,9 @@
-"""Products of elements by clusters: each reads its slots once, and adds up for each what its elements give.
+"""Products H p by clusters of elements: a cluster reads each of its slots once and writes one sum of forces per slot.
 
-A cluster is a run of elements that one block of threads does. The fields at its slots lie in memory that the threads
-share, and so do the elements' contributions until they are summed, in a fixed order. What it writes is one sum per
-slot, about a third of the contributions, and to read a slot costs no address in global memory. On the CPU a cluster is
-one thread's, and arrays stand for the shared memory.
+A cluster is a run of elements that one block of threads processes. The fields at its slots lie in shared memory, and so
+do the forces of its elements until they are summed, per slot and in a fixed order. The sums are about a third as many
+as the forces of the elements, and elements read their slots without an address in global memory. On the CPU one thread
+processes a cluster, and arrays take the place of the shared memory.
 """
 
 import functools
@@ -30,39 +30,39 @@ __all__ = [
 ]
 
 LARGEST = {"float64": 64, "float32": 128}
-"""Elements of a cluster, and threads of its block: as many as shared memory and registers let fill a device well."""
+"""Elements of a cluster and threads of its block: the size at which shared memory and registers let a GPU fill best."""
 CAPACITY = {32: 24, 64: 32, 128: 46}
-"""Slots that clusters of these sizes have room for, as multiples of the slots of an element."""
+"""Slots that a cluster has room for, by its number of elements, as multiples of the slots of one element."""
 SHARED_BYTES = 48 * 1024
-"""Shared memory that a block may have without asking."""
+"""Shared memory that a block may use without asking CUDA for more."""
 THREADS = {"float64": 384, "float32": 640}
-"""Threads that registers must leave room for on a multiprocessor."""
+"""Threads that must fit on a multiprocessor at once: this bounds the registers of a thread."""
 U, DIRECTION, V = 0, 1, 2
-"""Fields of a cluster."""
+"""The fields at the slots of a cluster: displacement, direction p, velocity."""
 QUAD = 4
-"""Words of a table that are read at once."""
+"""32-bit words of a table that are copied at once."""
 
 
 def cluster_size(dtype: str, count: int, *, fit: bool) -> int:
-    """Elements of a cluster in a block of so many.
+    """Elements of a cluster where an element block has `count` elements.
 
-    `fit`: small blocks have small clusters, so that few threads idle where thousands of worlds are done at once.
+    `fit`: small element blocks get small clusters, so that few threads idle where thousands of worlds run at once.
     """
     return min(n for n in CAPACITY if n == LARGEST[dtype] or (fit and count <= n < LARGEST[dtype]))
 
 
 def slot_capacity(size: int, slots: int) -> int:
-    """Slots that a cluster of `size` elements with so many has at most."""
+    """Most slots of a cluster of `size` elements that have `slots` slots each."""
     return slots * CAPACITY[size]
 
 
 def pool_size(size: int, slots: int, fields: int) -> int:
-    """Numbers that a cluster holds: fields at its slots, contributions of its elements."""
+    """Numbers in the memory of a cluster: the fields at its slots, and the forces of its elements."""
     return 3 * (fields * slot_capacity(size, slots) + slots * size)
 
 
 def table_layout(size: int, slots: int) -> tuple[int, int, int]:
-    """Where place and sum_start begin in a cluster's table of 16-bit numbers, and the words of the table."""
+    """Layout of a cluster's table: where `place` and `sum_start` begin (16-bit numbers), and its 32-bit words."""
     place = slots * size
     words = place + slot_capacity(size, slots) // 2 + 1
     return place, 2 * place, QUAD * -(-words // QUAD)
@@ -70,17 +70,18 @@ def table_layout(size: int, slots: int) -> tuple[int, int, int]:
 
 @functools.cache
 def cluster_struct():
-    """The clusters of a block of elements.
+    """The clusters of an element block.
 
-    A table holds, in 16 bits each: sum_entry, local * size + element of the cluster, of the contributions in the
-    order of the slots that they go to; place [local, element] of a slot in its cluster; sum_start [slot + 1].
+    The table of a cluster holds three lists of 16-bit numbers: `sum_entry`, the forces local * size + element in the
+    order of the slots that they are added to; `place` [local, element], where the slot of an element lies among those
+    of the cluster; `sum_start` [slot + 1], where the forces on a slot begin in `sum_entry`.
     """
 
     @wp.struct
     class Clusters:
-        start: wp.array(dtype=wp.int32)  # [cluster + 1] elements
-        slot_start: wp.array(dtype=wp.int32)  # [cluster + 1] index into the sums of the block
-        slot: wp.array2d(dtype=wp.int32)  # [cluster, place]; the last one fills the row
+        start: wp.array(dtype=wp.int32)  # [cluster + 1] first element
+        slot_start: wp.array(dtype=wp.int32)  # [cluster + 1] first sum, counted within the block
+        slot: wp.array2d(dtype=wp.int32)  # [cluster, place] slot; rows are filled up with their last slot
         table: wp.array(dtype=wp.int32)  # [cluster * words]
         offset: wp.int32  # of the block's sums among those of all blocks
 
@@ -89,7 +90,7 @@ def cluster_struct():
 
 @functools.cache
 def pool_struct(dtype: str):
-    """What stands for the shared memory of a block on the CPU; a number each on CUDA."""
+    """Arrays that take the place of shared memory on the CPU; on CUDA they have one element and are not used."""
     T = precision(dtype).T
 
     @wp.struct
@@ -101,10 +102,10 @@ def pool_struct(dtype: str):
 
 
 def _pool_access(dtype: str, size: int) -> Callable:
-    """access(1, k, x, spare) stores, access(0, k, x, spare) returns number k."""
+    """The device function access: access(1, k, x, spare) stores x as number k, access(0, k, x, spare) returns it."""
     T = precision(dtype).T
     scalar = {"float64": "double", "float32": "float"}[dtype]
-    # one function for both: shared memory of two functions would be two memories
+    # one function to store and to return: two functions would declare two separate shared arrays
     snippet = f"""
     #if defined(__CUDA_ARCH__)
     __shared__ {scalar} pool[{size}];
@@ -116,14 +117,18 @@ def _pool_access(dtype: str, size: int) -> Callable:
     """
 
     @wp.func_native(snippet)
-    def access(store: int, k: int, x: T, spare: wp.array(dtype=T)) -> T: ...
+    def access(store: int, k: int, x: T, spare: wp.array(dtype=T)) -> T:
+        """Store x as number k of the pool if `store` is set, and return number k."""
 
     return access
 
 
 def _table_access(words: int) -> Callable:
-    """access(1, k, first, source, spare) copies QUAD words k of a table that begins at word `first` of the source;
-    access(0, k, first, source, spare) returns 16 bits of it."""
+    """The device function access for the table of a cluster.
+
+    access(1, k, first, source, spare) copies its words QUAD k .. QUAD (k + 1) - 1 from the source, where the table
+    begins at word `first`; access(0, k, first, source, spare) returns its 16-bit number k.
+    """
     snippet = f"""
     #if defined(__CUDA_ARCH__)
     __shared__ __align__(16) int table[{words}];
@@ -142,20 +147,19 @@ def _table_access(words: int) -> Callable:
     """
 
     @wp.func_native(snippet)
-    def access(
-        copy: int, k: int, first: int, source: wp.array(dtype=wp.int32), spare: wp.array(dtype=wp.int32)
-    ) -> int: ...
+    def access(copy: int, k: int, first: int, source: wp.array(dtype=wp.int32), spare: wp.array(dtype=wp.int32)) -> int:
+        """Copy QUAD words of the table if `copy` is set, else return its 16-bit number k."""
 
     return access
 
 
 @functools.cache
 def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.SimpleNamespace:
-    """What kernels of elements with so many slots need to take part in clusters of `size`.
+    """Functions for kernels of elements with `slots` slots each that are processed in clusters of `size` elements.
 
-    `fetch(pool, field, i, at)`: a field (U, DIRECTION, V) at slot i of element `at` of the cluster; `set_force`
-    and `add_force(pool, i, at, f)`: what it gives there; `by_clusters(module, Block, product, bounded)`:
-    the kernel.
+    On the device, `fetch(pool, field, i, at)` returns a field (U, DIRECTION, V) at slot i of element `at` of the
+    cluster; `set_force` and `add_force(pool, i, at, f)` store and add to the force of that element on its slot i. On
+    the host, `by_clusters(module, Block, product, bounded)` makes the kernel.
     """
     p = precision(dtype)
     T, vec3, sym6 = p.T, p.vec3, p.sym
@@ -165,21 +169,23 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
     PLACE, SUM_START, WORDS = table_layout(size, slots)
     FORCE = 3 * fields * ROOM
     numbers = pool_size(size, slots, fields)
-    assert numbers * (8 if dtype == "float64" else 4) + 4 * WORDS < SHARED_BYTES, "smaller clusters are wanted"
+    assert numbers * (8 if dtype == "float64" else 4) + 4 * WORDS < SHARED_BYTES, "a cluster exceeds shared memory"
     number = _pool_access(dtype, numbers)
     bits = _table_access(WORDS)
-    # loads under way at once
+    # a thread starts so many loads before it needs the first
     SLOTS_AT_ONCE, QUADS_AT_ONCE = -(-ROOM // ELEMENTS), -(-WORDS // (QUAD * ELEMENTS))
     Slots = wp.types.vector(length=SLOTS_AT_ONCE, dtype=wp.int32)
     Values = wp.types.matrix(shape=(SLOTS_AT_ONCE, 3), dtype=T)
 
     @wp.func
     def put(first: int, stride: int, at: int, x: vec3, pool: Pool):
+        """Store x; its component k is number first + k * stride + at of the pool."""
         for k in range(3):
             number(1, first + k * stride + at, x[k], pool.number)
 
     @wp.func
     def get(first: int, stride: int, at: int, pool: Pool) -> vec3:
+        """The vector that `put` stored there."""
         x = vec3()
         for k in range(3):
             x[k] = number(0, first + k * stride + at, T(0.0), pool.number)
@@ -187,23 +193,27 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
 
     @wp.func
     def entry(k: int, pool: Pool) -> int:
-        """Number k of the table."""
+        """The 16-bit number k of the cluster's table."""
         return bits(0, k, 0, pool.table, pool.table)
 
     @wp.func
     def fetch(pool: Pool, field: int, i: int, at: int) -> vec3:
+        """A field at slot i of element `at` of the cluster."""
         return get(3 * field * ROOM, ROOM, entry(PLACE + i * ELEMENTS + at, pool), pool)
 
     @wp.func
     def set_force(pool: Pool, i: int, at: int, f: vec3):
+        """Store the force of element `at` on its slot i."""
         put(FORCE + i * ELEMENTS, NS * ELEMENTS, at, f, pool)
 
     @wp.func
     def add_force(pool: Pool, i: int, at: int, f: vec3):
+        """Add to the force of element `at` on its slot i."""
         set_force(pool, i, at, get(FORCE + i * ELEMENTS, NS * ELEMENTS, at, pool) + f)
 
     @wp.func
     def take_table(clusters: Clusters, cluster: int, lane: int, lanes: int, pool: Pool):
+        """Copy the table of a cluster into the memory of the block; the lanes share the work."""
         for first in range(lane, WORDS / QUAD, QUADS_AT_ONCE * lanes):
             for j in range(QUADS_AT_ONCE):
                 if first + j * lanes < WORDS / QUAD:
@@ -211,6 +221,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
 
     @wp.func
     def slots_from(clusters: Clusters, cluster: int, first: int, lanes: int) -> Slots:
+        """The next SLOTS_AT_ONCE slots of a lane: those at the places first, first + lanes, ... of the cluster."""
         slot = Slots()
         for j in range(SLOTS_AT_ONCE):
             slot[j] = clusters.slot[cluster, wp.min(first + j * lanes, ROOM - 1)]
@@ -227,6 +238,10 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
         count: int,
         pool: Pool,
     ):
+        """Copy a field at these slots into the memory of the block, as field number `into`.
+
+        All loads are started before the first value is stored, so that they overlap.
+        """
         x = Values()
         for j in range(SLOTS_AT_ONCE):
             x[j] = field[world, slot[j]]
@@ -235,7 +250,11 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
                 put(3 * into * ROOM, ROOM, first + j * lanes, x[j], pool)
 
     def by_clusters(module: wp.Module, Block, product: wp.Function, bounded: bool) -> wp.Kernel:
-        """The kernel `with_mass_product`; `product` sets what an element gives, `bounded`: registers go by THREADS."""
+        """The kernel `with_mass_product`.
+
+        `product` is the device function that sets the forces of one element; `bounded`: registers per thread are
+        limited so that THREADS threads fit on a multiprocessor.
+        """
 
         @wp.kernel(module=module, launch_bounds=(ELEMENTS, THREADS[dtype] // ELEMENTS) if bounded else None)
         def with_mass_product(
@@ -252,9 +271,10 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
             pool: Pool,
             sums: wp.array2d(dtype=vec3),
         ):
-            """c_M M p + (dq/dv) K p of straight elements, whose mass is one table times a number each.
+            """(c_M M + (dq/dv) K) p of straight elements, one sum per slot of each cluster.
 
-            So many lanes do a cluster: a thread per element, or one alone.
+            The mass of a straight element is the table of its parent times rho det J0. `lanes` threads process a
+            cluster: one per element on CUDA, one for all on the CPU.
             """
             world, index = wp.tid()
             if active[world] == 0:

@@ -1,6 +1,6 @@
 """Element kernels: internal force Eq. (32), energy, tangent product and diagonal blocks, for any table element.
 
-One thread does one element of one world, with the functions of points.py.
+One thread processes one element of one world, with the functions of points.py.
 """
 
 import functools
@@ -34,9 +34,9 @@ def element_kernels(
         dtype: precision.
         law: name in `materials.LAWS`.
         slots, points: slots and quadrature points per element.
-        affine: parent gradients and one J0 per element, or a table of h.
+        affine: straight elements with parent gradients and one J0 each; False: a table of h_i per element and point.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
-        framed: the law has axes of its own at each point.
+        framed: the law has axes of its own at each point, `block.frame`.
     """
     fn = point_functions(dtype, law, slots, affine, damping, framed)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
@@ -63,9 +63,10 @@ def element_kernels(
         min_J: wp.array(dtype=wp.float64),
         domain_J: wp.array(dtype=wp.float64),
     ):
-        """Internal force contributions, Eqs. (32) and (70), strain energy and viscous potential of each element.
+        """Internal force contributions (N), Eqs. (32) and (70), strain energy and viscous potential (J) by element.
 
-        So many lanes share the points of an element.
+        `lanes` threads share the quadrature points of an element. The smallest J goes to `min_J`, and to `domain_J` for
+        laws that need J > 0.
         """
         world, index = wp.tid()
         if active[world] == 0:
@@ -84,20 +85,20 @@ def element_kernels(
         if wp.static(damping == "rate"):
             V = fn.load(block, v, world, elem)
         dq = T(dq_dv[world])
-        for q in range(lane, block.gradient.shape[0], lanes):
-            G = fn.gradient_of(block, U, q, elem)
-            w = fn.weight_of(block, q, elem)
+        for point in range(lane, block.gradient.shape[0], lanes):
+            G = fn.gradient_of(block, U, point, elem)
+            w = fn.weight_of(block, point, elem)
             J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
-            local = fn.into_axes(block, G, q, elem)
+            local = fn.into_axes(block, G, point, elem)
             P = m.stress(local, c)
             psi += w * m.energy(local, c)
             if wp.static(damping == "incremental" or damping == "rate"):
-                Fdot = fn.velocity_gradient(block, V, q, elem)
-                rate = fn.strain_rate(block, local, Fdot, history, dq, world, q, elem)
+                Fdot = fn.velocity_gradient(block, V, point, elem)
+                rate = fn.strain_rate(block, local, Fdot, history, dq, world, point, elem)
                 S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
                 P = P + S + local * S
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
-            f = fn.scatter(block, f, fn.out_of_axes(block, P, q, elem), q, elem)
+            f = fn.scatter(block, f, fn.out_of_axes(block, P, point, elem), point, elem)
         for i in range(NS):
             f[i] = lane_sum(f[i], lanes)
         stored = row_sum(wp.float64(psi), lanes)
@@ -125,7 +126,7 @@ def element_kernels(
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p, with K = df_int/dq at u (of the rate form only its symmetric part)."""
+        """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); of damping of the rate form only the symmetric part."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -146,7 +147,7 @@ def element_kernels(
         active: wp.array(dtype=wp.int32),
         contribution: wp.array2d(dtype=sym6),
     ):
-        """The 3x3 diagonal blocks of K, made positive at each point, in Voigt order."""
+        """The 3x3 diagonal blocks of K in Voigt order, positive semi-definite at each point, for preconditioners."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -156,19 +157,21 @@ def element_kernels(
         for i in range(NS):
             B = sym6()
             contribution[world, block.contribution_offset + i * block.count + elem] = B
-        for q in range(block.gradient.shape[0]):
-            G = fn.gradient_of(block, U, q, elem)
-            w = fn.weight_of(block, q, elem)
+        for point in range(block.gradient.shape[0]):
+            G = fn.gradient_of(block, U, point, elem)
+            w = fn.weight_of(block, point, elem)
             for i in range(NS):
                 a = vec3()
                 if wp.static(affine):
-                    a = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[q, i, 0]
+                    a = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[point, i, 0]
                 else:
-                    a = block.gradient[q, i, elem]
+                    a = block.gradient[point, i, elem]
                 K = mat33()
                 if wp.static(framed):
-                    R = block.frame[q, elem]
-                    K = fn.out_of_axes(block, m.block(fn.into_axes(block, G, q, elem), wp.transpose(R) * a, c), q, elem)
+                    R = block.frame[point, elem]
+                    K = fn.out_of_axes(
+                        block, m.block(fn.into_axes(block, G, point, elem), wp.transpose(R) * a, c), point, elem
+                    )
                 else:
                     K = m.block(G, a, c)
                 if wp.static(damping == "incremental" or damping == "rate"):

@@ -1,7 +1,8 @@
 """Constitutive laws on the device: energy, first Piola-Kirchhoff stress and its increment per point.
 
 Every law is a function of the displacement gradient G = F - I, not of F: strains are then formed without
-subtracting nearly equal numbers, which float32 needs. A law is four functions
+subtracting nearly equal numbers, which float32 needs. All tensors are in the reference frame, stresses in Pa. A law is
+four functions
 
     energy(G, c)            Psi (J/m^3)
     stress(G, c)            P = dPsi/dF (Pa)
@@ -9,9 +10,9 @@ subtracting nearly equal numbers, which float32 needs. A law is four functions
     block(G, a, c)          symmetric 3x3 matrix B with d.B d = d2Psi along the rank-one dF = d a^T, projected to be
                             positive semi-definite where the exact one need not be (for preconditioners)
 
-of the law's coefficients c. Laws whose S is linear in E have two more, stiffness(E, c), that linear function, and
-moduli(c), its numbers: (D11, D22, D33, D23, D13, D12, G23, G13, G12) with S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
-Kelvin-Voigt damping adds to any of them and is made of the same St. Venant-Kirchhoff form.
+of the law's coefficients c. Laws whose S is linear in E have two more: stiffness(E, c) is S, and moduli(c) its numbers
+(D11, D22, D33, D23, D13, D12, G23, G13, G12), with S_ii = sum_j D_ij E_jj and S_ij = 2 G_ij E_ij. Kelvin-Voigt damping
+can be added to any law; Eq. (62) has the form of St. Venant-Kirchhoff's Eq. (26) and uses the same functions.
 """
 
 import functools
@@ -27,6 +28,7 @@ NCOEF = 11
 """Coefficients per material: up to nine of the law, then eta and lambda_v of Kelvin-Voigt damping."""
 ETA = NCOEF - 2
 LAMBDA_V = NCOEF - 1
+"""Places of eta and lambda_v (Pa s) among the coefficients."""
 
 
 @functools.cache
@@ -38,16 +40,18 @@ def tensors(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def identity() -> mat33:
+        """I."""
         return wp.identity(n=3, dtype=T)
 
     @wp.func
     def green(G: mat33) -> mat33:
-        """Green-Lagrange strain E = (G + G^T + G^T G)/2."""
+        """Green-Lagrange strain E = (G + G^T + G^T G)/2, Eq. (56)."""
         Gt = wp.transpose(G)
         return T(0.5) * (G + Gt + Gt * G)
 
     @wp.func
     def sym(A: mat33) -> mat33:
+        """(A + A^T)/2."""
         return T(0.5) * (A + wp.transpose(A))
 
     @wp.func
@@ -58,12 +62,12 @@ def tensors(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def isotropic(E: mat33, lam: T, mu: T) -> mat33:
-        """lambda tr(E) I + 2 mu E."""
+        """lambda tr(E) I + 2 mu E: S of Eq. (26), and S_vis of Eq. (62) with lambda_v, eta and Edot."""
         return lam * wp.trace(E) * identity() + T(2.0) * mu * E
 
     @wp.func
     def isotropic_moduli(lam: T, mu: T) -> moduli9:
-        """The numbers of `isotropic`, see `moduli` of laws."""
+        """`isotropic` as the nine numbers that the function `moduli` of a law returns."""
         d = lam + T(2.0) * mu
         return moduli9(d, d, d, lam, lam, lam, mu, mu, mu)
 
@@ -75,7 +79,7 @@ def tensors(dtype: str) -> _types.SimpleNamespace:
 
 @functools.cache
 def svk(dtype: str) -> _types.SimpleNamespace:
-    """St. Venant-Kirchhoff, Eqs. (25)-(28); c = (lambda, mu)."""
+    """St. Venant-Kirchhoff, Eqs. (25)-(28) and (35); c = (lambda, mu), Pa."""
     p, t = precision(dtype), tensors(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
     moduli9 = t.moduli9
@@ -83,25 +87,30 @@ def svk(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def stiffness(E: mat33, c: coef) -> mat33:
+        """S = lambda tr(E) I + 2 mu E, Eq. (26)."""
         return t.isotropic(E, c[0], c[1])
 
     @wp.func
     def moduli(c: coef) -> moduli9:
+        """lambda and mu as the nine numbers of an orthotropic stiffness."""
         return t.isotropic_moduli(c[0], c[1])
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
+        """Psi = lambda/2 tr(E)^2 + mu tr(E^2), Eq. (25)."""
         E = t.green(G)
         tr = wp.trace(E)
         return T(0.5) * c[0] * tr * tr + c[1] * wp.ddot(E, E)
 
     @wp.func
     def stress(G: mat33, c: coef) -> mat33:
+        """P = F S, Eq. (27)."""
         S = t.isotropic(t.green(G), c[0], c[1])
         return S + G * S
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
+        """dP = dF S + F dS. With dF = d h_j^T, dP h_i is the integrand of Eq. (35) times d."""
         F = t.identity() + G
         S = t.isotropic(t.green(G), c[0], c[1])
         dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[0], c[1])
@@ -109,6 +118,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def block(G: mat33, a: vec3, c: coef) -> mat33:
+        """The integrand of Eq. (35) for i = j and h_i = a, with a negative geometric part a.S a set to zero."""
         F = t.identity() + G
         Fa = F * a
         S = t.isotropic(t.green(G), c[0], c[1])
@@ -122,16 +132,16 @@ def svk(dtype: str) -> _types.SimpleNamespace:
 
 @functools.cache
 def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNamespace:
-    """Mooney-Rivlin, Eqs. (36)-(52), or with `second_invariant=False` neo-Hookean; c = (mu10, k, mu01).
+    """Mooney-Rivlin, Eqs. (36)-(54), or with `second_invariant=False` neo-Hookean; c = (mu10, k, mu01), Pa.
 
-    Written with the Kirchhoff stress, P = tau F^-T. With b = (F F^T - I)/2 and t = tr b,
+    Written with the Kirchhoff stress tau, P = tau F^-T. With b = (F F^T - I)/2 and t = tr b,
     tau = 2 mu10 J^-2/3 dev(2 b) + 2 mu01 J^-4/3 dev((2 + 4 t) b - 4 b^2) + k (J - 1) J I,
     where no term is a difference of nearly equal ones at small strain.
     """
     p, t = precision(dtype), tensors(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
     coef = wp.types.vector(length=NCOEF, dtype=T)
-    # captured in the precision itself: an expression of literals would be float32
+    # as constants of this precision: Warp would evaluate an expression of literals in float32
     third = T(1.0 / 3.0)
     two_thirds = T(2.0 / 3.0)
     four_thirds = T(4.0 / 3.0)
@@ -141,6 +151,7 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
 
     @wp.func
     def dev(A: mat33) -> mat33:
+        """Deviator A - tr(A)/3 I."""
         return A - third * wp.trace(A) * t.identity()
 
     @wp.func
@@ -154,11 +165,13 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
 
     @wp.func
     def half_left_strain(G: mat33) -> mat33:
+        """b = (F F^T - I)/2 = (G + G^T + G G^T)/2."""
         Gt = wp.transpose(G)
         return T(0.5) * (G + Gt + G * Gt)
 
     @wp.func
     def kirchhoff(G: mat33, c: coef) -> mat33:
+        """Kirchhoff stress tau = P F^T, in the form that the law's docstring gives."""
         b = half_left_strain(G)
         j1 = t.volume_change(G)
         J = T(1.0) + j1
@@ -171,8 +184,9 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
-        # A = J^(-2/3) C - I has det(I + A) = 1, which gives its first invariant x = I1bar - 3 from terms of second
-        # order, without subtracting equal numbers; and then I2bar - 3 = x - det A
+        """Psi, Eq. (36)."""
+        # A = J^(-2/3) C - I has det(I + A) = 1, which gives its trace x = I1bar - 3 from terms of second order, without
+        # subtracting nearly equal numbers; then I2bar - 3 = x - det A
         j1 = t.volume_change(G)
         d = power_change(j1)
         A = T(2.0) * (T(1.0) + d) * t.green(G) + d * t.identity()
@@ -185,11 +199,13 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
 
     @wp.func
     def stress(G: mat33, c: coef) -> mat33:
+        """P = tau F^-T, equal to Eq. (52)."""
         F = t.identity() + G
         return kirchhoff(G, c) * wp.transpose(wp.inverse(F))
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
+        """dP = (dtau - tau L^T) F^-T, L = dF F^-1. With dF = d h_j^T, dP h_i is the integrand of Eq. (54) times d."""
         F = t.identity() + G
         Fi = wp.inverse(F)
         b = half_left_strain(G)
@@ -213,7 +229,8 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
 
     @wp.func
     def block(G: mat33, a: vec3, c: coef) -> mat33:
-        # det and cof are affine along a rank-one change, so the second derivative is short
+        """The integrand of Eq. (54) for i = j and h_i = a: d2Psi along dF = d a^T, J > 0."""
+        # the determinant and the cofactors of F are affine along a rank-one change, so the second derivative is short
         F = t.identity() + G
         B = F * wp.transpose(F)
         J = wp.determinant(F)
@@ -248,7 +265,7 @@ def neo_hookean(dtype: str) -> _types.SimpleNamespace:
 
 @functools.cache
 def orthotropic(dtype: str) -> _types.SimpleNamespace:
-    """Psi = E : D : E / 2 with D orthotropic in the axes of G; parts of the SVK law that an element integrates apart.
+    """Psi = E : D : E / 2 with D orthotropic in the axes of G: a part of the SVK law with an integral of its own.
 
     c = (D11, D22, D33, D23, D13, D12, G23, G13, G12): S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
     """
@@ -259,6 +276,7 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def stiffness(E: mat33, c: coef) -> mat33:
+        """S = D : E."""
         s1 = c[0] * E[0, 0] + c[5] * E[1, 1] + c[4] * E[2, 2]
         s2 = c[5] * E[0, 0] + c[1] * E[1, 1] + c[3] * E[2, 2]
         s3 = c[4] * E[0, 0] + c[3] * E[1, 1] + c[2] * E[2, 2]
@@ -269,26 +287,31 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def moduli(c: coef) -> moduli9:
+        """The coefficients c."""
         return moduli9(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
+        """Psi = E : D : E / 2."""
         E = t.green(G)
         return T(0.5) * wp.ddot(E, stiffness(E, c))
 
     @wp.func
     def stress(G: mat33, c: coef) -> mat33:
+        """P = F S."""
         S = stiffness(t.green(G), c)
         return S + G * S
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
+        """dP = dF S + F dS."""
         F = t.identity() + G
         return dG * stiffness(t.green(G), c) + F * stiffness(t.sym(wp.transpose(F) * dG), c)
 
     @wp.func
     def block(G: mat33, a: vec3, c: coef) -> mat33:
-        # without the couplings D_ij, which may be indefinite alone, and without geometric stiffness
+        """F M F^T with M d = (D : sym(d a^T)) a, without the parts of D that may be indefinite."""
+        # the couplings D_ij alone may be indefinite, and so may the geometric stiffness: both are left out
         F = t.identity() + G
         x = a[0] * a[0]
         y = a[1] * a[1]
@@ -315,7 +338,7 @@ LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, 
 
 
 ANY_J = ("svk", "orthotropic", "assumed_strain")
-"""Laws that are defined for any F; the others need J > 0."""
+"""Laws that are defined for any F; the others are only where J > 0."""
 
 
 def law(name: str, dtype: str) -> _types.SimpleNamespace:

@@ -1,7 +1,8 @@
-"""Matrices of table elements: column by column, or a whole element at a time.
+"""Stiffness matrices of table elements: column by column on a GPU, a whole element at a time on the CPU.
 
-Columns are for a GPU, where threads are many and registers few. A processor's core does whole elements: at a point it
-makes dP/dF once, and its units of arithmetic take the numbers of several slots, a panel, side by side.
+A GPU has many threads with few registers: one thread computes one column of an element's matrix. A core of a CPU
+computes whole elements: it forms dP/dF once per quadrature point, and its vector units process the slots of a panel
+(up to WIDEST slots) side by side.
 """
 
 import functools
@@ -16,13 +17,13 @@ from .points import point_functions
 __all__ = ["UNROLL", "matrix_kernels", "panels_of", "row_of", "rows_type"]
 
 WIDEST = 8
-"""Most slots of a panel: eight numbers of 64 bits fill the widest registers there are."""
+"""Most slots of a panel: eight 64-bit numbers fill the widest vector registers."""
 UNROLL = 9
-"""`max_unroll` of modules that do panels: loops over components must not stand in the way of those over slots."""
+"""`max_unroll` of modules that process panels: with the loops over components unrolled, those over slots vectorise."""
 
 
 def panels_of(slots: int) -> tuple[int, int, int]:
-    """How many panels, slots per panel, and rows of all: those of a panel are for slots up to its last."""
+    """Number of panels, slots per panel, and rows in all: a panel has a row for each slot up to its last one."""
     panels = -(-slots // WIDEST)
     width = -(-slots // panels)
     return panels, width, width * panels * (panels - 1) // 2 + slots
@@ -30,12 +31,12 @@ def panels_of(slots: int) -> tuple[int, int, int]:
 
 @wp.func
 def row_of(panel: int, width: int, a: int) -> int:
-    """Which row of an element's matrix is that of slot a and a panel of so many slots."""
+    """Row of an element's matrix that holds K_ab of slot a for the slots b of a panel, `width` slots wide."""
     return width * ((panel * (panel + 1)) / 2) + a
 
 
 def rows_type(dtype: str, slots: int):
-    """K_ab of one slot and a panel of so many: rows 3 i + j over b."""
+    """Type of such a row: component (i, j) of K_ab at [3 i + j, b], for the `slots` slots b of a panel."""
     return wp.types.matrix(shape=(9, slots), dtype=precision(dtype).T)
 
 
@@ -43,7 +44,7 @@ def rows_type(dtype: str, slots: int):
 def matrix_kernels(
     dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool
 ) -> _types.SimpleNamespace:
-    """`prepare_matrix`, `element_matrix` and `element_rows` of a kind of element block, arguments as of its kernels."""
+    """Kernels `prepare_matrix`, `element_matrix` and `element_rows` of one kind of element block (see element.py)."""
     fn = point_functions(dtype, law, slots, affine, damping, framed)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     t, m, Block, Local, coef = fn.tensors, fn.law, fn.Block, fn.Local, fn.coef
@@ -62,7 +63,7 @@ def matrix_kernels(
 
     @wp.func
     def compression(S: mat33) -> T:
-        """A bound of the largest compressive principal value of S (Gershgorin), 0 in tension."""
+        """An upper bound (Gershgorin) of the largest compressive principal value of S, Pa; 0 in tension."""
         low = T(0.0)
         for i in range(3):
             low = wp.max(low, wp.abs(S[i, 0]) + wp.abs(S[i, 1]) + wp.abs(S[i, 2]) - wp.abs(S[i, i]) - S[i, i])
@@ -70,9 +71,10 @@ def matrix_kernels(
 
     @wp.func
     def stand_in(F: mat33, dF: mat33, c: coef) -> mat33:
-        """For laws whose tangent is indefinite far from rest: the stiffness at rest, turned with F and of its shape.
+        """A positive dP for laws whose tangent is indefinite far from rest: A C0 : sym(A^T dF).
 
-        c = (mu10, k, mu01), with mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3.
+        C0 is the stiffness at rest, with c = (mu10, k, mu01), mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3; A is F
+        scaled to A : A = 3, so that the stiffness turns and stretches with the material.
         """
         A = wp.sqrt(T(3.0) / wp.ddot(F, F)) * F
         mu = T(2.0) * (c[0] + c[2])
@@ -91,7 +93,11 @@ def matrix_kernels(
         point: int,
         elem: int,
     ):
-        """F with columns along the law's axes, and the second Piola-Kirchhoff stress of `form` there."""
+        """F with columns along the law's axes, and the second Piola-Kirchhoff stress S there, Pa.
+
+        `form` 0: S with its viscous part; 1: without it, and with compression removed. Of laws that need J > 0, S is
+        the viscous part alone; their elastic tangent comes whole from `increment` or `stand_in`.
+        """
         G = fn.gradient_of(block, U, point, elem)
         local = fn.into_axes(block, G, point, elem)
         F = t.identity() + G
@@ -111,7 +117,7 @@ def matrix_kernels(
 
     @wp.func
     def velocities(block: Block, v: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
-        """Those of the slots, where damping needs them."""
+        """Velocities of an element's slots where its damping needs them (form "rate"), else zeros."""
         if wp.static(damping == "rate"):
             return fn.load(block, v, world, elem)
         else:
@@ -128,21 +134,21 @@ def matrix_kernels(
         active: wp.array(dtype=wp.int32),
         lines: wp.array3d(dtype=vec3),
     ):
-        """What all columns of an element's matrix need of a point, [world, 5 point + row, elem].
+        """F and S of `point_state`, which all columns of an element's matrix need: [world, 5 point + row, elem].
 
-        Three rows of F with columns along the law's axes, and the second Piola-Kirchhoff stress of `element_matrix`'s
-        `form` there, its diagonal and (23, 13, 12).
+        Rows 0 to 2 are those of F, row 3 is the diagonal of S, row 4 its components (23, 13, 12). `form`: see
+        `element_matrix`.
         """
-        world, q, elem = wp.tid()
+        world, point, elem = wp.tid()
         if active[world] == 0:
             return
         U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
         c = fn.coefficients(block, world, elem)
-        F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, q, elem)
+        F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, point, elem)
         for i in range(3):
-            lines[world, 5 * q + i, elem] = F[i]
-        lines[world, 5 * q + 3, elem] = vec3(S[0, 0], S[1, 1], S[2, 2])
-        lines[world, 5 * q + 4, elem] = vec3(S[1, 2], S[0, 2], S[0, 1])
+            lines[world, 5 * point + i, elem] = F[i]
+        lines[world, 5 * point + 3, elem] = vec3(S[0, 0], S[1, 1], S[2, 2])
+        lines[world, 5 * point + 4, elem] = vec3(S[1, 2], S[0, 2], S[0, 1])
 
     @wp.kernel(module=module)
     def element_matrix(
@@ -154,12 +160,12 @@ def matrix_kernels(
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=vec3),
     ):
-        """K of each element as the columns of the 3x3 blocks of slots a <= b, row by row; one thread does one column.
+        """K of each element, Eqs. (35) and (54), as the columns of its 3x3 blocks K_ab, a <= b; one thread per column.
 
         Args:
-            form: 0: K; 1: without what can make it indefinite at a point, compression and stress of the viscosity, and
-                with a stand-in for laws that need J > 0, a function of u.
-            add: to what is there, of another part of the energy.
+            form: 0: K. 1: positive semi-definite at each point: without compression and viscous stress in the
+                geometric part, and with `stand_in` for laws that need J > 0; a function of u alone.
+            add: 1: add to `matrix`, which holds K of another part of the energy.
         """
         world, index = wp.tid()
         if active[world] == 0:
@@ -173,20 +179,20 @@ def matrix_kernels(
         unit = vec3()
         unit[axis] = T(1.0)
         out = Local()
-        for q in range(block.gradient.shape[0]):
+        for point in range(block.gradient.shape[0]):
             F = wp.matrix_from_rows(
-                lines[world, 5 * q, elem], lines[world, 5 * q + 1, elem], lines[world, 5 * q + 2, elem]
+                lines[world, 5 * point, elem], lines[world, 5 * point + 1, elem], lines[world, 5 * point + 2, elem]
             )
-            d = lines[world, 5 * q + 3, elem]
-            o = lines[world, 5 * q + 4, elem]
+            d = lines[world, 5 * point + 3, elem]
+            o = lines[world, 5 * point + 4, elem]
             S = mat33(d[0], o[2], o[1], o[2], d[1], o[0], o[1], o[0], d[2])
             h = vec3()
             if wp.static(affine):
-                h = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[q, b, 0]
+                h = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[point, b, 0]
             else:
-                h = block.gradient[q, b, elem]
+                h = block.gradient[point, b, elem]
             if wp.static(framed):
-                h = wp.transpose(block.frame[q, elem]) * h
+                h = wp.transpose(block.frame[point, elem]) * h
             # dF = unit h^T, so that F^T dF is the outer product of a row of F and h
             B = t.sym(wp.outer(wp.transpose(F) * unit, h))
             dP = wp.outer(unit, S * h)
@@ -203,16 +209,16 @@ def matrix_kernels(
                 else:
                     dP += m.increment(F - t.identity(), wp.outer(unit, h), c)
             if wp.static(framed):
-                dP = dP * wp.transpose(block.frame[q, elem])
-            dP = fn.weight_of(block, q, elem) * dP
+                dP = dP * wp.transpose(block.frame[point, elem])
+            dP = fn.weight_of(block, point, elem) * dP
             if wp.static(affine):
                 dP = dP * wp.transpose(fn.inverse_jacobian(block, elem))
             for a in range(NS):
                 if a <= b:
                     if wp.static(affine):
-                        out[a] = out[a] + dP * block.gradient[q, a, 0]
+                        out[a] = out[a] + dP * block.gradient[point, a, 0]
                     else:
-                        out[a] = out[a] + dP * block.gradient[q, a, elem]
+                        out[a] = out[a] + dP * block.gradient[point, a, elem]
         for a in range(NS):
             if a <= b:
                 pair = a * NS - (a * (a - 1)) / 2 + b - a
@@ -222,11 +228,10 @@ def matrix_kernels(
 
     @wp.func
     def elasticity(F: mat33, S: mat33, moduli: moduli9, c: coef, form: int, w: T) -> Tensor:
-        """w dP_ik/dF_jl, [3 i + k, 3 j + l]: the linear part, of S = `moduli` : E and of viscosity, and the rest.
+        """w dP_ik/dF_jl at [3 i + k, 3 j + l]: of S, of stresses linear in E (`moduli`), and of laws that need J > 0.
 
-        With the shears G and the other moduli D of pairs k, l: for k != l it is
-        S_kl delta_ij + D_kl F_ik F_jl + G_kl F_il F_jk, and for k = l S_kk delta_ij + D_kk F_ik F_jk + the sum over the
-        other m of G_mk F_im F_jm.
+        With the shear moduli G and the other moduli D of `moduli`, the first two give S_kl delta_ij + D_kl F_ik F_jl +
+        G_kl F_il F_jk for k != l, and S_kk delta_ij + D_kk F_ik F_jk + sum of G_mk F_im F_jm over m != k for k = l.
         """
         A = Tensor()
         for k in range(3):
@@ -284,13 +289,13 @@ def matrix_kernels(
         add: int,
         matrix: wp.array3d(dtype=Rows),
     ):
-        """K of an element by one thread, what `prepare_matrix` does included.
+        """K of each element by one thread; it needs no `prepare_matrix`.
 
-        A is dP/dF at a point; a panel's A : (e_j h_b^T) are the rows of D, over b, and K_ab = h_a . D_b.
+        A is dP/dF at a point; the rows of D, over b, are A : (e_j h_b^T) of a panel, and K_ab = h_a . D_b.
 
         Args:
-            matrix: [world, elem, row_of(panel, a)] rows 3 i + j of K_ab over the slots b of a panel.
-            form, add: as of `element_matrix`.
+            matrix: [world, elem, row_of(panel, a)], K_ab over the slots b of a panel, see `rows_type`.
+            form, add: see `element_matrix`.
         """
         world, elem = wp.tid()
         if active[world] == 0:
@@ -307,23 +312,23 @@ def matrix_kernels(
             for k in range(matrix.shape[2]):
                 matrix[world, elem, k] = Rows()
         h, H = Local(), Slots()
-        for q in range(block.gradient.shape[0]):
-            F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, q, elem)
+        for point in range(block.gradient.shape[0]):
+            F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, point, elem)
             into = t.identity()
             if wp.static(framed):
-                into = wp.transpose(block.frame[q, elem])
+                into = wp.transpose(block.frame[point, elem])
             if wp.static(affine):
                 into = into * wp.transpose(fn.inverse_jacobian(block, elem))
             for a in range(NS):
                 if wp.static(affine):
-                    h[a] = into * block.gradient[q, a, 0]
+                    h[a] = into * block.gradient[point, a, 0]
                 elif wp.static(framed):
-                    h[a] = into * block.gradient[q, a, elem]
+                    h[a] = into * block.gradient[point, a, elem]
                 else:
-                    h[a] = block.gradient[q, a, elem]
+                    h[a] = block.gradient[point, a, elem]
                 for l in range(3):
                     H[3 * (a / P) + l, a % P] = h[a][l]
-            A = elasticity(F, S, moduli, c, form, fn.weight_of(block, q, elem))
+            A = elasticity(F, S, moduli, c, form, fn.weight_of(block, point, elem))
             for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
                 D = Products()
                 for i in range(9):

@@ -1,4 +1,4 @@
-"""What only some scenes or outputs launch of table elements, each compiled apart: history, viscous force, stress."""
+"""Kernels of table elements that only some scenes or outputs launch, each a module: history, viscous force, stress."""
 
 import types as _types
 
@@ -11,11 +11,12 @@ __all__ = ["output_kernels"]
 
 
 def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types.SimpleNamespace:
-    """Kernels of the block with the functions fn of points.py.
+    """Kernels of one kind of element block.
 
     Args:
-        name: what names of modules begin with.
-        points: quadrature points.
+        fn: the functions of points.py for this kind.
+        name: beginning of the names of the modules.
+        points: quadrature points per element.
     """
     NQ = points
     history_module = kernel_module(f"{name}_history")
@@ -36,17 +37,17 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         active: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
     ):
-        """a0 E(u0) - a1 E(u1) per point, in the law's axes: what the incremental strain rate is measured from."""
+        """a0 E(u0) - a1 E(u1) per point in the law's axes: the strain that incremental strain rates start from."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
         U0 = fn.load(block, u0, world, elem)
-        for q in range(NQ):
-            E = T(a0[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U0, q, elem), q, elem))
+        for point in range(NQ):
+            E = T(a0[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U0, point, elem), point, elem))
             if a1[world] != wp.float64(0.0):
                 U1 = fn.load(block, u1, world, elem)
-                E = E - T(a1[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U1, q, elem), q, elem))
-            history[world, fn.history_index(block, q, elem)] = fn.pack(E)
+                E = E - T(a1[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U1, point, elem), point, elem))
+            history[world, fn.history_index(block, point, elem)] = fn.pack(E)
 
     @wp.kernel(module=viscous_module)
     def viscous_force(
@@ -57,7 +58,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         contribution: wp.array2d(dtype=vec3),
         power: wp.array2d(dtype=wp.float64),
     ):
-        """Kelvin-Voigt force, Eqs. (58)-(70), at a given state, and its dissipation rate S_vis : Edot (W)."""
+        """Kelvin-Voigt force (N), Eqs. (58)-(70), at a given state, and the power S_vis : Edot (W) lost."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -66,13 +67,13 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         V = fn.load(block, v, world, elem)
         f = Local()
         rate_of_work = T(0.0)
-        for q in range(NQ):
-            G = fn.gradient_of(block, U, q, elem)
+        for point in range(NQ):
+            G = fn.gradient_of(block, U, point, elem)
             F = t.identity() + G
-            rate = t.sym(wp.transpose(F) * fn.gradient_of(block, V, q, elem))
+            rate = t.sym(wp.transpose(F) * fn.gradient_of(block, V, point, elem))
             S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
-            rate_of_work += fn.weight_of(block, q, elem) * wp.ddot(S, rate)
-            f = fn.scatter(block, f, F * S, q, elem)
+            rate_of_work += fn.weight_of(block, point, elem) * wp.ddot(S, rate)
+            f = fn.scatter(block, f, F * S, point, elem)
         for i in range(NS):
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
         power[world, block.element_offset + elem] = wp.float64(rate_of_work)
@@ -84,15 +85,15 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         stress: wp.array3d(dtype=sym6),
         jacobian: wp.array3d(dtype=T),
     ):
-        """Cauchy stress P F^T / J (elastic part) and J at the quadrature points, [world, point, elem]."""
+        """Cauchy stress P F^T / J (Pa, elastic part, Voigt order) and J at the points, [world, point, elem]."""
         world, elem = wp.tid()
         c = fn.coefficients(block, world, elem)
         U = fn.load(block, u, world, elem)
-        for q in range(NQ):
-            G = fn.gradient_of(block, U, q, elem)
+        for point in range(NQ):
+            G = fn.gradient_of(block, U, point, elem)
             J = T(1.0) + t.volume_change(G)
-            P = fn.out_of_axes(block, m.stress(fn.into_axes(block, G, q, elem), c), q, elem)
-            stress[world, q, elem] = fn.pack((T(1.0) / J) * (P + P * wp.transpose(G)))
-            jacobian[world, q, elem] = J
+            P = fn.out_of_axes(block, m.stress(fn.into_axes(block, G, point, elem), c), point, elem)
+            stress[world, point, elem] = fn.pack((T(1.0) / J) * (P + P * wp.transpose(G)))
+            jacobian[world, point, elem] = J
 
     return _types.SimpleNamespace(strain_history=strain_history, viscous_force=viscous_force, point_stress=point_stress)

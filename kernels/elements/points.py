@@ -1,8 +1,8 @@
-"""What is done at a quadrature point of a table element: gradients, axes, strain rates, increments of stress.
+"""Device functions of a table element at its quadrature points: gradients, axes, strain rates, increments of stress.
 
-The family of an element is only its numbers of slots and points and the tables; straight tetrahedra share one table of
-parent gradients and keep J0^-1, others keep h per element and point. Displacements are taken relative to the element's
-first position slot: a rigid translation then has exactly zero strain.
+The device code knows of an element family only its number of slots and its tables. Straight ("affine") elements share
+one table of parent gradients and keep J0^-1 each; others keep h_i per element and point. Displacements are taken
+relative to the first slot of the element, which is a position: a rigid translation then has exactly zero strain.
 """
 
 import functools
@@ -27,7 +27,7 @@ def block_struct(dtype: str):
         conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
         is_position: wp.array(dtype=T)  # [local] 1 for a position slot, 0 for a gradient slot
         gradient: wp.array3d(dtype=vec3)  # [point, local, elem] h_i; affine: [point, local, 0] parent gradient
-        vertex_gradient: wp.array3d(dtype=vec3)  # the same at the vertices, for laws that need J > 0
+        vertex_gradient: wp.array3d(dtype=vec3)  # the same at the vertices, where J is tested for laws that need J > 0
         shape: wp.array3d(dtype=T)  # [point, local, elem or 0] s_i at the points of the mass rule (field loads)
         field_weight: wp.array2d(dtype=T)  # [point, elem] rho w at those points
         J0_inv: wp.array2d(dtype=T)  # [3 row + column, elem], affine only
@@ -35,14 +35,14 @@ def block_struct(dtype: str):
         weight: wp.array2d(dtype=T)  # [point, elem] W det J0; affine: [point, 0] W
         det_J0: wp.array(dtype=T)  # [elem], affine only
         mass: wp.array2d(dtype=T)  # [local, local] int s_i s_j over the parent; affine only
-        density: wp.array(dtype=T)  # [elem] rho det J0, where it is constant; affine only
+        density: wp.array(dtype=T)  # [elem] rho det J0, kg; affine only, with a density constant in each element
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]
         frame: wp.array2d(dtype=mat33)  # [point, elem] axes of the law, framed blocks only
-        contribution_offset: wp.int32
+        contribution_offset: wp.int32  # of the block among the contributions, elements and histories of all blocks
         element_offset: wp.int32
         history_offset: wp.int32
-        count: wp.int32
+        count: wp.int32  # elements
 
     return ElementBlock
 
@@ -51,7 +51,7 @@ def block_struct(dtype: str):
 def point_functions(
     dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool
 ) -> _types.SimpleNamespace:
-    """Functions of one kind of element block, of which the kernels of elements are made; arguments as there."""
+    """Device functions for one kind of element block; the arguments are those of `element_kernels`."""
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     t = materials.tensors(dtype)
@@ -65,6 +65,7 @@ def point_functions(
 
     @wp.func
     def coefficients(block: Block, world: int, elem: int) -> coef:
+        """Coefficients of an element's law, then eta and lambda_v of its damping (Pa s)."""
         c = coef()
         row = world % block.coefficients.shape[0]
         mat = block.material[elem]
@@ -74,6 +75,7 @@ def point_functions(
 
     @wp.func
     def damping_coefficients(c: coef, scale: T) -> coef:
+        """scale (lambda_v, eta) as the coefficients (lambda, mu) of `materials.svk`, which Eq. (62) has the form of."""
         d = coef()
         d[0] = c[LAMBDA_V] * scale
         d[1] = c[ETA] * scale
@@ -81,7 +83,7 @@ def point_functions(
 
     @wp.func
     def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
-        """Slot values of an element, translations taken relative to the first slot."""
+        """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
         U = Local()
         first = field[world, block.conn[0, elem]]
         for i in range(NS):
@@ -99,7 +101,7 @@ def point_functions(
 
     @wp.func
     def gradient_of(block: Block, U: Local, point: int, elem: int) -> mat33:
-        """sum_i u_i h_i^T at a point."""
+        """sum_i u_i h_i^T at a point, Eq. (1): F - I of displacements, Fdot of velocities."""
         D = mat33()
         for i in range(NS):
             if wp.static(affine):
@@ -112,6 +114,7 @@ def point_functions(
 
     @wp.func
     def weight_of(block: Block, point: int, elem: int) -> T:
+        """w = W_q det J0 of a quadrature point, Eq. (11): the volume that it stands for, m^3."""
         if wp.static(affine):
             return block.weight[point, 0] * block.det_J0[elem]
         else:
@@ -119,7 +122,7 @@ def point_functions(
 
     @wp.func
     def scatter(block: Block, f: Local, P: mat33, point: int, elem: int) -> Local:
-        """f_i += w P h_i."""
+        """f_i += w P h_i: what a point adds to the forces of Eq. (32)."""
         Q = weight_of(block, point, elem) * P
         if wp.static(affine):
             Q = Q * wp.transpose(inverse_jacobian(block, elem))
@@ -133,15 +136,17 @@ def point_functions(
 
     @wp.func
     def pack(A: mat33) -> sym6:
+        """A symmetric tensor in Voigt order (xx, yy, zz, yz, xz, xy)."""
         return sym6(A[0, 0], A[1, 1], A[2, 2], A[1, 2], A[0, 2], A[0, 1])
 
     @wp.func
     def unpack(a: sym6) -> mat33:
+        """The tensor whose components in Voigt order are a."""
         return mat33(a[0], a[5], a[4], a[5], a[1], a[3], a[4], a[3], a[2])
 
     @wp.func
     def into_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
-        """Components in the axes of the law."""
+        """R^T A R: from the axes of the body into those of the law, if it has its own."""
         if wp.static(framed):
             R = block.frame[point, elem]
             return wp.transpose(R) * A * R
@@ -150,7 +155,7 @@ def point_functions(
 
     @wp.func
     def out_of_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
-        """Components in the body's axes."""
+        """R A R^T: from the axes of the law back into those of the body."""
         if wp.static(framed):
             R = block.frame[point, elem]
             return R * A * wp.transpose(R)
@@ -159,11 +164,12 @@ def point_functions(
 
     @wp.func
     def history_index(block: Block, point: int, elem: int) -> int:
+        """Place of a quadrature point in the `history` array of all blocks."""
         return block.history_offset + point * block.count + elem
 
     @wp.func
     def velocity_gradient(block: Block, V: Local, point: int, elem: int) -> mat33:
-        """Fdot in the law's axes, where the form of damping needs it."""
+        """Fdot in the law's axes (1/s) for damping of the form "rate", Eq. (60); else zero."""
         if wp.static(damping == "rate"):
             return into_axes(block, gradient_of(block, V, point, elem), point, elem)
         else:
@@ -173,8 +179,10 @@ def point_functions(
     def strain_rate(
         block: Block, G: mat33, Fdot: mat33, history: wp.array2d(dtype=sym6), dq: T, world: int, point: int, elem: int
     ) -> mat33:
-        """Edot at a point: (E - history)/dq (incremental), or Eq. (58) with F and Fdot at the new state (rate); all in
-        the law's axes."""
+        """Edot at a point in the law's axes, 1/s.
+
+        Damping of the form "incremental": (E - history)/dq. "rate": Eq. (58) with F and Fdot at the new state.
+        """
         if wp.static(damping == "incremental"):
             past = unpack(history[world, history_index(block, point, elem)])
             return (T(1.0) / dq) * (t.green(G) - past)
@@ -183,15 +191,15 @@ def point_functions(
 
     @wp.func
     def vertex_jacobian(block: Block, U: Local, elem: int) -> T:
-        """Smallest J at the element's vertices, where a quadratic field is outside the hull of the points."""
+        """Smallest J at the vertices of an element, which lie outside the hull of its quadrature points."""
         J = T(1.0e30)
-        for q in range(block.vertex_gradient.shape[0]):
+        for vertex in range(block.vertex_gradient.shape[0]):
             D = mat33()
             for i in range(NS):
                 if wp.static(affine):
-                    D += wp.outer(U[i], block.vertex_gradient[q, i, 0])
+                    D += wp.outer(U[i], block.vertex_gradient[vertex, i, 0])
                 else:
-                    D += wp.outer(U[i], block.vertex_gradient[q, i, elem])
+                    D += wp.outer(U[i], block.vertex_gradient[vertex, i, elem])
             if wp.static(affine):
                 D = D * inverse_jacobian(block, elem)
             J = wp.min(J, T(1.0) + t.volume_change(D))
@@ -210,7 +218,7 @@ def point_functions(
         point: int,
         elem: int,
     ) -> mat33:
-        """dP at a point, with damping."""
+        """dP of a change dG at a point in the body's axes, damping included: the integrand of the tangent product."""
         local = into_axes(block, G, point, elem)
         change = into_axes(block, dG, point, elem)
         dP = m.increment(local, change, c)
@@ -232,15 +240,15 @@ def point_functions(
         world: int,
         elem: int,
     ) -> Local:
-        """K dU of an element."""
+        """K dU of an element: its forces for a change dU of its slots, Eqs. (35) and (54) applied to a vector."""
         c = coefficients(block, world, elem)
         f = Local()
-        for q in range(block.gradient.shape[0]):
-            G = gradient_of(block, U, q, elem)
-            dG = gradient_of(block, dU, q, elem)
-            Fdot = velocity_gradient(block, V, q, elem)
-            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, q, elem)
-            f = scatter(block, f, dP, q, elem)
+        for point in range(block.gradient.shape[0]):
+            G = gradient_of(block, U, point, elem)
+            dG = gradient_of(block, dU, point, elem)
+            Fdot = velocity_gradient(block, V, point, elem)
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, point, elem)
+            f = scatter(block, f, dP, point, elem)
         return f
 
     return _types.SimpleNamespace(

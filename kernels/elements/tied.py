@@ -1,7 +1,8 @@
-"""Shears by assumed natural strain (Dvorkin and Bathe 1984): force, energy, tangent product and diagonal blocks.
+"""Elements with assumed natural shear strain (Dvorkin and Bathe 1984): force, energy, tangent product and matrices.
 
-Covariant shears e_t = 2 E_ab are taken at tying points; interpolation, metric and quadrature are one symmetric matrix A
-per element, made on the host: Psi = (mu/2) e.A e.
+Covariant shears e_t = 2 E_ab = x_a . x_b - X_a . X_b are taken at tying points ("ties") t, where x_a and x_b are the
+derivatives of the position along two parent directions. Interpolation, metric and quadrature are one symmetric matrix A
+per element, made on the host: the energy is (mu/2) e.A e, J.
 """
 
 import functools
@@ -29,7 +30,7 @@ def tied_struct(dtype: str):
         second: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
         X_first: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
         X_second: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
-        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the tie's run
+        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A; k counts within the run of ties that it couples
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
         contribution_offset: wp.int32
@@ -42,10 +43,12 @@ def tied_struct(dtype: str):
 
 @functools.cache
 def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.SimpleNamespace:
-    """Kernels of tied elements; their arguments are those of `element_kernels`, so that one loop launches both.
+    """Kernels of tied elements; they take the arguments of `element_kernels`, so that one loop launches both.
 
     Args:
-        width: A couples the ties of each run of so many.
+        dtype: precision.
+        slots, ties: slots and tying points per element.
+        width: A couples the ties of each run of `width`.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
@@ -59,7 +62,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     NS, NT, W = slots, ties, width
     PANELS, P, _ = panels_of(NS)
     Row = wp.types.vector(length=P, dtype=T)
-    GROUP = 4 if NT % 4 == 0 else 1  # ties per loading and storing of a row of the matrix
+    GROUP = 4 if NT % 4 == 0 else 1  # ties added to a row of the matrix between loading and storing it
     Rows = rows_type(dtype, P)
     Slots = wp.types.matrix(shape=(NT * PANELS, P), dtype=T)
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
@@ -68,7 +71,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
 
     @wp.func
     def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
-        """Slot values of an element, translations taken relative to the first slot."""
+        """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
         U = Local()
         first = field[world, block.conn[0, elem]]
         for i in range(NS):
@@ -77,6 +80,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
 
     @wp.func
     def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
+        """sum_i s_i,a u_i at a tie, with `table` the derivatives along one direction: what U adds to x_a, m."""
         out = vec3()
         for i in range(NS):
             out += table[tie, i, elem] * U[i]
@@ -84,7 +88,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
 
     @wp.func
     def kinematics(block: Block, U: Local, elem: int):
-        """x_a and x_b at the ties, and x_a . x_b less its reference value, without cancellation."""
+        """x_a, x_b (m) and the shears e (m^2) at the ties; e is formed without subtracting nearly equal numbers."""
         first, second = TieVectors(), TieVectors()
         e = Ties()
         for t in range(NT):
@@ -97,7 +101,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
 
     @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
-        """mu A e."""
+        """s = mu A e, the derivative of the energy by the shears, N/m."""
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         s = Ties()
         for t in range(NT):
@@ -122,7 +126,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         min_J: wp.array(dtype=wp.float64),
         domain_J: wp.array(dtype=wp.float64),
     ):
-        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), and the energy e.s/2; one lane per element."""
+        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), N, and the energy e.s/2, J; one thread per element."""
         world, elem = wp.tid()
         if active[world] == 0 or elem >= block.count:
             return
@@ -151,7 +155,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p."""
+        """K p (N): the change of `internal_force` with a change p of the slots."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -180,7 +184,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         active: wp.array(dtype=wp.int32),
         contribution: wp.array2d(dtype=sym6),
     ):
-        """The 3x3 diagonal blocks of K without the geometric part: positive, as A is."""
+        """The 3x3 diagonal blocks of K in Voigt order, without the geometric part: positive semi-definite, as A is."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -213,8 +217,10 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         active: wp.array(dtype=wp.int32),
         lines: wp.array3d(dtype=vec3),
     ):
-        """What all columns of an element's matrix need of a tie: x_a and x_b, [world, tie and NT + tie, elem], and the
-        shear, the first component of 2 NT + tie."""
+        """What all columns of an element's matrix need of a tie, [world, row, elem].
+
+        Row `tie` holds x_a, row NT + tie x_b, and row 2 NT + tie the shear e_t in its first component.
+        """
         world, tie, elem = wp.tid()
         if active[world] == 0:
             return
@@ -234,7 +240,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
 
     @wp.kernel(module=matrix_module)
     def prepare_stress(block: Block, active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)):
-        """The stresses of the ties, the first components of 3 NT + tie."""
+        """s = mu A e of the ties, in the first components of the rows 3 NT + tie."""
         world, tie, elem = wp.tid()
         if active[world] == 0:
             return
@@ -255,7 +261,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=vec3),
     ):
-        """As of `element_kernels`; `form` = 1: without the geometric part."""
+        """K of each element by columns, stored as by `element_kernels`; `form` 1: without the geometric part."""
         world, index = wp.tid()
         if active[world] == 0:
             return
@@ -305,7 +311,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         add: int,
         matrix: wp.array3d(dtype=Rows),
     ):
-        """As of `element_kernels`: K = mu B^T A B + geometric part, with the slots of a panel side by side."""
+        """K = mu B^T A B + geometric part of each element by one thread, stored by panels as by `element_kernels`."""
         world, elem = wp.tid()
         if active[world] == 0:
             return

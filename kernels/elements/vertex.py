@@ -1,18 +1,19 @@
-"""Product with mass of straight 10-node tetrahedra whose rule has a point on each line from the centroid to a vertex.
+"""(c_M M + (dq/dv) K) p of straight T10 whose rule has a point on each line from the centroid to a vertex.
 
 A gradient is linear over such an element. With L_b the volume coordinates, e(v, b) the slot half-way from vertex v to
-vertex b, and e(v, v) = v, at vertex v, at the centroid, and at the point that lies s of the way from there to v it is
+vertex b and e(v, v) = v, the gradient in parent coordinates is D_v at vertex v, S at the centroid, and D at the point
+that lies s of the way from the centroid to v:
 
     D_v = 4 E_v - C,    E_v = sum_b u_e(v, b) dL_b^T,    C = sum_b u_b dL_b^T
     S = sum_ab u_e(a, b) (dL_a + dL_b)^T    over the edges
     D = (1 - s) S + s D_v = H + 4 s E_v,    H = (1 - s) S - s C
 
-in parent coordinates, where dL_k is the k-th axis and dL_0 minus their sum: differences of slots alone, which cancel a
-translation. Forces are the transpose: slot e(v, b) takes 4 s Q_v dL_b of the stress Q_v at each point, and then
+Here dL_k is the k-th axis and dL_0 minus their sum, so that only differences of slots enter and a translation cancels.
+Forces are the transpose: of the stress Q_v at a point slot e(v, b) takes 4 s Q_v dL_b, and all points together give
 
     corner b: -B dL_b,    edge a b: R (dL_a + dL_b),    B = s sum_v Q_v,    R = Q_centroid + (1 - s) sum_v Q_v.
 
-What lives across a point is H of each field and B; forces lie with the fields in the memory of a cluster.
+From one point to the next only H of each field and B are kept; forces lie beside the fields in the memory of a cluster.
 """
 
 import types as _types
@@ -29,7 +30,7 @@ SPOKES = tuple(
     wp.vec4i(*(v if a == v else 4 + next(k for k, edge in enumerate(EDGES) if {a, v} == set(edge)) for a in range(4)))
     for v in range(4)
 )
-"""e(v, b)."""
+"""e(v, b) of each vertex v."""
 
 
 @wp.func_native("""
@@ -38,11 +39,11 @@ SPOKES = tuple(
     #endif
 """)
 def forget():
-    """Nothing read before is kept: it would take registers that more blocks could have."""
+    """Keep no value in registers that was read before: with fewer registers more blocks run at once."""
 
 
 def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.SimpleNamespace) -> wp.Function:
-    """What an element adds to the product, in this form.
+    """The device function `product`, which sets the forces of an element in this form.
 
     Args:
         points: 4, one for each vertex, or 5, the centroid before them.
@@ -63,7 +64,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
 
     @wp.func
     def spokes(pool: Pool, field: int, at: int, e: wp.vec4i) -> mat33:
-        """sum_b u_e(b) dL_b^T."""
+        """sum_b u_e(b) dL_b^T of a field: E_v with e = e(v, .), C with the corners."""
         o = fetch(pool, field, e[0], at)
         return wp.matrix_from_cols(
             fetch(pool, field, e[1], at) - o,
@@ -73,7 +74,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
 
     @wp.func
     def central(pool: Pool, field: int, at: int) -> mat33:
-        """S, where opposite edges have opposite signs."""
+        """S of a field, the gradient at the centroid; opposite edges enter with opposite signs."""
         a = fetch(pool, field, 5, at) - fetch(pool, field, 7, at)
         b = fetch(pool, field, 8, at) - fetch(pool, field, 6, at)
         c = fetch(pool, field, 9, at) - fetch(pool, field, 4, at)
@@ -81,7 +82,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
 
     @wp.func
     def common(pool: Pool, field: int, at: int, s: T) -> mat33:
-        """H."""
+        """H = (1 - s) S - s C of a field, which all four vertices have in common."""
         S = central(pool, field, at)
         return S - s * (S + spokes(pool, field, at, wp.vec4i(0, 1, 2, 3)))
 
@@ -94,7 +95,10 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
 
     @wp.func
     def finish(block: Block, pool: Pool, scale: T, B: mat33, R: mat33, at: int):
-        """Adds what B and R give, and scale M p, where M has one number for each way that two slots can lie."""
+        """Add the forces of B and R, and scale M p.
+
+        M (over the parent) has one number for each way in which two slots can lie to each other: seven in all.
+        """
         u = Local()
         for i in range(10):
             u[i] = fetch(pool, DIRECTION, i, at)
@@ -107,7 +111,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
         of_corner = scale * block.mass[0, 0] - beside
         of_edge = scale * block.mass[4, 4] - joined
         across = scale * block.mass[4, 9] - joined
-        # what all corners and all edges have in common, then what differs from it
+        # first the part that all corners and all edges have in common, then the differences from it
         at_corner = beside * corners + far * edges
         at_edge = far * corners + joined * edges
         for i in range(4):
@@ -131,9 +135,9 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
         elem: int,
         at: int,
     ):
-        """scale M p + dq K p of element `at` of a cluster.
+        """Set the forces (scale M + dq K) p of element `at` of a cluster.
 
-        Slots are read anew at each vertex, and forces lie in the pool, to hold fewer registers.
+        Slots are read again at each vertex and forces are kept in the pool, which takes fewer registers.
         """
         c = coefficients(block, world, elem)
         # the first function's gradient at the first vertex's point is 3 s dL_0
@@ -146,7 +150,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
         B = mat33()
         for k in range(4):
             forget()
-            q = FIRST + k
+            point = FIRST + k
             e = wp.static(SPOKES[k])
             J0_inv = inverse_jacobian(block, elem)
             G = (H + T(4.0) * s * spokes(pool, U, at, e)) * J0_inv
@@ -154,12 +158,12 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
             Fdot = mat33()
             if wp.static(rate):
                 Fdot = (rate_H + T(4.0) * s * spokes(pool, V, at, e)) * J0_inv
-            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, q, elem)
-            w = T(4.0) * dq * s * block.weight[q, 0] * block.det_J0[elem]
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, point, elem)
+            w = T(4.0) * dq * s * block.weight[point, 0] * block.det_J0[elem]
             Q = w * dP * wp.transpose(J0_inv)
             B += T(0.25) * Q
             for b in range(4):
-                if wp.static(b < k):  # an edge to a vertex that has been
+                if wp.static(b < k):  # the edge to a vertex already done has a force
                     add_force(pool, wp.static(SPOKES[k][b]), at, column(Q, b))
                 else:
                     set_force(pool, wp.static(SPOKES[k][b]), at, column(Q, b))

@@ -1,4 +1,4 @@
-"""The product c_M M p + (dq/dv) K p of straight elements, mass included, by clusters of elements."""
+"""The product (c_M M + (dq/dv) K) p of straight elements, mass included, by clusters of elements (cluster.py)."""
 
 import functools
 
@@ -23,7 +23,7 @@ def with_mass_kernel(
         law: name in `materials.LAWS`.
         slots, points: slots and quadrature points per element.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
-        vertex: 10-node tetrahedra with a rule for kernels/elements/vertex.py.
+        vertex: 10-node tetrahedra with a rule that kernels/elements/vertex.py handles.
         size: elements of a cluster.
     """
     fn = point_functions(dtype, law, slots, True, damping, False)
@@ -31,8 +31,8 @@ def with_mass_kernel(
     Block, Local, NS = fn.Block, fn.Local, fn.slots
     shared = cluster_functions(dtype, size, slots, 3 if damping == "rate" else 2)
     Pool = shared.Pool
-    # slots in registers, not in arrays that loops index; the loops over points stay loops
-    name = f"massive_{dtype}_{law}_{slots}_{points}_{'vertex' if vertex else 'affine'}_{damping}_{size}"
+    # unrolled loops over slots keep them in registers; the loops over points are longer and stay loops
+    name = f"with_mass_{dtype}_{law}_{slots}_{points}_{'vertex' if vertex else 'affine'}_{damping}_{size}"
     module = kernel_module(name, max_unroll=16, block_dim=size)
 
     if vertex:
@@ -41,7 +41,7 @@ def with_mass_kernel(
 
         @wp.func
         def fetch_all(block: Block, pool: Pool, field: int, at: int) -> Local:
-            """Slot values of an element, translations taken relative to the first slot."""
+            """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
             out = Local()
             first = shared.fetch(pool, field, 0, at)
             for i in range(NS):
@@ -52,7 +52,7 @@ def with_mass_kernel(
         def product(
             block: Block, pool: Pool, history: wp.array2d(dtype=sym6), dq: T, scale: T, world: int, elem: int, at: int
         ):
-            """scale M p + dq K p of element `at` of a cluster."""
+            """Set the forces (scale M + dq K) p of element `at` of a cluster."""
             u = fetch_all(block, pool, U, at)
             du = fetch_all(block, pool, DIRECTION, at)
             v = Local()
@@ -68,6 +68,6 @@ def with_mass_kernel(
                     total += block.mass[i, j]
                 shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
 
-    # of this kind spilling was measured to be little; of others the compiler decides
+    # measured for this kind: the bound makes it spill few registers; for others the compiler chooses
     bounded = vertex and law == "svk" and damping is None
     return shared.by_clusters(module, Block, product, bounded)

@@ -1,1 +1,1 @@
-"""Pictures on the device."""
+"""Pictures drawn on the device."""

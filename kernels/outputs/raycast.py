@@ -1,6 +1,6 @@
 """Ray casting of a triangle mesh over a ground plane: one thread per sample of the picture.
 
-Everything is scaled by the host so that the scene has size one, with z up; colours are linear light.
+The host scales everything so that the scene has size one, with z up. Colours are linear light, 0 to 1.
 """
 
 import warp as wp
@@ -10,6 +10,8 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 @wp.struct
 class Scene:
+    """What a picture shows: mesh, camera, light, ground plane and its shadow map."""
+
     mesh: wp.uint64
     corner_normals: wp.array(dtype=wp.vec3)  # [3 * face + corner]
     colors: wp.array(dtype=wp.vec3)  # [vertex]
@@ -23,28 +25,29 @@ class Scene:
     light: wp.vec3  # towards the light
     ground: float  # height of the ground plane
     has_ground: int
-    grid: float  # distance of its fine lines; every fifth is strong
-    fade: float  # radius at which it has faded
-    focus: wp.vec2  # its middle
+    grid: float  # distance of the ground's fine lines; every fifth is strong
+    fade: float  # radius at which the ground has faded into the background
+    focus: wp.vec2  # (x, y) of the middle of the ground
     shadow: wp.array2d(dtype=float)  # light (0 .. 1) that reaches the ground
-    shadow_low: wp.vec2
-    shadow_cell: float
+    shadow_low: wp.vec2  # corner of the shadow map
+    shadow_cell: float  # size of its cells
 
 
 @wp.func
 def mix(a: wp.vec3, b: wp.vec3, t: float):
+    """a (1 - t) + b t."""
     return a * (1.0 - t) + b * t
 
 
 @wp.func
 def backdrop(height: float):
-    """Background at a height in the picture, 0 at the bottom."""
+    """Colour of the background at a height in the picture, 0 at the bottom and 1 at the top."""
     return mix(wp.vec3(0.90, 0.91, 0.92), wp.vec3(0.60, 0.68, 0.78), wp.clamp(height, 0.0, 1.0))
 
 
 @wp.func
 def line(x: float, step: float, half_width: float, footprint: float):
-    """How much of a pixel of size `footprint` at x the lines at multiples of `step` cover."""
+    """Part of a pixel of size `footprint` at x that is covered by lines at the multiples of `step`."""
     d = wp.abs(x / step - wp.round(x / step)) * step
     w = wp.max(half_width, 0.5 * footprint)
     strength = half_width / w
@@ -53,7 +56,7 @@ def line(x: float, step: float, half_width: float, footprint: float):
 
 @wp.func
 def ground_light(scene: Scene, x: float, y: float):
-    """Bilinear value of the shadow map; 1 outside."""
+    """Light (0 to 1) that reaches a point of the ground: the shadow map, bilinear; 1 outside of it."""
     fx = (x - scene.shadow_low[0]) / scene.shadow_cell - 0.5
     fy = (y - scene.shadow_low[1]) / scene.shadow_cell - 0.5
     i = int(wp.floor(fx))
@@ -69,7 +72,7 @@ def ground_light(scene: Scene, x: float, y: float):
 
 @wp.func
 def shade_ground(scene: Scene, p: wp.vec3, distance: float, slope: float, behind: wp.vec3):
-    """A light plane with a grid, its shadow, and a soft border."""
+    """Colour of the ground at p: a light plane with a grid and the shadow, which fades into the colour `behind` it."""
     base = wp.vec3(0.80, 0.81, 0.83)
     pixel = distance * wp.length(scene.up) * 2.0 / scene.height
     footprint = pixel / wp.max(slope, 0.05)
@@ -84,7 +87,7 @@ def shade_ground(scene: Scene, p: wp.vec3, distance: float, slope: float, behind
 
 @wp.func
 def shade_surface(scene: Scene, p: wp.vec3, n: wp.vec3, flat: wp.vec3, albedo: wp.vec3, ray: wp.vec3):
-    """Sky and ground light, a key light with shadow, a head light, a small highlight."""
+    """Colour of a surface at p: light of sky and ground, a key light with shadow, a head light, a small highlight."""
     key = wp.max(wp.dot(n, scene.light), 0.0)
     if key > 0.0:
         if wp.mesh_query_ray_anyhit(scene.mesh, p + flat * 1.0e-3, scene.light, 10.0):
@@ -133,7 +136,7 @@ def cast(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.
 
 @wp.kernel
 def cast_shadow(scene: Scene, lights: wp.array(dtype=wp.vec3), shadow: wp.array2d(dtype=float)):
-    """Share of the directions `lights` in which a cell of the ground sees no surface."""
+    """The shadow map: share of the directions `lights` in which a cell of the ground sees no surface."""
     i, j = wp.tid()
     x = scene.shadow_low[0] + (float(i) + 0.5) * scene.shadow_cell
     y = scene.shadow_low[1] + (float(j) + 0.5) * scene.shadow_cell

@@ -1,7 +1,7 @@
-"""Cholesky factors of a banded matrix, in blocks of 4 x 4 whose columns lie side by side; one thread per world.
+"""Cholesky factors of a banded matrix in 4 x 4 blocks, one thread per world: for the CPU.
 
-Block row I of L holds the blocks J = I - width .. I one after the other, columns within, L_II as its inverse. For the
-CPU: a row after the other is what one core does well, its units of arithmetic take a column at once.
+Block row I of L holds the blocks J = I - width .. I one after the other, each stored by columns, and of L_II its
+inverse. One core works through the rows in turn, and its vector units process a column of a block at once.
 """
 
 import functools
@@ -16,10 +16,11 @@ __all__ = ["BLOCK", "band_kernels", "column_type"]
 
 BLOCK = 4
 SHIFT_GROWTH = 100.0
+"""Factor by which the shift of the diagonal grows when a factorisation has failed again."""
 
 
 def column_type(dtype: str):
-    """A column of a block."""
+    """Type of a column of a block."""
     return wp.types.vector(length=BLOCK, dtype=precision(dtype).T)
 
 
@@ -31,15 +32,15 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     Pattern = pattern_struct()
     Column = column_type(dtype)
     Block = wp.types.matrix(shape=(BLOCK, BLOCK), dtype=T)
-    # a pivot below this share of its diagonal is rounding, or the matrix is indefinite there
+    # a pivot below this share of its diagonal entry is rounding, or the matrix is indefinite there
     NEGLIGIBLE = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
-    # share of the diagonal that is added first where that comes up, of rounding or of an indefinite matrix
+    # the first shift where such a pivot comes up, as a share of the diagonal
     FIRST_SHIFT = {"float64": 1.0e-4, "float32": 1.0e-6}[dtype]
     module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
 
     @wp.kernel(module=module)
     def clear(slots: int, width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
-        """Zeros, and ones on the diagonal beyond the slots; one thread per block row."""
+        """Set the band to zero, with ones on the diagonal beyond the slots; one thread per block row."""
         world, row = wp.tid()
         if active[world] == 0:
             return
@@ -59,8 +60,10 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         band: wp.array3d(dtype=Column),
     ):
-        """The lower half of A + shift D with slots in the order of `place_of`, one thread per slot. A negative number
-        on the diagonal, of an unknown under strong compression, takes the other sign."""
+        """The lower half of A + shift |D|, D = diag A, with slots in the order of `place_of`; one thread per slot.
+
+        A negative number on the diagonal, as of an unknown under strong compression, is made positive.
+        """
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -82,10 +85,11 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def inverse_factor(A: Block, given: Column) -> Block:
-        """Columns of L^-1 of A = L L^T.
+        """Columns of L^-1, with A = L L^T.
 
-        An unknown whose pivot is not safely positive, measured by the `given` diagonal, takes that, and its column of
-        L ends there: L L^T is positive whatever A is. Its number on the diagonal is negative, for the blocks below.
+        Where a pivot is not safely positive against the `given` diagonal, that takes its place and the rest of the
+        column of L is zero, so that L L^T is positive definite whatever A is. The entry of L^-1 on the diagonal is
+        negative then, which tells the blocks below.
         """
         S = Block()
         for c in range(BLOCK):
@@ -98,7 +102,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
             if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
                 scale = T(1.0) / wp.sqrt(pivot)
                 column = scale * S[j]
-                # rows of L^-1: what the rows above leave of e_j, over the pivot
+                # row j of L^-1: what the rows above leave of e_j, over the root of the pivot
                 own = scale * rows[j]
                 own[j] = scale
                 for c in range(j + 1, BLOCK):
@@ -113,7 +117,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     def factor(
         width: int, active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)
     ):
-        """L in place; `bad`: unknowns without a pivot of their own."""
+        """Factor A into L, in place; `bad`: number of unknowns whose pivot had to be replaced."""
         world = wp.tid()
         if active[world] == 0:
             return
@@ -155,7 +159,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin(flags: wp.array(dtype=wp.int32), doing: wp.array(dtype=wp.int32), shift: wp.array(dtype=T)):
-        """Which worlds are factored."""
+        """Start with the flagged worlds, and no shift."""
         world = wp.tid()
         doing[world] = flags[world]
         if flags[world] != 0:
@@ -168,7 +172,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         shift: wp.array(dtype=T),
         again: wp.array(dtype=wp.int32),
     ):
-        """Where A is not positive, more of its diagonal is added and it is factored again, up to A + D."""
+        """Where A was not positive definite, raise the shift, up to 1, and ask for another factorisation."""
         world = wp.tid()
         if doing[world] == 0:
             return
@@ -188,7 +192,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         y: wp.array2d(dtype=Column),
         z: wp.array2d(dtype=vec3),
     ):
-        """z = A^-1 r."""
+        """z = A^-1 r by forward and backward substitution; y holds the forward solution."""
         world = wp.tid()
         if active[world] == 0:
             return

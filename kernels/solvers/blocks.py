@@ -13,22 +13,7 @@ from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SMALL, kernel_module, precision
 from ..elements.matrix import panels_of, row_of
 
-__all__ = ["assembly_kernels", "block_kernels", "coupling_struct"]
-
-
-@functools.cache
-def coupling_struct():
-    """What constraints add to entries: rho w grad_a grad_b^T."""
-
-    @wp.struct
-    class Couplings:
-        entry: wp.array(dtype=wp.int32)  # [item] index into Pattern.upper
-        start: wp.array(dtype=wp.int32)  # [item + 1]
-        term_a: wp.array(dtype=wp.int32)  # index into Multipliers.gradient
-        term_b: wp.array(dtype=wp.int32)
-        weight: wp.array(dtype=wp.float64)
-
-    return Couplings
+__all__ = ["assembly_kernels", "block_kernels"]
 
 
 @functools.cache
@@ -154,45 +139,11 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels on matrices of 3x3 blocks, whatever they came from."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
-    f64 = wp.float64
     vec4 = wp.types.vector(length=4, dtype=T)
     Topology = topology_struct(dtype)
-    Pattern, Couplings = pattern_struct(), coupling_struct()
+    Pattern = pattern_struct()
     free_inverse = inverse_function(dtype)
     module = kernel_module(f"blocks_{dtype}", max_unroll=SMALL)
-    coupling_module = kernel_module(f"couplings_{dtype}", max_unroll=SMALL)
-
-    @wp.kernel(module=coupling_module)
-    def add_constraints(
-        topo: Topology,
-        pattern: Pattern,
-        con: Couplings,
-        gradient: wp.array2d(dtype=wp.vec3d),
-        stiffness: wp.array2d(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=mat33),
-    ):
-        """value += (dq/dv) J^T rho J."""
-        world, item = wp.tid()
-        if active[world] == 0:
-            return
-        at = pattern.upper[con.entry[item]]
-        A = wp.mat33d()
-        for k in range(con.start[item], con.start[item + 1]):
-            a = con.term_a[k]
-            factor = con.weight[k] * dq_dv[world] * stiffness[world, a / 3]
-            A += factor * wp.outer(gradient[world, a], gradient[world, con.term_b[k]])
-        B = mat33(A)
-        row_free = topo.free[at[2]]
-        column_free = topo.free[at[3]]
-        for i in range(3):
-            for j in range(3):
-                B[i, j] = row_free[i] * column_free[j] * B[i, j]
-        B += value[world, at[0]]
-        value[world, at[0]] = B
-        if at[1] != at[0]:
-            value[world, at[1]] = wp.transpose(B)
 
     @wp.kernel(module=module)
     def take_diagonal(
@@ -252,7 +203,4 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
         at = pair[group]
         coarse[world, at[0] + k * at[1] + at[2] + l] = A
 
-    return _types.SimpleNamespace(
-        module=module, coupling_module=coupling_module, add_constraints=add_constraints, take_diagonal=take_diagonal,
-        galerkin=galerkin,
-    )  # fmt: skip
+    return _types.SimpleNamespace(module=module, take_diagonal=take_diagonal, galerkin=galerkin)

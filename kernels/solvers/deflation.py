@@ -1,8 +1,9 @@
-"""Constraint directions deflated: the preconditioner (D + (dq/dv) J^T rho J)^-1 by Woodbury's identity.
+"""Deflation of the directions of constraints: the preconditioner (D + (dq/dv) J^T rho J)^-1 by Woodbury's identity.
 
     z = D^-1 r - D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J D^-1 r
 
-It is exact within a cluster, rows whose matrix is inverted densely; coupled clusters are swept colour by colour.
+D stands for the 3x3 diagonal blocks of H. The rows of J are grouped into clusters, whose matrices are inverted densely;
+where clusters are coupled, symmetric Gauss-Seidel sweeps go over them colour by colour.
 """
 
 import functools
@@ -19,7 +20,7 @@ __all__ = ["deflation_kernels"]
 
 @functools.cache
 def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels of the deflation for one precision of the slots; also of the penalty, which the same matrices set."""
+    """Kernels of the deflation for one precision of the slots, and of the penalty rho, which the same matrices set."""
     p = precision(dtype)
     vec3, mat33 = p.vec3, p.mat33
     f64, vec3d = wp.float64, wp.vec3d
@@ -32,7 +33,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     def pair_blocks(
         con: Constraints, inverse: wp.array2d(dtype=mat33), active: wp.array(dtype=wp.int32), mul: Multipliers
     ):
-        """sum w w' D^-1 over the slots that two vectors share."""
+        """sum w w' D^-1 over the slots that two vectors of constraints share, with their weights w and w' there."""
         world, block = wp.tid()
         if active[world] == 0:
             return
@@ -43,7 +44,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def pair_sum(con: Constraints, mul: Multipliers, world: int, row: int, column: int, first: int, last: int) -> f64:
-        """(J D^-1 J^T) of two rows."""
+        """The entry of J D^-1 J^T for two rows: the sum over the pairs of their vectors that share slots."""
         s = f64(0.0)
         for k in range(first, last):
             side = con.pair_side[k]
@@ -54,7 +55,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def assemble_coupling(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
-        """J D^-1 J^T between rows of different clusters."""
+        """J D^-1 J^T between rows of different clusters, one thread per coupling."""
         world, k = wp.tid()
         if active[world] != 0:
             first, last = con.couple_pair[k], con.couple_pair[k + 1]
@@ -75,7 +76,10 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def penalty(con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers):
-        """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii): free of units, of the mesh and of E. Frozen during a step."""
+        """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii), N/m, kept during a step.
+
+        kappa is its ratio to the stiffness of what the constraint ties: free of units, of the mesh and of E.
+        """
         world, row = wp.tid()
         if active[world] == 0:
             return
@@ -89,7 +93,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def regularise(con: Constraints, mul: Multipliers, dq: f64, world: int, cluster: int):
-        """Add 1 / (dq/dv rho) to the diagonal; rows without any freedom get 1."""
+        """Add 1 / ((dq/dv) rho) to the diagonal of a cluster's matrix; 1 for rows without a free slot (rho = 0)."""
         first = con.cluster_start[cluster]
         n = con.cluster_start[cluster + 1] - first
         base = con.matrix_start[cluster]
@@ -139,7 +143,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """One pivot of Gauss-Jordan in every large cluster, a thread per row; the pivot's is left to `scale_row`."""
+        """One pivot of Gauss-Jordan in every large cluster, a thread per row; `scale_row` does the row of the pivot."""
         world, k, i = wp.tid()
         cluster = large[k]
         n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
@@ -163,7 +167,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """The pivot's own row."""
+        """The row of the pivot in a step of Gauss-Jordan, after `eliminate`."""
         world, k = wp.tid()
         cluster = large[k]
         n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
@@ -184,7 +188,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def solve_clusters(con: Constraints, mul: Multipliers, active: wp.array(dtype=wp.int32)):
-        """The inverse of each cluster's matrix times J z, one thread per row."""
+        """s = the inverse of each cluster's matrix times J z, one thread per row."""
         world, row = wp.tid()
         if active[world] == 0:
             return
@@ -206,8 +210,8 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """One colour of a symmetric block Gauss-Seidel sweep over coupled clusters.
 
-        It stands for (G + L) G^-1 (G + L^T) >= J D^-1 J^T + 1/((dq/dv) rho), G the clusters' own matrices: with more
-        than the right matrix the preconditioner stays positive definite.
+        Both sweeps together invert (G + L) G^-1 (G + L^T), with G the clusters' own matrices and L the couplings to
+        colours before. It is no less than J D^-1 J^T + 1/((dq/dv) rho), so the preconditioner stays positive definite.
         """
         world, k = wp.tid()
         if active[world] == 0:
@@ -248,7 +252,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z = y - D^-1 J^T s where constraints touch a slot, y = D^-1 r, with `add` z += the same; r.z per warp."""
+        """z = y - D^-1 J^T s on slots that constraints touch, y = D^-1 r; with `add` added to z. Rows: r.z per warp."""
         world, slot = wp.tid()
         if active[world] == 0:
             return

@@ -5,11 +5,10 @@ import types as _types
 
 import warp as wp
 
+from ..common.entries import add_block_function
 from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import kernel_module, precision
-from ..terms.constraints import DISTANCE, TURN, constraint_struct, multiplier_struct
-from .blocks import coupling_struct
 
 __all__ = ["direct_kernels", "followed_struct"]
 
@@ -34,75 +33,10 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
-    Topology, Pattern, Couplings, Followed = (
-        topology_struct(dtype),
-        pattern_struct(),
-        coupling_struct(),
-        followed_struct(),
-    )
-    Constraints, Multipliers = constraint_struct(), multiplier_struct()
+    Topology, Pattern, Followed = topology_struct(dtype), pattern_struct(), followed_struct()
+    add_block = add_block_function(dtype)
     row_sum = lane_functions(dtype).row_sum
     module = kernel_module(f"direct_{dtype}")
-
-    @wp.func
-    def add_block(topo: Topology, at: wp.vec4i, A: mat33, world: int, value: wp.array2d(dtype=mat33)):
-        """Add to an entry and its mirror, on the free components."""
-        row_free = topo.free[at[2]]
-        column_free = topo.free[at[3]]
-        B = mat33()
-        for i in range(3):
-            for j in range(3):
-                B[i, j] = row_free[i] * column_free[j] * A[i, j]
-        B += value[world, at[0]]
-        value[world, at[0]] = B
-        if at[1] != at[0]:
-            value[world, at[1]] = wp.transpose(B)
-
-    @wp.func
-    def curvature(con: Constraints, mul: Multipliers, world: int, row: int, a: int, b: int) -> wp.mat33d:
-        """d2c / (d vector a  d vector b) of a row, a and b its sides."""
-        kind = con.kind[row]
-        f = mul.target[world, row]
-        scale = mul.scale[world, row]
-        one = wp.identity(n=3, dtype=f64)
-        if kind == DISTANCE:
-            n = mul.gradient[world, 3 * row] / scale
-            size = wp.abs(mul.value[world, row] / scale + f)
-            if a == 0 and b == 0:
-                return (scale / size) * (one - wp.outer(n, n))
-        elif kind == TURN:
-            if a + b == 1:
-                return -scale * wp.sin(f) * one
-            if a + b == 3:
-                return scale * wp.cos(f) * one
-        elif a + b == 1:
-            return scale * one
-        return wp.mat33d()
-
-    @wp.kernel(module=module)
-    def add_constraints(
-        topo: Topology,
-        pattern: Pattern,
-        pairs: Couplings,
-        con: Constraints,
-        mul: Multipliers,
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=mat33),
-    ):
-        """value += (dq/dv) (J^T rho J + sum lambda d2c/dq2)."""
-        world, item = wp.tid()
-        if active[world] == 0:
-            return
-        A = wp.mat33d()
-        for k in range(pairs.start[item], pairs.start[item + 1]):
-            a = pairs.term_a[k]
-            b = pairs.term_b[k]
-            row = a / 3
-            tight = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
-            bend = mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
-            A += pairs.weight[k] * (tight + bend)
-        add_block(topo, pattern.upper[pairs.entry[item]], mat33(dq_dv[world] * A), world, value)
 
     @wp.kernel(module=module)
     def take_local(
@@ -174,7 +108,6 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module,
-        add_constraints=add_constraints,
         take_local=take_local,
         unit_direction=unit_direction,
         add_followers=add_followers,

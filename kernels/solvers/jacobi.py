@@ -1,7 +1,7 @@
-"""Accelerated descent with a fixed preconditioner B: v += p, p made of B r and of the last few moves.
+"""Accelerated descent with a fixed preconditioner B: v += p, where p is made of B r and of the last few moves.
 
-Pairs (s, y) of the last moves s = v' - v and of what they did to the residual r = -g, y = r - r', which is H s where
-H is constant. One thread per slot, and one per world for the small systems.
+Of the last moves the pairs (s, y) are kept: s = v' - v and the change y = r - r' of the residual r = -g, which is H s
+where H is constant. One thread per slot, or one per world for the small systems. See warpfea/solvers/jacobi.py.
 """
 
 import functools
@@ -9,6 +9,7 @@ import types as _types
 
 import warp as wp
 
+from ..common.traits import Traits
 from ..common.types import kernel_module, precision
 from .newton import (
     FAIL_CONSTRAINT,
@@ -23,47 +24,47 @@ from .pcg import pcg_struct
 __all__ = ["PAIRS", "jacobi_kernels", "jacobi_struct"]
 
 PAIRS = 4
-"""Moves that are remembered: 1 and 3 to 5 were tried, beyond 3 it hardly matters."""
-DEPENDENT = 1.0e-10  # a pivot below this share of its diagonal: a move that the others hold already
+"""Moves that are kept: 1 and 3 to 5 were tried, and beyond 3 the number hardly matters."""
+DEPENDENT = 1.0e-10  # a pivot below this share of its diagonal: the move depends linearly on the others
 
 
 @functools.cache
 def jacobi_struct():
-    """What the acceleration knows of each world."""
+    """The acceleration's numbers of each world."""
 
     @wp.struct
     class JacobiControl:
-        gram: wp.array3d(dtype=wp.float64)  # [world, pair, pair]
+        gram: wp.array3d(dtype=wp.float64)  # [world, pair, pair] s_i . y_j
         factor: wp.array3d(dtype=wp.float64)  # its Cholesky factor, newest pair first
         right: wp.array2d(dtype=wp.float64)  # [world, pair] right side, newest first
         gamma: wp.array2d(dtype=wp.float64)  # [world, pair] share of each pair in the move
         sums: wp.array2d(dtype=wp.float64)  # [2 PAIRS, world]
         first_norm: wp.array(dtype=wp.float64)  # |g| at the start of the attempt
         rho: wp.array(dtype=wp.float64)  # of the Chebyshev recursion
-        growth: wp.float64  # |g| over that of the start beyond which a step is refused
-        gap: wp.float64  # m, violation of a constraint beyond which a step is refused
+        growth: wp.float64  # |g| over that of the start beyond which a step is rejected
+        gap: wp.float64  # m, violation of a constraint beyond which a step is rejected
         step: wp.float64  # factor of B r
-        centre: wp.float64  # of the interval of eigenvalues
-        half: wp.float64
+        centre: wp.float64  # of the interval of eigenvalues of B H that the Chebyshev recursion is for
+        half: wp.float64  # its half width
 
     return JacobiControl
 
 
 @functools.cache
-def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.SimpleNamespace:
-    """Kernels of one precision and acceleration."""
+def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.SimpleNamespace:
+    """Kernels for one precision, the traits of a model's terms, and one acceleration."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
-    shared = newton_kernels(dtype, constrained)
+    shared = newton_kernels(dtype, traits)
     measure, record = shared.measure, shared.record
     paired = acceleration in ("secants", "anderson")
-    module = kernel_module(f"jacobi_{dtype}_{acceleration}{'_constrained' if constrained else ''}")
+    module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'gated', 'limited')}")
 
     @wp.func
     def settle(ctl: Newton, jac: Jacobi, world: int):
-        """End where the residual is within the tolerance, or was evaluated for the last time."""
+        """End a world's iterations where it has converged or failed, or where they are used up."""
         record(ctl, world)
         finite = wp.isfinite(ctl.norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
         if ctl.domain_J[world] <= f64(0.0):
@@ -78,16 +79,16 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
             ctl.active[world] = 0
             if ctl.norm[world] > jac.growth * jac.first_norm[world]:
                 ctl.failed[world] = FAIL_GROWTH
-            if wp.static(constrained):
+            if wp.static(traits.gated):
                 if ctl.open[world] * ctl.constraint_tol > jac.gap:
                     ctl.failed[world] = FAIL_CONSTRAINT
-            # rounding may explain what is left
+            # not rough where rounding explains what is left
             if ctl.failed[world] == 0 and ctl.floor_excess[world] > f64(1.0):
                 ctl.rough[world] = 1
 
     @wp.kernel(module=module)
     def begin(ctl: Newton, jac: Jacobi):
-        """Judge the first iterate."""
+        """Measure the residual of the first iterate, and see whether it will do."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -98,7 +99,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
 
     @wp.kernel(module=module)
     def judge(ctl: Newton, jac: Jacobi):
-        """Judge an iterate."""
+        """Measure the residual of an iterate, count it, and see whether it will do."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -109,7 +110,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
 
     @wp.func
     def pair_of(k: int, age: int) -> int:
-        """Place of the pair that is `age` moves old at iteration k."""
+        """Index of the pair that is `age` moves old at iteration k; the pairs lie in a ring."""
         return (k - 1 - age) % PAIRS
 
     @wp.kernel(module=module)
@@ -124,7 +125,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
         y: wp.array3d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """r = -g on the free components; the newest pair; rows s_j.y and s_j.r."""
+        """r = -g on the free components; store the newest pair; rows: s_j.y and s_j.r of all pairs."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -149,7 +150,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
 
     @wp.func
     def substitute(jac: Jacobi, world: int, k: int, count: int, add: f64):
-        """gamma = add gamma + G^-1 right, without dependent pairs, whose pivots are 0."""
+        """gamma = add gamma + G^-1 right with the Cholesky factor of G; dependent pairs, of pivot 0, are left out."""
         for i in range(count):
             v = jac.right[world, i]
             for j in range(i):
@@ -173,7 +174,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
 
     @wp.kernel(module=module)
     def recursion(ctl: Newton, jac: Jacobi):
-        """Chebyshev's factors of the last move and of z, for eigenvalues in centre -+ half."""
+        """Factors gamma of the last move and of z in the Chebyshev iteration for eigenvalues in centre -+ half."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -190,7 +191,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
 
     @wp.kernel(module=module)
     def shares(ctl: Newton, jac: Jacobi):
-        """The pairs' part of the move: G gamma = S^T r by Cholesky, newest pair first."""
+        """Share gamma of each pair in the move: G gamma = S^T r, G = S^T Y, by Cholesky with the newest pair first."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -224,7 +225,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
 
     @wp.kernel(module=module)
     def project(ctl: Newton, jac: Jacobi, y: wp.array3d(dtype=vec3), r: wp.array2d(dtype=vec3)):
-        """r -= Y gamma: what the pairs leave."""
+        """r -= Y gamma: the residual that the pairs leave."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -246,7 +247,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
 
     @wp.kernel(module=module)
     def conjugate(ctl: Newton, jac: Jacobi):
-        """gamma -= G^-1 Y^T z: the move is conjugate to the pairs."""
+        """gamma -= step G^-1 Y^T z, which makes the move conjugate to the pairs."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -264,7 +265,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
         z: wp.array2d(dtype=vec3),
         move: wp.array2d(dtype=vec3),
     ):
-        """p = S gamma + step z."""
+        """The move p = S gamma + step z; of the Chebyshev iteration, gamma_0 times the last move + gamma_1 z."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -290,7 +291,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
         move: wp.array2d(dtype=vec3),
         r: wp.array2d(dtype=vec3),
     ):
-        """r = -g - c_M M p as far as the sum over a body counts, for its translation."""
+        """r = -g - c_M M p with the lumped mass, whose sum over a body is exact: the force left on its translation."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             m = T(mass_factor[world]) * lumped[slot]
@@ -305,7 +306,7 @@ def jacobi_kernels(dtype: str, constrained: bool, acceleration: str) -> _types.S
 
     @wp.kernel(module=module)
     def tell(ctl: Newton, jac: Jacobi, pcg: PCG, running: wp.array(dtype=wp.int32)):
-        """What the attempt cost and gained, for the preconditioner's rule; flags the worlds that iterated."""
+        """Tell the rule of kernels/solvers/reuse.py what the attempt cost and gained; flag the worlds that iterated."""
         world = wp.tid()
         ctl.active[world] = 0
         if running[world] != 0 and ctl.failed[world] == 0 and ctl.iterations[world] > 0:

@@ -1,7 +1,8 @@
-"""Two-level preconditioner: dense inverses of tiles, affine motions of groups of tiles, a dense inverse at the bottom.
+"""Application of the two-level preconditioner: tile inverses, a coarse space of affine motions, a dense inverse.
 
-A level has slots of 3-vectors, tiles of up to TILE_SLOTS slots, and groups whose four affine functions per axis are the
-slots of the next level. What is here applies it; levels_build.py makes it.
+A level has slots of 3-vectors, which lie in tiles of up to TILE_SLOTS slots and in groups. The four affine functions
+1, x, y, z of each group are the slots of the next, coarser level; P interpolates from them (prolongation) and P^T sums
+onto them (restriction). levels_build.py makes the inverses.
 """
 
 import functools
@@ -17,7 +18,9 @@ __all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
 
 TILE_SLOTS = 16
 TILE = 3 * TILE_SLOTS
+"""Unknowns of a tile."""
 LANES = 64
+"""Threads that invert a tile on CUDA."""
 
 
 @functools.cache
@@ -43,7 +46,7 @@ def level_struct(dtype: str):
 
 @functools.cache
 def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamespace:
-    """Kernels that apply the levels in one precision; `storage`: of the inverses, as of `build_kernels`."""
+    """Kernels that apply the levels in one precision; `storage`: precision of the inverses, see `build_kernels`."""
     storage = storage or dtype
     S = precision(storage).T
     scaled = storage != dtype
@@ -70,10 +73,10 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         z: wp.array2d(dtype=vec3),
         coarse: wp.array2d(dtype=vec3),
     ):
-        """z = tile inverse times r, `share` lanes per slot; from thread `first_group` on P^T r, `lanes` per group.
+        """z = tile inverse times r, `share` lanes per slot; threads from `first_group` on: P^T r, `lanes` per group.
 
-        The inverse is symmetric: read by columns neighbouring threads read neighbouring numbers, which CUDA wants;
-        read by rows one thread does, which the CPU wants.
+        The inverse is symmetric. By columns, neighbouring threads read neighbouring numbers, which is fast on CUDA; by
+        rows, each thread does, which is fast on the CPU.
         """
         world, index = wp.tid()
         if active[world] == 0:
@@ -138,7 +141,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def prolonged(level: Level, x: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
-        """(P x) of a slot."""
+        """(P x) at a slot: the affine motion that the coarse unknowns x give its group."""
         first = 4 * level.group_of[slot]
         w = level.weight[slot]
         s = vec3()
@@ -159,7 +162,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z += P x; rows: r.z and r.D^-1 r per warp of slots."""
+        """z += P x on free components if `correct`; rows: r.z and r.D^-1 r, one sum per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -191,7 +194,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         d: wp.array2d(dtype=vec3),
         x: wp.array2d(dtype=vec3),
     ):
-        """d = keep d + step (z + P coarse), x += d; with keep = 0 both start anew."""
+        """A Chebyshev step: d = keep d + step (z + P coarse), x += d; with keep = 0 both start from zero."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -216,7 +219,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         active: wp.array(dtype=wp.int32),
         r: wp.array2d(dtype=vec3),
     ):
-        """r -= A d, so many lanes per row."""
+        """r -= A d, `lanes` threads per row."""
         world, index = wp.tid()
         if active[world] == 0:
             return
@@ -232,6 +235,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def part_of(root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, k: int) -> T:
+        """Number k of r, scaled by `root` where the stored inverse is."""
         if wp.static(scaled):
             return r[world, k] * root[world, k]
         else:
@@ -246,13 +250,13 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         active: wp.array(dtype=wp.int32),
         x: wp.array2d(dtype=T),
     ):
-        """x = A^-1 r, so many lanes per row."""
+        """x = A^-1 r with a dense inverse, `lanes` threads per row."""
         world, index = wp.tid()
         if active[world] == 0:
             return
         lane = index % lanes
         row = wp.min(index / lanes, x.shape[1] - 1)
-        # four sums at once keep enough loads under way
+        # four independent sums, so that enough loads are under way at a time
         n = r.shape[1]
         s0 = T(0.0)
         s1 = T(0.0)

@@ -1,6 +1,6 @@
-"""Making of the levels: tiles and dense matrices filled, inverted by Gauss-Jordan, and put into their storage.
+"""Making of the two-level preconditioner: tiles and dense matrices are filled, inverted by Gauss-Jordan, and stored.
 
-Work of a block is shared by the lanes of a block on CUDA and done by one lane on the CPU.
+On CUDA the threads (lanes) of a block share the work on a tile; on the CPU one thread does it.
 """
 
 import functools
@@ -20,8 +20,8 @@ __all__ = ["build_kernels"]
 def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamespace:
     """Kernels that make the levels in one precision.
 
-    `storage`: precision of the inverses, by default the same. Another one holds them scaled to a unit diagonal of A,
-    R B R with R^2 = diag A, and with so much on the diagonal that rounding leaves them positive definite.
+    `storage`: precision in which inverses are kept, by default the same. In another one an inverse B of A is kept as
+    R B R with R^2 = diag A, and enough is added to its diagonal to stay positive definite after rounding.
     """
     storage = storage or dtype
     S = precision(storage).T
@@ -33,7 +33,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     sync = lane_functions(dtype).sync
-    # a pivot below this share of its diagonal is rounding: the functions are dependent
+    # a pivot below this share of its diagonal entry is rounding: the functions are linearly dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
     module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SMALL)
 
@@ -46,7 +46,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         diagonal: wp.array3d(dtype=T),
         matrix: wp.array4d(dtype=T),
     ):
-        """Diagonal blocks of A and their diagonal, one thread per slot; rows without an unknown are zero."""
+        """The block of A for each tile, and its diagonal; one thread per slot, rows without an unknown are zero."""
         world, tile, place = wp.tid()
         if active[world] == 0:
             return
@@ -78,9 +78,11 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         column: wp.array3d(dtype=T),
         matrix: wp.array4d(dtype=T),
     ):
-        """Inverse in place by Gauss-Jordan. A row whose pivot is not safely positive, measured by its given diagonal,
-        is dropped: zeros, or with `keep` the inverse of the diagonal, so that the result is positive (semi-)definite
-        always."""
+        """Inverse of each tile in place, by Gauss-Jordan.
+
+        A row whose pivot is not safely positive against the diagonal of A is dropped: zeros, or with `keep` the inverse
+        of that diagonal. The result is therefore always positive semi-definite, with `keep` definite.
+        """
         thread = wp.tid()
         lane = thread % lanes
         index = thread / lanes
@@ -112,7 +114,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
                     matrix[world, tile, j, k] = T(0.0)
                 sync()
                 if lane == 0 and keep != 0 and wp.abs(size) > T(0.0):
-                    # negative now: the pivots to come must not see it, the end turns its sign
+                    # the sign marks the row, which stays zero for the pivots to come and is filled in at the end
                     diagonal[world, tile, k] = -wp.abs(size)
             sync()
         for j in range(lane, TILE, lanes):
@@ -129,7 +131,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         scale: wp.array2d(dtype=T),
         matrix: wp.array3d(dtype=T),
     ):
-        """The whole matrix and its diagonal, one thread per row of slots; rows beyond the slots are zero."""
+        """A as a dense matrix, and its diagonal; one thread per slot, rows beyond the slots are zero."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -157,7 +159,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         diagonal: wp.array3d(dtype=T),
         pivot: wp.array4d(dtype=T),
     ):
-        """The pivot's block, and the diagonal that it had at first."""
+        """Copy the pivot block, and the diagonal that A has there."""
         world, i, j = wp.tid()
         if active[world] != 0:
             pivot[world, 0, i, j] = matrix[world, first + i, first + j]
@@ -173,13 +175,13 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         left: wp.array3d(dtype=T),
         top: wp.array3d(dtype=T),
     ):
-        """left = A_ik P, top = A_kj: what the rest of the matrix is changed with."""
+        """left = A_ik P with P the inverse pivot block, top = A_kj: the panels that update the rest of the matrix."""
         world, m, i = wp.tid()
         if active[world] == 0:
             return
         s = T(0.0)
         for n in range(TILE):
-            # the rows of A beside the pivot are symmetric but for the sign that columns done before have
+            # A is symmetric beside the pivot but for the sign of columns that were pivots before
             s += matrix[world, i, first + n] * pivot[world, 0, n, m]
         left[world, m, i] = s
         top[world, m, i] = matrix[world, first + m, i]
@@ -193,12 +195,12 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=T),
     ):
-        """One pivot of block Gauss-Jordan; a thread does four rows of a column, which share what they read."""
+        """One pivot of block Gauss-Jordan; a thread updates four rows of a column, which share what they read."""
         world, i4, j = wp.tid()
         if active[world] == 0:
             return
         i = 4 * i4
-        # a tile's size is a multiple of 4: the rows lie on the same side of it
+        # a tile's size is a multiple of 4, so the four rows are all in the pivot's or all outside
         in_row = i >= first and i < first + TILE
         in_column = j >= first and j < first + TILE
         s = vec4()
@@ -225,12 +227,12 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def inverse_root(d: T) -> T:
-        """1/sqrt of a pivot's diagonal, 0 without an unknown."""
+        """1/sqrt|d| of an entry of diag A; 0 where there is no unknown."""
         return wp.where(d == T(0.0), T(0.0), T(1.0) / wp.sqrt(wp.abs(d)))
 
     @wp.func
     def scaled_entry(b: T, own: T, other: T, on_diagonal: bool, trace: T) -> S:
-        """An entry of R B R, with what rounding needs on the diagonal."""
+        """An entry of R B R in the storage's precision; on the diagonal with what its rounding needs."""
         x = T(0.0)
         if own > T(0.0) and other > T(0.0):
             x = b / (own * other)
@@ -247,7 +249,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         root: wp.array3d(dtype=T),
         stored: wp.array4d(dtype=S),
     ):
-        """Inverses of tiles into their storage, one thread per row."""
+        """Put the inverses of tiles into their storage, one thread per row."""
         world, tile, i = wp.tid()
         if active[world] == 0:
             return
@@ -269,7 +271,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         root: wp.array2d(dtype=T),
         stored: wp.array3d(dtype=S),
     ):
-        """The dense inverse into its storage."""
+        """Put the dense inverse into its storage, one thread per entry."""
         world, i, j = wp.tid()
         if active[world] == 0:
             return
@@ -286,7 +288,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         active: wp.array(dtype=wp.int32),
         rows: wp.array3d(dtype=f64),
     ):
-        """Terms of the trace of the scaled inverse."""
+        """Terms of the trace of R B R."""
         world, i = wp.tid()
         if active[world] != 0:
             rows[0, world, i] = f64(matrix[world, i, i] * wp.abs(diagonal[world, i]))

@@ -5,6 +5,7 @@ import types as _types
 
 import warp as wp
 
+from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "FAIL_LINE_SEARCH",
     "FAIL_NAN",
     "LANES",
+    "TERM_ROWS",
     "control_struct",
     "newton_kernels",
 ]
@@ -33,6 +35,9 @@ ARMIJO = 1.0e-4
 WOLFE = 0.8
 COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
 LANES = 32
+TERM_ROWS = 3
+"""Rows summed per world of what terms store: the potential with what is held in a line search (multipliers, caps), the
+potential with what they would hold next, and its magnitude."""
 NOISE = 100.0  # Phi is blind below this many roundings of its parts
 FLOOR = 16.0
 MAX_SEARCH = 20
@@ -77,7 +82,8 @@ def control_struct():
         follower_sum: wp.array2d(dtype=wp.float64)  # p.K p of the follower loads, 0 without
         dq_dv: wp.array(dtype=wp.float64)
         violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m; with constraints
-        constraint_sums: wp.array2d(dtype=wp.float64)  # constraints.SUM_ROWS
+        term_sums: wp.array2d(dtype=wp.float64)  # [TERM_ROWS, world], with terms that have a potential of their own
+        limit: wp.array(dtype=wp.float64)  # largest step along the direction; with terms that limit it
         stepped: wp.array(dtype=wp.int32)  # the trial was accepted
         outer: wp.array(dtype=wp.int32)  # multiplier updates of this step
         constraint_tol: wp.float64  # m
@@ -99,27 +105,31 @@ def control_struct():
 
 
 @functools.cache
-def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace:
-    """Kernels of the Newton iteration in one precision of the vectors; scalars are float64."""
+def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+    """Kernels of the Newton iteration in one precision of the vectors; scalars are float64.
+
+    Of the traits "stored", "gated" and "limited" count.
+    """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
-    module = kernel_module(f"newton_{dtype}{'_constrained' if constrained else ''}")
+    stored, gated, limited = traits.stored, traits.gated, traits.limited
+    module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited')}")
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
-        stored = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
-        if wp.static(constrained):
-            stored += ctl.constraint_sums[0, world]
-        return ctl.slot_sums[4, world] + stored / ctl.dq_dv[world]
+        energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
+        if wp.static(stored):
+            energy += ctl.term_sums[0, world]
+        return ctl.slot_sums[4, world] + energy / ctl.dq_dv[world]
 
     @wp.func
     def magnitude(ctl: Control, world: int) -> f64:
-        stored = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
-        if wp.static(constrained):
-            stored += ctl.constraint_sums[2, world]
-        return ctl.slot_sums[5, world] + stored / ctl.dq_dv[world]
+        energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
+        if wp.static(stored):
+            energy += ctl.term_sums[2, world]
+        return ctl.slot_sums[5, world] + energy / ctl.dq_dv[world]
 
     @wp.func
     def largest_violation(ctl: Control, world: int) -> f64:
@@ -161,7 +171,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             if ctl.predicted[world] != 0:
                 accept = f64(PREDICTED) * accept  # what is left would add up over steps that none solves for
             loud = norm > accept
-            if wp.static(constrained):
+            if wp.static(gated):
                 if ctl.violation[world, c] > ctl.constraint_tol:
                     loud = True
                     excess = wp.max(excess, ctl.violation[world, c] / ctl.constraint_tol)
@@ -171,14 +181,14 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
                 solve += g2
                 solve_accept = wp.min(solve_accept, accept)
                 rounding = f64(2.0) * ctl.eps * wp.sqrt(spread)
-                if wp.static(constrained):
+                if wp.static(gated):
                     if ctl.classical != 0:  # the residual holds rho c, and so kappa times the rounding of places
                         rounding = rounding / (ctl.slack * ctl.slack)
                 floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
             ratio = norm / wp.max(scale, f64(1.0e-300))
             largest = wp.max(largest, ratio)
             excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))
-        if wp.static(constrained):
+        if wp.static(gated):
             ctl.open[world] = largest_violation(ctl, world) / ctl.constraint_tol
         ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
         ctl.relative[world] = largest
@@ -209,7 +219,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_ITERATIONS
-            if wp.static(constrained):
+            if wp.static(gated):
                 if unsatisfied(ctl, world):
                     ctl.failed[world] = FAIL_CONSTRAINT
 
@@ -221,7 +231,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         within = ctl.floor_excess[world] <= f64(1.0) and ctl.iterations[world] > 0
         if not (within and why != FAIL_NAN):
             ctl.failed[world] = why
-            if wp.static(constrained):
+            if wp.static(gated):
                 if why != FAIL_NAN and why != FAIL_JACOBIAN and unsatisfied(ctl, world):
                     ctl.failed[world] = FAIL_CONSTRAINT
 
@@ -253,6 +263,13 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             settle(ctl, world)
 
     @wp.kernel(module=module)
+    def free_step(ctl: Control):
+        """Before terms limit a step: the full one."""
+        world = wp.tid()
+        if ctl.active[world] != 0:
+            ctl.limit[world] = f64(1.0)
+
+    @wp.kernel(module=module)
     def begin_search(ctl: Control):
         """Take the slope along the new direction; try the full step first."""
         world = wp.tid()
@@ -262,11 +279,14 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         slope = ctl.slope_sum[0, world]
         ctl.slope[world] = slope
         ctl.alpha[world] = f64(1.0)
+        if wp.static(limited):
+            ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
         ctl.searches[world] = 0
         ctl.searching[world] = 1
         ctl.predicted[world] = 0
-        if wp.static(constrained):
+        if wp.static(stored):
             ctl.stepped[world] = 0
+        if wp.static(gated):
             if ctl.classical == 0:
                 ctl.outer[world] = ctl.outer[world] + 1
         if not wp.isfinite(slope):
@@ -309,9 +329,9 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
             ctl.searching[world] = 0
             measure(ctl, world)
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
-            if wp.static(constrained):
+            if wp.static(stored):
                 ctl.stepped[world] = 1
-                more = ctl.constraint_sums[1, world] - ctl.constraint_sums[0, world]
+                more = ctl.term_sums[1, world] - ctl.term_sums[0, world]
                 ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
             ctl.phi_magnitude[world] = magnitude(ctl, world)
             if stands:
@@ -444,6 +464,7 @@ def newton_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamesp
         record=record,
         reset_min_J=reset_min_J,
         begin=begin,
+        free_step=free_step,
         begin_search=begin_search,
         judge_trial=judge_trial,
         judge_outer=judge_outer,

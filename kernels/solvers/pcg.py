@@ -15,23 +15,24 @@ from .newton import control_struct
 __all__ = ["LANES", "groups_struct", "pcg_kernels", "pcg_struct"]
 
 TIGHTER = 0.4
-"""Solves with constraints go so much further: of 0.03, 0.18, 0.4 and 1 this spares the third Newton iteration at least
-cost (64, 54 and 52 PCG iterations per step from 0.18 on, and 2.0, 2.0 and 2.55 of Newton, in a chain of 100 joints)."""
+"""Factor on the tolerance of solves with constraints. Of 0.03, 0.18, 0.4 and 1 it saves the third Newton iteration at
+the least cost: with 0.18, 0.4 and 1 a chain of 100 joints takes 64, 54 and 52 PCG iterations per step, and 2.0, 2.0
+and 2.55 Newton iterations."""
 LANES = 128
-"""Partial sums per group of bodies: fixed, so that results don't depend on the number of worlds."""
+"""Partial sums per group of bodies; a fixed number, so that results don't depend on the number of worlds."""
 
 
 @functools.cache
 def pcg_struct():
-    """What the conjugate gradients know of each world."""
+    """The conjugate gradients' scalars of each world."""
 
     @wp.struct
     class PCGControl:
         active: wp.array(dtype=wp.int32)
         iterations: wp.array(dtype=wp.int32)  # of this solve
         total: wp.array(dtype=wp.int32)  # of this step
-        rz: wp.array(dtype=wp.float64)  # of the iteration before
-        target: wp.array(dtype=wp.float64)  # of the norm
+        rz: wp.array(dtype=wp.float64)  # r.z of the iteration before
+        target: wp.array(dtype=wp.float64)  # norm at which the solve ends
         norm: wp.array(dtype=wp.float64)  # |r| in the D^-1 norm, which Newton's method judges by
         first_norm: wp.array(dtype=wp.float64)  # at the start of the solve
         sums: wp.array2d(dtype=wp.float64)  # r.z and r.D^-1 r
@@ -44,7 +45,7 @@ def pcg_struct():
 
 @functools.cache
 def groups_struct(dtype: str):
-    """Bodies that may translate freely together: Z, their position slots."""
+    """Groups of bodies that may translate freely together: Z, the indicator of their position slots."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
@@ -62,8 +63,8 @@ def groups_struct(dtype: str):
 
 
 @functools.cache
-def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace:
-    """Kernels of the linear solver in one precision."""
+def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
+    """Kernels of the linear solver in one precision; `gated`: with constraints, see Traits."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
@@ -71,7 +72,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
     Control = pcg_struct()
     Groups = groups_struct(dtype)
     row_sum = lane_functions(dtype).row_sum
-    module = kernel_module(f"pcg_{dtype}{'_constrained' if constrained else ''}")
+    module = kernel_module(f"pcg_{dtype}{'_gated' if gated else ''}")
 
     @wp.kernel(module=module)
     def start(
@@ -94,7 +95,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         active: wp.array(dtype=wp.int32),
         r: wp.array2d(dtype=vec3),
     ):
-        """r = 0 on converged components: the iteration for the others must not move them."""
+        """r = 0 on components of the model that have converged: the solve for the others must not move them."""
         world, slot = wp.tid()
         if active[world] != 0 and newton.quiet[world, of_slot[slot]] != 0:
             r[world, slot] = vec3()
@@ -109,7 +110,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z = B r with 3x3 blocks B, and r.z and r.D^-1 r per warp of slots."""
+        """z = B r with 3x3 blocks B; rows: r.z and r.D^-1 r, one sum per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -129,7 +130,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
 
     @wp.kernel(module=module)
     def begin(newton: Newton, ctl: Control):
-        """Set the target of the solve: Eisenstat-Walker, but no tighter than Newton needs."""
+        """Set the norm at which the solve ends: by Eisenstat and Walker, but no tighter than Newton's method needs."""
         world = wp.tid()
         ctl.active[world] = 0
         if newton.active[world] == 0:
@@ -142,14 +143,14 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         ctl.iterations[world] = 0
         goal = newton.forcing[world] * newton.solve_norm[world]
         least = f64(0.1) * newton.solve_accept[world]
-        if wp.static(constrained):
-            # open constraints may drive a step where the forces balance
+        if wp.static(gated):
+            # where the forces balance already, what is left of the constraints may still call for a step
             goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
-            # what is left of r across constraints is left of their forces, which are found by the same solve
+            # the same solve finds the constraint forces: what is left of r across constraints is their error
             least = f64(TIGHTER) * least
             if newton.classical == 0:
                 goal = f64(TIGHTER) * goal
-                # a loose tolerance of the forces must not leave constraints open
+                # a loose tolerance of the forces must not leave constraints violated
                 least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
         ctl.target[world] = wp.max(goal, least)
         if newton.fixed_forcing != 0:
@@ -166,7 +167,10 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         x: wp.array2d(dtype=vec3),
         r: wp.array2d(dtype=vec3),
     ):
-        """x += alpha p, r -= alpha Hp with alpha = r.z / p.Hp; a direction of no positive curvature ends the solve."""
+        """x += alpha p, r -= alpha H p with alpha = r.z / p.H p.
+
+        A direction of no positive curvature ends the solve: it is taken in full if it is the first, else not at all.
+        """
         world, slot = wp.tid()
         if world == 0 and slot == 0:
             ctl.any_active[0] = 0
@@ -204,7 +208,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
             if more and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
                 wp.atomic_max(ctl.any_active, 0, 1)
             else:
-                ctl.active[world] = 0  # threads that see it already leave a direction that nobody reads
+                ctl.active[world] = 0  # threads that see this at once leave p as it was; it is not read again
 
     @wp.kernel(module=module)
     def group_partial(
@@ -230,7 +234,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         active: wp.array(dtype=wp.int32),
         velocity: wp.array2d(dtype=vec3),
     ):
-        """(Z^T H Z)^-1 Z^T r: stiffness does not feel a translation, so this is the mass alone."""
+        """c = (Z^T H Z)^-1 Z^T r; a translation meets no stiffness, so Z^T H Z is c_M times the mass of a group."""
         world, group = wp.tid()
         if active[world] == 0:
             return
@@ -250,7 +254,7 @@ def pcg_kernels(dtype: str, constrained: bool = False) -> _types.SimpleNamespace
         x: wp.array2d(dtype=vec3),
         r: wp.array2d(dtype=vec3),
     ):
-        """x += Z c, r -= H Z c."""
+        """x += Z c, r -= H Z c, where H Z = c_M M Z."""
         world, slot = wp.tid()
         if active[world] == 0:
             return

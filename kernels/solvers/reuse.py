@@ -1,7 +1,9 @@
-"""When a preconditioner or an operator's matrix is made anew: it is kept until what it costs in iterations exceeds what
-making it costs. A preconditioner costs iterations of PCG, a matrix those of Newton's method.
+"""Reuse of a preconditioner, or of the operator's matrix, from an earlier iterate: when it is kept and when remade.
 
-The rules count iterations, never time, and their memory is part of the state, so that a resumed run does the same.
+It is kept until the extra iterations that it causes have cost as much as making it anew: iterations of PCG with a
+preconditioner, of Newton's method with a matrix. The rules count iterations, never time, and their counts are part of
+the state, so that a resumed run takes the same decisions. Below, "the object" is the preconditioner or the matrix, and
+"the place" the displacements that it was made at.
 """
 
 import functools
@@ -17,37 +19,37 @@ from .pcg import pcg_struct
 __all__ = ["reuse_kernels", "reuse_struct"]
 
 DECADES = 3.0
-"""What an iteration of Newton's method gains with the matrix of its iterate, for the rule."""
+"""Decades by which the rule expects an iteration of Newton's method to reduce the residual with a new matrix."""
 FADE = 0.8
-"""A kept matrix that served badly at the start of a step is tried again after some steps."""
+"""Factor on `pace` where a step begins with a new matrix, so that the rule tries to keep one again after some steps."""
 AGEING = 0.25
-"""What a solve adds to `excess` where only D, which norms are measured with, is kept."""
+"""What a solve adds to `excess` where only D, which weights the norms, is kept."""
 SHARE = 0.3
-"""Residual of a linear solve over what the last iteration left, with a matrix that is not of the iterate."""
+"""Relative tolerance of a linear solve with a reused matrix, over the reduction by the last Newton iteration."""
 
 
 @functools.cache
 def reuse_struct():
-    """What a rule knows of each world."""
+    """What the rule knows of each world."""
 
     @wp.struct
-    class LagControl:
-        build: wp.array(dtype=wp.int32)  # make it now
-        moved: wp.array(dtype=wp.int32)  # at the present iterate; else again where it was made
-        changed: wp.array(dtype=wp.int32)  # it was moved since the state last heard
-        stale: wp.array(dtype=wp.int32)  # the matrices at hand are not those of the state; 2: its counts are
-        due: wp.array(dtype=wp.int32)  # make it at the next solve
-        mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv it was made for; negative: never made
+    class ReuseControl:
+        build: wp.array(dtype=wp.int32)  # make the object now
+        moved: wp.array(dtype=wp.int32)  # it is made at this iterate; else again at its old place
+        changed: wp.array(dtype=wp.int32)  # the place has moved since the state last stored it
+        stale: wp.array(dtype=wp.int32)  # 1: the object is not the one of the state; 2: nor is it, but the counts are
+        due: wp.array(dtype=wp.int32)  # make it anew at the next solve
+        mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv that it was made for; negative: never made
         dq_dv: wp.array(dtype=wp.float64)
-        rate: wp.array(dtype=wp.float64)  # iterations of the first solve (per decade) or step with it; 0: none yet
+        rate: wp.array(dtype=wp.float64)  # iterations of its first solve (per decade) or step; 0: none yet
         excess: wp.array(dtype=wp.float64)  # iterations beyond that rate since
-        made_at: wp.array(dtype=wp.int32)  # of a matrix: iteration of this attempt that it was made at; -1: kept
+        made_at: wp.array(dtype=wp.int32)  # of a matrix: Newton iteration of this attempt that made it; -1: kept
         pace: wp.array(dtype=wp.float64)  # reduction of the residual by a step's first iteration with a kept matrix
-        kept: wp.array2d(dtype=wp.float64)  # of the state: due, mass_factor, dq_dv, rate, excess, pace
-        limit: wp.float64  # excess that pays for making it
+        kept: wp.array2d(dtype=wp.float64)  # in the state: due, mass_factor, dq_dv, rate, excess, pace
+        limit: wp.float64  # excess at which making it anew pays
         any_build: wp.array(dtype=wp.int32)
 
-    return LagControl
+    return ReuseControl
 
 
 @functools.cache
@@ -58,11 +60,11 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
     f64 = wp.float64
     Reuse = reuse_struct()
     Newton, PCG = control_struct(), pcg_struct()
-    module = block_kernels(dtype).module  # one with the matrices that it keeps
+    module = block_kernels(dtype).module  # shared with the kernels of the matrices, to compile one module less
 
     @wp.func
     def recall(reuse: Reuse, world: int):
-        """What the state remembers, once after it was set from elsewhere."""
+        """Take the counts from the state, once, after the state was set from elsewhere (reset, checkpoint)."""
         if reuse.stale[world] == 1:
             reuse.due[world] = int(reuse.kept[world, 0])
             reuse.mass_factor[world] = reuse.kept[world, 1]
@@ -74,7 +76,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def gain(reduction: f64) -> f64:
-        """Decades."""
+        """Decades by which a reduction makes the residual smaller."""
         return -wp.log10(wp.max(reduction, f64(1.0e-30)))
 
     @wp.kernel(module=module)
@@ -85,7 +87,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
     ):
-        """Before a solve: which worlds make theirs."""
+        """Before a solve: decide which worlds make the object, at the iterate if it is due or the step has changed."""
         world = wp.tid()
         reuse.build[world] = 0
         reuse.moved[world] = 0
@@ -108,11 +110,11 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def judge_matrix(reuse: Reuse, newton: Newton, keep: int):
-        """Before a solve: whether Newton's method would gain by the matrix of this iterate.
+        """Before a solve: decide whether the matrix of this iterate would save Newton's method enough iterations.
 
-        What an iteration gained tells how many are left with the matrix at hand: the last one or, at the start of a
-        step, the first of the last step that began with a kept matrix, whose memory fades. `keep`: 1: it may be kept
-        within a step; 2: from step to step.
+        How many are left with the matrix at hand is estimated from what an iteration with it gained: the last one or,
+        at the start of a step, the first one of the last step that began with a kept matrix (`pace`, which fades).
+        `keep`: 1: the matrix may be kept within a step; 2: from step to step.
         """
         world = wp.tid()
         if newton.active[world] == 0:
@@ -131,7 +133,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             reuse.made_at[world] = -1
             if keep < 2:
                 reuse.due[world] = 1
-                reuse.stale[world] = 0  # whatever the state was, it holds none
+                reuse.stale[world] = 0  # the state holds no matrix
                 return
             if need > gain(reuse.pace[world]) * (fresh + reuse.limit):
                 reuse.due[world] = 1
@@ -144,7 +146,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def loosen(reuse: Reuse, newton: Newton):
-        """With a matrix of an earlier iterate no solve need go further than the matrix is good for."""
+        """Loosen the tolerance of a solve with a reused matrix to what an iteration with it can gain."""
         world = wp.tid()
         newton.reused[world] = 1 - reuse.moved[world]
         if newton.active[world] == 0:
@@ -159,12 +161,12 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def count_step(reuse: Reuse, newton: Newton, accepted: wp.array(dtype=wp.int32)):
-        """An accepted step: what it cost in iterations beyond the first step with this matrix."""
+        """After an accepted step: count its iterations beyond those of the first step with this matrix."""
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
         made_at = wp.max(reuse.made_at[world], 0)
-        # a step that made it on its way had begun with another
+        # a step that made it on the way began with another matrix: one iteration more counts for that
         count = f64(newton.iterations[world] - made_at + wp.min(made_at, 1))
         if reuse.rate[world] == f64(0.0):
             reuse.rate[world] = wp.max(count, f64(1.0))
@@ -175,7 +177,10 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def judge(reuse: Reuse, newton: Newton, pcg: PCG, follows: int):
-        """After a solve: what it cost. `follows`: the preconditioner is made with the operator, only D grows old."""
+        """After a solve: count its iterations beyond those of the first solve with this preconditioner.
+
+        `follows`: the preconditioner is always made with the operator's matrix, and only D is kept.
+        """
         world = wp.tid()
         if newton.active[world] == 0 or pcg.iterations[world] == 0:
             return
@@ -193,7 +198,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def commit(reuse: Reuse, accepted: wp.array(dtype=wp.int32)):
-        """An accepted step: the state hears what was done; of a step without a solve that is nothing."""
+        """After an accepted step: store the counts in the state, unless the step came without a solve."""
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
@@ -207,14 +212,17 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def mark(flags: wp.array(dtype=wp.int32), reuse: Reuse):
-        """The state of flagged worlds was set from elsewhere."""
+        """Note that the state of the flagged worlds was set from elsewhere."""
         world = wp.tid()
         if flags[world] != 0:
             reuse.stale[world] = 1
 
     @wp.func
     def which(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
-        """1: the iterate is where it is made; 2: what was kept is; 3: the state hears. 0: nothing to do."""
+        """What to copy: 1: the iterate to the place; 2: the state's place to it; 3: the place to the state; 0: nothing.
+
+        1 and 2 come before a solve, 3 after a step, of which `accepted` has the flags (else it is empty).
+        """
         if accepted.shape[0] > 0:
             return wp.where(accepted[world] != 0 and reuse.changed[world] != 0 and reuse.stale[world] == 0, 3, 0)
         if reuse.moved[world] != 0:
@@ -229,7 +237,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         kept: wp.array2d(dtype=vec3),
         place: wp.array2d(dtype=vec3),
     ):
-        """Where it is made, and what the state keeps of it. `accepted`: of a step, else empty."""
+        """Set the place of the object or, after a step, that of the state; see `which`."""
         world, slot = wp.tid()
         to = which(reuse, accepted, world)
         if to == 1:
@@ -238,6 +246,24 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             place[world, slot] = kept[world, slot]
         elif to == 3:
             kept[world, slot] = place[world, slot]
+
+    @wp.kernel(module=module)
+    def carry_words(
+        reuse: Reuse,
+        accepted: wp.array(dtype=wp.int32),
+        live: wp.array2d(dtype=wp.uint32),
+        kept: wp.array2d(dtype=wp.uint32),
+        place: wp.array2d(dtype=wp.uint32),
+    ):
+        """The same for an array of a term, seen as [world, 32-bit word]."""
+        world, word = wp.tid()
+        to = which(reuse, accepted, world)
+        if to == 1:
+            place[world, word] = live[world, word]
+        elif to == 2:
+            place[world, word] = kept[world, word]
+        elif to == 3:
+            kept[world, word] = place[world, word]
 
     @wp.kernel(module=module)
     def carry_rows(
@@ -250,7 +276,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         place_gradient: wp.array2d(dtype=wp.vec3d),
         place_stiffness: wp.array2d(dtype=f64),
     ):
-        """The same for the constraints' rows."""
+        """As `carry_places`, for the rows of constraints that the object was made with."""
         world, row = wp.tid()
         to = which(reuse, accepted, world)
         if to == 1:
@@ -270,7 +296,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def made(reuse: Reuse):
-        """The matrices at hand are those of the state again."""
+        """Clear `stale` in the worlds that have made the object."""
         world = wp.tid()
         if reuse.build[world] != 0:
             reuse.stale[world] = 0
@@ -287,4 +313,5 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         made=made,
         carry_places=carry_places,
         carry_rows=carry_rows,
+        carry_words=carry_words,
     )

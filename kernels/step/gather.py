@@ -11,6 +11,7 @@ import warp as wp
 from ..common.inverse import inverse_function
 from ..common.lanes import lane_functions
 from ..common.structs import additions_struct, balance_struct, pattern_struct, topology_struct
+from ..common.traits import NO_TERMS, Traits
 from ..common.types import SMALL, kernel_module, precision
 from ..terms.constraints import constraint_struct, multiplier_struct
 
@@ -29,11 +30,9 @@ REACTION = wp.constant(wp.float64(1.0e-6))
 
 
 @functools.cache
-def gather_kernels(
-    dtype: str, nonpotential: bool, pressure: bool = False, constrained: bool = False
-) -> _types.SimpleNamespace:
-    """Kernels over slots; `nonpotential` adds forces that are held inside a line search, `pressure` their tangent,
-    `constrained` the forces of constraints."""
+def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+    """Kernels over slots. Of the traits "nonpotential", "tangent", "pooled" and "ties" count."""
+    nonpotential, tangent, pooled, ties = traits.nonpotential, traits.tangent, traits.pooled, traits.ties
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
@@ -43,7 +42,7 @@ def gather_kernels(
     Pattern = pattern_struct()
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     free_inverse = inverse_function(dtype)
-    name = f"{dtype}_{nonpotential}_{pressure}{'_constrained' if constrained else ''}"
+    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'ties')}"
     module = kernel_module(f"gather_{name}", max_unroll=SMALL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
 
@@ -115,6 +114,9 @@ def gather_kernels(
         f = vec3()
         for k in range(topo.start[slot], topo.start[slot + 1]):
             f += contribution[world, topo.entry[k]]
+        if wp.static(pooled):
+            for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
+                f += balance.pool[world, topo.pool_entry[k]]
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             j = topo.mass_column[k]
@@ -131,7 +133,7 @@ def gather_kernels(
                 magnitude[k] = magnitude[k] + wp.abs(new[k])
         residual_force = a + f - load
         descent = a + f - held
-        if wp.static(constrained):
+        if wp.static(ties):
             tie = constraint_forces(con, mul, world, slot)
             residual_force += vec3(tie[0])
             balance.gradient[world, slot] = residual_force + vec3(tie[1])
@@ -176,14 +178,20 @@ def gather_kernels(
         slot: int,
         result: wp.array2d(dtype=vec3),
     ) -> f64:
-        """H p: follower loads and constraints added to the elements' part, on the free components; returns p.Hp."""
+        """H p: follower loads, pooled terms and constraints added to the elements' part, on the free components; returns
+        p.Hp."""
         out = h
-        if wp.static(pressure):
+        if wp.static(tangent):
             f = vec3()
             for k in range(more.start[slot], more.start[slot + 1]):
                 f += more.contribution[world, more.entry[k]]
             out -= T(more.dq_dv[world]) * f
-        if wp.static(constrained):
+        if wp.static(pooled):
+            stiff = vec3()
+            for k in range(more.pool_start[slot], more.pool_start[slot + 1]):
+                stiff += more.pool[world, more.pool_entry[k]]
+            out += T(more.dq_dv[world]) * stiff
+        if wp.static(ties):
             tie = wp.vec3d()
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
                 tie += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
@@ -290,6 +298,7 @@ def gather_kernels(
     def gather_blocks(
         topo: Topology,
         contribution: wp.array2d(dtype=sym6),
+        pool: wp.array2d(dtype=sym6),
         mass_factor: wp.array(dtype=f64),
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
@@ -303,6 +312,9 @@ def gather_kernels(
         k6 = sym6()
         for k in range(topo.start[slot], topo.start[slot + 1]):
             k6 += contribution[world, topo.entry[k]]
+        if wp.static(pooled):
+            for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
+                k6 += pool[world, topo.pool_entry[k]]
         mass = T(0.0)
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             if topo.mass_column[k] == slot:

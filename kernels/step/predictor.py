@@ -1,7 +1,8 @@
-"""The first iterate of a step from the velocities of the steps before.
+"""The predictor: the first iterate of a step, extrapolated from the velocities of the steps before.
 
-v_n, 2 v_n - v_{n-1}, or 3 v_n - 3 v_{n-1} + v_{n-2}, whichever would have served the last step best: a third fewer PCG
-iterations where motions are smooth, and those of v_n where they are not.
+It is v_n (order 0), 2 v_n - v_{n-1} (order 1) or 3 v_n - 3 v_{n-1} + v_{n-2} (order 2): the one that would have been
+nearest to the result of the last step. Smooth motions need a third fewer PCG iterations for it, and others as many as
+with v_n.
 """
 
 import functools
@@ -16,21 +17,22 @@ from .step import step_struct
 __all__ = ["PREDICTOR_ROWS", "predictor_kernels", "predictor_struct"]
 
 PREDICTOR_ROWS = 4
+"""Rows of `compare` that are summed per world."""
 BETTER = 0.05
-"""Share of the squared error that a higher order must come below."""
+"""A higher order is chosen where its squared error is below this share of the lower order's."""
 ROUNDINGS = 1.0e3
-"""Errors of so many roundings of the velocity are none."""
+"""Errors below this many roundings of the velocity count as none."""
 
 
 @functools.cache
 def predictor_struct():
-    """What is known of the steps before, per world."""
+    """What the predictor knows of the steps before, per world."""
 
     @wp.struct
     class PredictorControl:
-        order: wp.array(dtype=wp.int32)  # to begin the next step of the same size with
-        count: wp.array(dtype=wp.int32)  # velocities that are known of steps of that size, at most 2
-        kept: wp.array2d(dtype=wp.float64)  # of the state: order, count, size of the step, its end
+        order: wp.array(dtype=wp.int32)  # that this attempt begins with
+        count: wp.array(dtype=wp.int32)  # earlier velocities known, of steps of the same size; at most 2
+        kept: wp.array2d(dtype=wp.float64)  # in the state: next order and count, size and end of the last step
         sums: wp.array2d(dtype=wp.float64)  # squared errors that orders 0, 1, 2 would have had; the velocity's square
 
     return PredictorControl
@@ -38,7 +40,7 @@ def predictor_struct():
 
 @functools.cache
 def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
-    """Kernels in one precision, in the module of the step that they belong to."""
+    """Kernels in one precision, compiled into the module of the step kernels."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
@@ -47,13 +49,14 @@ def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.func
     def continued(order: int, v: vec3, before: vec3, first: vec3) -> vec3:
+        """Extrapolation of order 1 or 2 from the velocities of one, two and three steps ago, m/s."""
         if order == 2:
             return T(3.0) * (v - before) + first
         return T(2.0) * v - before
 
     @wp.kernel(module=module)
     def begin(predictor: Predictor, step: Step, newton: Newton):
-        """What of the past counts for this attempt: only steps of its size, up to its start."""
+        """Choose the order: that of the state, if its last step had this size and ended where the attempt starts."""
         world = wp.tid()
         predictor.order[world] = 0
         predictor.count[world] = 0
@@ -75,7 +78,7 @@ def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         first: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
     ):
-        """The iterate on free components, where more than v_n is to be used."""
+        """Set the first iterate on free components where the order is above 0; else it stays v_n."""
         world, slot = wp.tid()
         order = predictor.order[world]
         if step.running[world] == 0 or order == 0:
@@ -101,7 +104,10 @@ def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         first: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """Of an accepted step, before it becomes the state: squared errors of the orders in the norm of D."""
+        """Squared errors that the orders would have had in an accepted step, in the norm of D.
+
+        Rows 0 to 2: the orders; row 3: the square of the velocity.
+        """
         world, slot = wp.tid()
         if step.accepted[world] == 0:
             return
@@ -110,7 +116,7 @@ def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         a = v_n[world, slot]
         fall = (T(step.dq_dv[world]) * is_position[slot]) * vec3(step.gravity[world])
         e = w - a - fall
-        if step.a1[world] > f64(0.0):  # a multistep scheme goes on as it went anyway
+        if step.a1[world] > f64(0.0):  # a multistep scheme extrapolates linearly already
             e = w - continued(1, a, before[world, slot], first[world, slot])
         rows[0, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
         for order in range(1, 3):
@@ -126,7 +132,7 @@ def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         before: wp.array2d(dtype=vec3),
         first: wp.array2d(dtype=vec3),
     ):
-        """The past moves on; `own`: v_{n-1} too, which multistep schemes keep themselves."""
+        """Move the stored velocities on by a step; `own`: v_{n-1} too, which multistep schemes store themselves."""
         world, slot = wp.tid()
         if step.accepted[world] != 0:
             first[world, slot] = before[world, slot]
@@ -135,7 +141,7 @@ def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def learn(predictor: Predictor, step: Step):
-        """The order to begin the next step with."""
+        """Choose the order for the next step: the smallest error wins, higher orders by a margin."""
         world = wp.tid()
         if step.accepted[world] == 0:
             return
@@ -143,7 +149,7 @@ def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         best = int(0)  # noqa: RUF046 - a variable of the loop
         least = f64(BETTER) * predictor.sums[0, world]
         if predictor.sums[0, world] <= f64(NOISE) * predictor.sums[3, world]:
-            least = f64(0.0)  # an extrapolated rounding would grow from step to step
+            least = f64(0.0)  # extrapolated rounding errors would grow from step to step
         for order in range(1, 3):
             if order <= count and predictor.sums[order, world] < least:
                 best = order

@@ -10,11 +10,25 @@ import types as _types
 import warp as wp
 
 from ..common.structs import balance_struct, topology_struct
+from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
 from ..solvers.newton import control_struct
 from ..solvers.pcg import pcg_struct
 
-__all__ = ["LEDGER", "LEDGER_ROWS", "REPORT", "STATUS", "step_kernels", "step_struct"]
+__all__ = [
+    "HELD_VISCOUS",
+    "LEDGER",
+    "LEDGER_ROWS",
+    "LOSS",
+    "NUMERICAL",
+    "REPORT",
+    "STATUS",
+    "STORED",
+    "WORK",
+    "booked_struct",
+    "step_kernels",
+    "step_struct",
+]
 
 STATUS = {"running": 0, "failed": 1, "frozen": 2}
 
@@ -46,9 +60,12 @@ LEDGER = (
     "integrator",
     "ledger_residual",
     "unbalanced",
-    "work_joints",
 )
-"""Columns of the energy ledger, J, accumulated since the start (the first three: current values)."""
+"""Columns of the energy ledger, J, accumulated since the start (the first three: current values); those of terms follow."""
+
+STORED, WORK, LOSS, NUMERICAL, HELD_VISCOUS = range(5)
+"""What a term books per substep: what it stores now; work done on the model; loss; a part of the integrator's; viscous loss
+of a force that counts among the dead loads."""
 
 LEDGER_ROWS = 10
 
@@ -89,8 +106,21 @@ def step_struct():
 
 
 @functools.cache
+def booked_struct():
+    """What terms book of a substep."""
+
+    @wp.struct
+    class Booked:
+        kind: wp.array(dtype=wp.int32)  # [row] STORED, WORK, ...
+        column: wp.array(dtype=wp.int32)  # [row] of the ledger, -1: none
+        sums: wp.array2d(dtype=wp.float64)  # [row, world] J
+
+    return Booked
+
+
+@functools.cache
 def step_kernels(
-    dtype: str, coefficients: wp.Function, static: bool, multistep: bool, nonpotential: bool, constrained: bool = False
+    dtype: str, coefficients: wp.Function, static: bool, multistep: bool, traits: Traits = NO_TERMS
 ) -> _types.SimpleNamespace:
     """Kernels of the step loop.
 
@@ -99,8 +129,7 @@ def step_kernels(
         coefficients: wp.func (h, previous h) -> vec3d(a0, a1, beta) of the time discretisation.
         static: no inertia, v is the displacement increment.
         multistep: the scheme uses the step before the last.
-        nonpotential: forces without a potential act.
-        constrained: the model has constraints.
+        traits: of the model; "nonpotential" and "gated" count.
     """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -109,8 +138,10 @@ def step_kernels(
     Newton = control_struct()
     Topology, Balance = topology_struct(dtype), balance_struct(dtype)
     PCG = pcg_struct()
-    tied = "_constrained" if constrained else ""
-    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}_{nonpotential}{tied}")
+    Booked = booked_struct()
+    nonpotential, gated = traits.nonpotential, traits.gated
+    variant = traits.suffix("nonpotential", "gated")
+    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}{variant}")
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
@@ -121,7 +152,7 @@ def step_kernels(
         step.refused[world] = 0
         newton.total_iterations[world] = 0
         newton.rough[world] = 0
-        if wp.static(constrained):
+        if wp.static(gated):
             newton.outer[world] = 0
         pcg.total[world] = 0
         step.halvings[world] = 0
@@ -323,11 +354,14 @@ def step_kernels(
         step: Step,
         newton: Newton,
         sums: wp.array2d(dtype=f64),
-        explicit_viscous: wp.array(dtype=f64),
-        constraint_work: wp.array2d(dtype=f64),
+        booked: Booked,
         ledger: wp.array2d(dtype=f64),
     ):
-        """Add a substep to the ledger; the integrator's part from its own formula, never as the remainder."""
+        """Add a substep to the ledger; the integrator's part from its own formula, never as the remainder.
+
+        The force of a term does the work f.dq on a substep. What it stores and loses of that is booked; the rest is the
+        integrator's.
+        """
         world = wp.tid()
         if step.accepted[world] == 0:
             return
@@ -336,17 +370,37 @@ def step_kernels(
         change_K = kinetic - ledger[world, 0]
         change_W = strain - ledger[world, 1]
         implicit = f64(2.0) * newton.elem_sums[1, world] * (step.h[world] / step.dq_dv[world])
-        viscous = implicit + explicit_viscous[world]
-        loads = sums[2, world] + explicit_viscous[world] - sums[3, world]
+        held = f64(0.0)
+        for k in range(booked.kind.shape[0]):
+            if booked.kind[k] == HELD_VISCOUS:
+                held += booked.sums[k, world]
+        viscous = implicit + held
+        loads = sums[2, world] + held - sums[3, world]
         numerical = sums[1, world] - change_W - implicit
         if wp.static(multistep):
             numerical += sums[8, world] - change_K
         else:
             numerical += sums[0, world]
-        joints = f64(0.0)
-        if wp.static(constrained):
-            joints = constraint_work[0, world]
-            numerical += constraint_work[1, world]
+        work = f64(0.0)
+        stored = f64(0.0)
+        lost = f64(0.0)
+        for k in range(booked.kind.shape[0]):
+            amount = booked.sums[k, world]
+            column = booked.column[k]
+            if booked.kind[k] == STORED:
+                change = amount - ledger[world, column]
+                stored += change
+                numerical -= change
+                ledger[world, column] = amount
+            elif booked.kind[k] == WORK:
+                work += amount
+                ledger[world, column] = ledger[world, column] + amount
+            elif booked.kind[k] == LOSS:
+                lost += amount
+                numerical -= amount
+                ledger[world, column] = ledger[world, column] + amount
+            elif booked.kind[k] == NUMERICAL:
+                numerical += amount
         step.ledger_time[world] = step.time[world]
         ledger[world, 0] = kinetic
         ledger[world, 1] = strain
@@ -356,11 +410,10 @@ def step_kernels(
         ledger[world, 5] = ledger[world, 5] + sums[7, world]
         ledger[world, 6] = ledger[world, 6] + viscous
         ledger[world, 7] = ledger[world, 7] + numerical
-        balance = change_K + change_W - sums[3, world] + viscous + numerical
-        balance -= loads + sums[4, world] + sums[7, world] + joints
+        balance = change_K + change_W - sums[3, world] + viscous + numerical + stored + lost
+        balance -= loads + sums[4, world] + sums[7, world] + work
         ledger[world, 8] = ledger[world, 8] + balance
         ledger[world, 9] = ledger[world, 9] + sums[6, world]
-        ledger[world, 10] = ledger[world, 10] + joints
 
     @wp.kernel(module=module)
     def write_report(step: Step, newton: Newton, pcg: PCG, report: wp.array2d(dtype=f64)):
@@ -379,7 +432,7 @@ def step_kernels(
         report[world, 10] = f64(0.0)
         report[world, 11] = newton.force[world]
         report[world, 12] = f64(newton.rough[world])
-        if wp.static(constrained):
+        if wp.static(gated):
             largest = f64(0.0)
             for c in range(newton.components):
                 largest = wp.max(largest, newton.violation[world, c])

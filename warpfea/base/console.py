@@ -22,16 +22,26 @@ __all__ = ["compile_bar", "number", "quiet_warp", "size", "table", "write_json"]
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
-@contextlib.contextmanager
-def quiet_warp() -> Iterator[None]:
-    """Warp started, without its greeting and its lines about modules; warnings and errors still show."""
-    before = wp.config.log_level
-    wp.config.log_level = max(before, wp.LOG_WARNING)
-    try:
-        _start()
-        yield
-    finally:
-        wp.config.log_level = before
+class quiet_warp:
+    """A context in which Warp, started if need be, prints no greeting and no lines about modules.
+
+    Warnings and errors still show, and so does all that Warp prints where its user asked for more than it prints by
+    default (`wp.config.log_level` below LOG_INFO, or `wp.config.verbose`). The level is as before afterwards.
+    """
+
+    def __enter__(self) -> None:
+        self.before = wp.config.log_level
+        asked = self.before < wp.LOG_INFO or bool(getattr(wp.config, "verbose", False))
+        if not asked:
+            wp.config.log_level = max(self.before, wp.LOG_WARNING)
+        if not _started:
+            _start()
+
+    def __exit__(self, *_: object) -> None:
+        wp.config.log_level = self.before
+
+
+_started: list[bool] = []
 
 
 def _start() -> None:
@@ -49,16 +59,20 @@ def _start() -> None:
         for line in file:
             if _NO_DRIVER not in line:
                 os.write(2, line)
+    _started.append(True)
 
 
 @contextlib.contextmanager
 def compile_bar(show: bool | None) -> Iterator[Callable[[int, int, str], None]]:
     """A bar "compiling kernels" on stderr, with how many modules are ready; None: when stderr is a terminal."""
-    from tqdm import tqdm
-
     if show is None:
         show = sys.stderr.isatty()
-    with tqdm(desc="compiling kernels", unit="module", file=sys.stderr, disable=not show, leave=False) as bar:
+    if not show:
+        yield lambda done, total, name: None
+        return
+    from tqdm import tqdm
+
+    with tqdm(desc="compiling kernels", unit="module", file=sys.stderr, leave=False) as bar:
 
         def update(done: int, total: int, name: str) -> None:
             bar.total = total

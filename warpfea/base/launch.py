@@ -10,6 +10,7 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 import warp as wp
 
 from ..kernels.common.lanes import WARP
+from .console import quiet_warp
 
 __all__ = ["PARTS", "Launcher", "Recorder", "kernel_name", "labelled"]
 
@@ -24,7 +25,6 @@ PARTS = {
     "preconditioner": "z = B r",
     "build": "the preconditioner at a new iterate",
     "vectors": "vector updates, dot products and sums",
-    "constraints": "values, multipliers and work of joints",
     "loads": "time laws, loads, drives, histories of damping",
     "control": "start of a step, line search, decisions of the loops",
     "commit": "acceptance of a step, energy ledger, report",
@@ -46,7 +46,7 @@ class Launcher:
 
     Attributes:
         recorder: does the launches, if set; they are not counted then.
-        label: the part that launches belong to, see `PARTS`.
+        label: the part that launches belong to. parts: those there are: `PARTS`, and what terms add.
     """
 
     def __init__(self, device: Any) -> None:
@@ -56,6 +56,7 @@ class Launcher:
         self.modules: set[str] = set()
         self.recorder: Recorder | None = None
         self.label = "control"
+        self.parts = dict(PARTS)
 
     def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
         """Launch one thread per item of `dim`; an empty launch is left out."""
@@ -79,8 +80,8 @@ class Launcher:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Launches within belong to part `name` of `PARTS`; the innermost counts."""
-        assert name in PARTS, name
+        """Launches within belong to part `name`; the innermost counts."""
+        assert name in self.parts, name
         outer, self.label = self.label, name
         try:
             yield
@@ -95,7 +96,8 @@ class Launcher:
             self.recorder(self.label, kernel, (*dim, block_dim), inputs, functools.partial(do, record_cmd=True))
             return
         self._count(kernel)
-        do()
+        with quiet_warp():  # a module that no Simulation has loaded is loaded now
+            do()
 
     def _count(self, kernel: wp.Kernel) -> None:
         self.launches += 1

@@ -6,20 +6,36 @@ import functools
 import os
 import pathlib
 import platform
+import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-__all__ = ["machine", "versions"]
+__all__ = ["commit", "machine", "origin", "versions"]
+
+
+def origin(words: Sequence[str], device: Any) -> dict[str, Any]:
+    """What a result file says of where its numbers come from: command, commit, machine and versions.
+
+    Args:
+        words: of the command line, without "warpfea".
+        device: that was used; None for the preferred one.
+    """
+    return {
+        "command": shlex.join(["warpfea", *words]),
+        "commit": commit(),
+        "machine": machine(device),
+        "versions": versions(),
+    }
 
 
 def versions() -> dict[str, str]:
     """Versions of what made the numbers."""
     import scipy
-    import warp as wp
 
     from .version import __version__
 
@@ -55,11 +71,13 @@ def commit() -> str | None:
 
     Asked once, before results are written into the checkout.
     """
-    root = pathlib.Path(__file__).resolve().parent.parent
+    root = pathlib.Path(__file__).resolve().parents[2]
 
     def ask(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
 
+    if not (root / "pyproject.toml").is_file():  # installed: a repository around it is another's
+        return os.environ.get("WARPFEA_COMMIT")
     try:
         return ask("rev-parse", "HEAD") + ("+" if ask("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):

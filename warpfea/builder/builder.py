@@ -2,54 +2,35 @@
 
 from __future__ import annotations
 
-import itertools
-import pathlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-import warp as wp
 
-from .. import elements as element_families
-from .. import mesh as meshes
+from ..base.console import quiet_warp
 from ..base.errors import ModelError
 from ..elements.sections import Rectangle
-from ..laws import time_law
 from ..materials import Material
-from ..mesh import Mesh
-from ..model.assembly import center_of_mass, surface_weights
+from ..model.assembly import require_density
 from ..model.bodies import Body
-from ..model.description import (
-    BodyForce,
-    DeadLoad,
-    Description,
-    Moment,
-    Pressure,
-    Probe,
-    Rotation,
-    Support,
-    support_slots,
-)
-from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
+from ..model.description import BodyForce, Description, Rotation
+from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint
+from ..model.model import Model
+from ..terms.evaluation import Evaluation
+from ..terms.term import Term
+from ..terms.term_set import TermSet
+from . import loads
+from .attachments import Ground
 from .beams import beam_geometry
-from .checks import assign_materials, component_mask, slot_field, vector
-from .joints import Ground, make_constraint, make_joint
+from .bodies import MeshLike, as_mesh, make_solid, make_structure, unused_name
+from .checks import owner_of, slot_field, vector, warn_implausible
+from .joints import make_constraint, make_joint
 from .shells import shell_geometry
-from .solids import solid_geometry
+from .supports import clamp_support, drive_supports
 from .welds import make_weld
 
-if TYPE_CHECKING:
-    from ..model.model import Model
-
 __all__ = ["ModelBuilder"]
-
-HANDLES: dict[type, str] = {
-    Body: "the body",
-    NodeSet: "nodes (body.nodes)",
-    SurfaceSet: "a surface (body.surface)",
-    ElementSet: "elements (body.elements)",
-    MaterialPoint: "a point (body.at)",
-}
 
 
 class ModelBuilder:
@@ -69,6 +50,15 @@ class ModelBuilder:
             raise ModelError(f"up_axis = {up_axis!r} is neither 'Z' nor 'Y'")
         self.up_axis = up_axis
         self.description = Description()
+        self._terms: list[Callable[[Model], Term | None]] = []
+
+    def __repr__(self) -> str:
+        d = self.description
+        count = len(d.dead_loads) + len(d.pressures) + len(d.moments) + len(d.body_forces)
+        counts = {"support": len(d.supports), "load": count, "joint": len(d.joints), "probe": len(d.probes)}
+        parts = [repr(body) for body in self.bodies] if len(self.bodies) <= 3 else [f"{len(self.bodies)} bodies"]
+        parts += [f"{n} {what}{'s' * (n > 1)}" for what, n in counts.items() if n]
+        return f"ModelBuilder({', '.join(parts)})" if parts else "ModelBuilder(no bodies)"
 
     # bodies
 
@@ -79,7 +69,7 @@ class ModelBuilder:
 
     def add_solid(
         self,
-        mesh: str | pathlib.Path | Mesh,
+        mesh: MeshLike,
         *,
         material: Material | dict[str, Material],
         element: str | None = None,
@@ -92,7 +82,7 @@ class ModelBuilder:
         """Add a solid body.
 
         Args:
-            mesh: file (Gmsh .msh, .vtu, Abaqus .inp) or Mesh, m after `scale`.
+            mesh: file (Gmsh .msh, .vtu, Abaqus .inp), Mesh or meshio.Mesh, m after `scale`.
             material: one law, or laws by element group of the mesh.
             element: "T4" or "T10", by default as the cells are; "ENMC", "FN" or "FN18", the ANCF tetrahedra, on
                 tetrahedra (of T10 cells the corner nodes stay, numbered anew; ENMC keeps the curved shape); "H3843",
@@ -110,22 +100,9 @@ class ModelBuilder:
             MeshError: the file or mesh can't be used.
             ModelError: unknown group or rule, elements without material, a name used twice.
         """
-        mesh = self._mesh(mesh, "add_solid", scale, transform)
-        name = self._name(name or mesh.name, given=name is not None)
-        if len(mesh.cells) == 0:
-            raise ModelError(f"body {name!r}: the mesh has no elements")
-        if element is None and mesh.cell_type in ("quad", "line"):
-            raise ModelError(
-                f"body {name!r}: {mesh.label} is a surface of {mesh.cell_type} cells, not a solid; use add_shell(mesh, "
-                "thickness=...)"
-            )
-        family = element_families.get(element) if element else element_families.for_cell(mesh.cell_type)
-        mesh, frames = solid_geometry(name, mesh, family)
-        rule = family.rule(quadrature).name
-        curved = family.curved_rule.name if quadrature is None else rule
-        return self._add(
-            Body(name, mesh, family, *assign_materials(name, mesh, material), rule, curved, frames), initial
-        )
+        mesh = as_mesh(mesh, "add_solid", scale, transform)
+        name = self._body_name(name, mesh.name)
+        return self._add(make_solid(name, mesh, material, element, quadrature), initial)
 
     def add_beam(
         self,
@@ -161,13 +138,13 @@ class ModelBuilder:
         Raises:
             ModelError: a corner, a normal along the axis, an unknown integration, or an argument out of range.
         """
-        name = self._name(name or "beam", given=name is not None)
+        name = self._body_name(name, "beam")
         mesh, axes, frames = beam_geometry(name, curve, elements, section, normal, corners)
-        return self._add_structure(name, mesh, "3243", material, integration, axes, frames, initial, section)
+        return self._add(make_structure(name, mesh, "3243", material, integration, axes, frames, section), initial)
 
     def add_shell(
         self,
-        mesh: str | pathlib.Path | Mesh,
+        mesh: MeshLike,
         *,
         thickness: float,
         material: Material | dict[str, Material],
@@ -182,8 +159,8 @@ class ModelBuilder:
         """Add a shell of ANCF 3443 elements on the mid-surface of quads.
 
         Args:
-            mesh: file or Mesh of quads, such as wf.mesh.grid; the director points where the quads turn left-handed
-                about it, (X_1 - X_0) x (X_3 - X_0).
+            mesh: file, Mesh or meshio.Mesh of quads, such as wf.mesh.grid; the director points where the quads turn
+                left-handed about it, (X_1 - X_0) x (X_3 - X_0).
             thickness: m.
             material: one law, or laws by element group of the mesh.
             integration: "tied" (default with SVK; remedies against thickness and shear locking, and the shear factor
@@ -200,48 +177,13 @@ class ModelBuilder:
             MeshError: the file or mesh can't be used.
             ModelError: a mesh that is not of quads, a corner, or an option out of range.
         """
-        mesh = self._mesh(mesh, "add_shell", scale, transform)
-        name = self._name(name or mesh.name, given=name is not None)
+        mesh = as_mesh(mesh, "add_shell", scale, transform)
+        name = self._body_name(name, mesh.name)
         axes, frames = shell_geometry(name, mesh, thickness, normals, corners)
-        return self._add_structure(name, mesh, "3443", material, integration, axes, frames, initial)
+        return self._add(make_structure(name, mesh, "3443", material, integration, axes, frames), initial)
 
-    def _add_structure(
-        self,
-        name: str,
-        mesh: Mesh,
-        element: str,
-        material: Any,
-        integration: str | None,
-        axes: np.ndarray,
-        frames: np.ndarray,
-        initial: Any,
-        section: Rectangle | None = None,
-    ) -> Body:
-        materials, index = assign_materials(name, mesh, material)
-        family = element_families.get(element)
-        split = all(law.law == "svk" for _, law in materials)
-        scheme = integration or ("tied" if split else "full")
-        known = [*family.schemes, *family.rules]
-        if scheme not in known:
-            raise ModelError(f"body {name!r}: integration = {scheme!r} is none of {', '.join(map(repr, known))}")
-        if scheme in family.schemes and not split:
-            bad = next(law for _, law in materials if law.law != "svk")
-            raise ModelError(
-                f"body {name!r}: integration = {scheme!r} splits the St. Venant-Kirchhoff law; use 'full' with "
-                f"{type(bad).__name__}"
-            )
-        return self._add(Body(name, mesh, family, materials, index, scheme, scheme, frames, axes, section), initial)
-
-    def _mesh(self, mesh: Any, what: str, scale: float, transform: Any) -> Mesh:
-        if isinstance(mesh, (str, pathlib.Path)):
-            mesh = meshes.read(mesh, scale=scale, transform=transform)
-        elif not isinstance(mesh, Mesh):
-            raise ModelError(f"{what}: mesh must be a file name or a Mesh, got {type(mesh).__name__}")
-        else:
-            if scale != 1.0 or transform is not None:
-                mesh = mesh.transformed(scale=scale, transform=transform)
-            meshes.check(mesh)
-        return mesh
+    def _body_name(self, name: str | None, default: str) -> str:
+        return unused_name(name, default, {body.name for body in self.bodies}, "body")
 
     def _add(self, body: Body, initial: Any) -> Body:
         body.index = len(self.bodies)
@@ -270,11 +212,7 @@ class ModelBuilder:
             ModelError: an unknown name of slots or components, or nodes of another builder.
         """
         body = self._own(nodes, "clamp", NodeSet)
-        held = support_slots(nodes, slots)
-        if not len(held):
-            raise ModelError(f"clamp on {body.name!r}: the nodes {nodes.name!r} have no slots {slots!r}")
-        mask = component_mask(components, f"clamp on {body.name!r}")
-        self.description.supports.append(Support(body, held, mask))
+        self.description.supports.append(clamp_support(body, nodes, slots, components))
 
     def drive(
         self,
@@ -300,49 +238,14 @@ class ModelBuilder:
             ModelError: neither or both of displacement and rotation, or a wrong shape.
         """
         body = self._own(nodes, "drive", NodeSet)
-        what = f"drive of {nodes.name or 'nodes'!r} on body {body.name!r}"
-        if (displacement is None) == (rotation is None):
-            raise ModelError(f"{what}: give either displacement or rotation")
-        slots = slots or ("position" if rotation is None else "all")
-        support = Support(body, support_slots(nodes, slots), component_mask(components, what))
-        if rotation is not None:
-            if not isinstance(rotation, Rotation):
-                raise ModelError(f"{what}: rotation must be a Rotation(anchor, axis, angle), got {rotation!r}")
-            axis = vector(rotation.axis, f"{what}: axis")
-            if not np.linalg.norm(axis) > 0.0:
-                raise ModelError(f"{what}: axis is zero")
-            support.law = time_law(rotation.angle, f"{what}: angle", scalar=True)
-            support.rotation = (vector(rotation.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis))
-            self.description.supports.append(support)
-            return
-        moved = np.isin(support.slots, support_slots(nodes, "position"))
-        if not moved.any():
-            raise ModelError(f"{what}: slots = {slots!r} has no position to displace; clamp holds gradients")
-        if not moved.all():  # gradients stay as they are
-            self.description.supports.append(Support(body, support.slots[~moved], support.components))
-        support.slots = support.slots[moved]
-        if isinstance(displacement, tuple) and len(displacement) == 2 and np.ndim(displacement[1]) == 3:
-            times, values = np.asarray(displacement[0], float), np.asarray(displacement[1], float)
-            if values.shape != (len(times), len(nodes), 3):
-                raise ModelError(f"{what}: values have shape {values.shape}, expected {(len(times), len(nodes), 3)}")
-            used = np.flatnonzero(body.node_slot[nodes.indices] >= 0)
-            support.node_laws = [time_law((times, values[:, k]), what) for k in used]
-        else:
-            support.law = time_law(displacement, f"{what}: displacement")
-        self.description.supports.append(support)
+        self.description.supports += drive_supports(body, nodes, displacement, rotation, components, slots)
 
     # loads
 
     def add_point_load(self, point: MaterialPoint | NodeSet, force: Any) -> None:
         """A force (time law, N) at a material point (Eq. 72), or shared equally by the nodes of a set."""
         body = self._own(point, "add_point_load", MaterialPoint, NodeSet)
-        law = time_law(force, f"point load on {body.name!r}")
-        if isinstance(point, NodeSet):
-            slots = support_slots(point, "position")
-            weights = np.full(len(slots), 1.0 / len(slots))
-        else:
-            slots, weights = point.slots, point.weights
-        self.description.dead_loads.append(DeadLoad(body, slots, weights, law, "point load"))
+        self.description.dead_loads.append(loads.point_load(body, point, force))
 
     def add_moment(self, point: MaterialPoint | NodeSet, moment: Any) -> None:
         """A moment about fixed directions (time law (3,), N m), at a material point or shared equally by nodes.
@@ -354,36 +257,17 @@ class ModelBuilder:
             ModelError: nodes without gradients to turn (T4, T10).
         """
         body = self._own(point, "add_moment", MaterialPoint, NodeSet)
-        law = time_law(moment, f"moment on {body.name!r}")
-        if isinstance(point, MaterialPoint):
-            slots, vectors, axes = point.slots[None], (point.gradients @ point.axes)[None], point.axes[None]
-        else:
-            nodes = point.indices[body.node_slot_count[point.indices] == 4]
-            if not len(nodes):
-                raise ModelError(
-                    f"add_moment: nodes of body {body.name!r} ({body.family.name}) have no gradients to turn; use a "
-                    "point body.at(...), or add_traction"
-                )
-            slots = body.node_slot[nodes][:, None] + np.arange(1, 4)
-            vectors = np.tile(np.eye(3), (len(slots), 1, 1))
-            axes = np.swapaxes(body.reference[slots], 1, 2)
-        vectors = vectors * (np.arange(3) >= 3 - body.family.spin_vectors)
-        self.description.moments.append(Moment(body, slots, vectors, axes, law))
+        self.description.moments.append(loads.spin_moment(body, point, moment))
 
     def add_traction(self, surface: SurfaceSet, traction: Any) -> None:
         """A dead traction (time law (3,), N per m^2 of the reference area) on faces."""
         body = self._own(surface, "add_traction", SurfaceSet)
-        law = time_law(traction, f"traction on {surface.name or 'faces'!r} of body {body.name!r}")
-        slots, weights = surface_weights(surface)
-        self.description.dead_loads.append(DeadLoad(body, slots, weights, law, "traction"))
+        self.description.dead_loads.append(loads.dead_traction(body, surface, traction))
 
     def add_pressure(self, surface: SurfaceSet, pressure: Any) -> None:
         """A follower pressure (time law, Pa) against the current outward normal of faces."""
         body = self._own(surface, "add_pressure", SurfaceSet)
-        law = time_law(pressure, f"pressure on {surface.name or 'faces'!r} of body {body.name!r}", scalar=True)
-        if not len(surface):
-            raise ModelError(f"pressure on body {body.name!r}: the surface has no faces")
-        self.description.pressures.append(Pressure(surface, law))
+        self.description.pressures.append(loads.follower_pressure(body, surface, pressure))
 
     def add_body_force(self, field: Any, *, bodies: list[Body] | None = None) -> None:
         """A force per mass b(x, t), N/kg, at the current position (Eq. 23).
@@ -392,13 +276,7 @@ class ModelBuilder:
             field: wp.func (x: vec3, t: scalar) -> vec3, in the model's precision or in float32 or float64 as annotated.
             bodies: bodies it acts on; by default all that were added so far.
         """
-        if not isinstance(field, wp.Function):
-            raise ModelError(f"add_body_force: the field must be a wp.func, got {field!r}")
-        if len(field.input_types) != 2:
-            raise ModelError(
-                f"add_body_force: {field.key} takes {len(field.input_types)} arguments; it must be "
-                "(x: wp.vec3d, t: wp.float64) -> wp.vec3d, or the same in float32"
-            )
+        loads.check_field(field)
         chosen = list(self.bodies if bodies is None else bodies)
         for body in chosen:
             self._own(body, "add_body_force", Body)
@@ -415,37 +293,14 @@ class ModelBuilder:
             displacement: a function X (n, 3) -> (n, 3), m, or, for T4 and T10, (nodes, 3).
         """
         self._own(body, "set_initial", Body)
-        label = f"body {body.name!r}"
-        if displacement is not None:
-            body.initial_displacement = slot_field(body, displacement, f"{label}: initial displacement")
-        if velocity is None and angular_velocity is None:
-            return
-        slots = np.zeros((body.slot_count, 3))
-        if velocity is not None:
-            slots += slot_field(body, velocity, f"{label}: velocity")
-        if angular_velocity is not None:
-            spin = vector(angular_velocity, f"{label}: angular_velocity")
-            x = body.reference + (0.0 if body.initial_displacement is None else body.initial_displacement)
-            position = body.slot_kind == 0
-            arm = np.where(position[:, None], x + body.origin - center_of_mass(body, x), x)
-            slots += np.cross(spin, arm)
-        body.velocity = slots
+        loads.set_initial_state(body, velocity, angular_velocity, displacement)
 
     def add_probe(self, name: str, where: MaterialPoint | SurfaceSet | NodeSet) -> None:
         """Record a point at every step; of a surface its area mean, of nodes their mean."""
         body = self._own(where, "add_probe", MaterialPoint, SurfaceSet, NodeSet)
         if any(p.name == name for p in self.description.probes):
             raise ModelError(f"probe {name!r} is there already")
-        if isinstance(where, MaterialPoint):
-            slots, weights = where.slots, where.weights
-        elif isinstance(where, SurfaceSet):
-            slots, weights = surface_weights(where)
-            weights = weights / weights[body.slot_kind[slots] == 0].sum()
-        else:
-            slots = support_slots(where, "position")
-            weights = np.full(len(slots), 1.0 / len(slots))
-        X = weights @ (body.reference[slots] + (body.slot_kind[slots] == 0)[:, None] * body.origin)
-        self.description.probes.append(Probe(name, body, slots, weights, X))
+        self.description.probes.append(loads.probe_at(name, body, where))
 
     # joints
 
@@ -532,14 +387,7 @@ class ModelBuilder:
         return self._join(make_weld(first, second, name))
 
     def _joint_name(self, name: str | None, kind: str) -> str:
-        taken = {joint.name for joint in self.description.joints}
-        if name is None:
-            return next(n for k in itertools.count(1) if (n := f"{kind}_{k}") not in taken)
-        if not isinstance(name, str) or not name:
-            raise ModelError(f"joint name {name!r} is no text")
-        if name in taken:
-            raise ModelError(f"joint name {name!r} is used twice")
-        return name
+        return unused_name(name, kind, {joint.name for joint in self.description.joints}, "joint")
 
     def _join(self, joint: Joint) -> Joint:
         self.description.joints.append(joint)
@@ -558,7 +406,7 @@ class ModelBuilder:
     # the end
 
     def finalize(self, *, device: Any = None, dtype: str = "float64", worlds: int = 1) -> Model:
-        """Make the constant Model of what was described.
+        """Make the constant Model of what was described; Warp starts quietly.
 
         Args:
             device: Warp device, e.g. "cpu" or "cuda:0"; by default CUDA where there is one, else the CPU.
@@ -566,38 +414,35 @@ class ModelBuilder:
             worlds: copies of the scene that are simulated side by side.
 
         Raises:
-            ModelError: no bodies, unknown device or precision.
+            ModelError: no bodies, unknown device or precision, or gravity or a body force on a body whose material has
+                no density.
+
+        Warns:
+            MeshWarning: a body is larger than a kilometre, heavier than 1e7 kg, or as small as dust: a wrong unit?
         """
-        from ..model.model import Model
+        if np.any(self.gravity):
+            require_density(self.bodies, "gravity")
+        for force in self.description.body_forces:
+            require_density(force.bodies, "add_body_force")
+        with quiet_warp():
+            model = Model(self, device=device, dtype=dtype, worlds=worlds)
+        warn_implausible(model)
+        return model
 
-        return Model(self, device=device, dtype=dtype, worlds=worlds)
+    def add_term(self, make: Callable[[Model], Term | None]) -> None:
+        """Add a term of one's own to the residual: a function of the Model that returns a Term, or None for nothing.
 
-    def _name(self, name: str, *, given: bool) -> str:
-        taken = {body.name for body in self.bodies}
-        if name in taken:
-            if given:
-                raise ModelError(f"body name {name!r} is used twice")
-            k = 2
-            while f"{name}_{k}" in taken:
-                k += 1
-            name = f"{name}_{k}"
-        return name
+        Raises:
+            ModelError: `make` can't be called.
+        """
+        if not callable(make):
+            raise ModelError(f"add_term: expected a function or class that takes the Model, got {make!r}")
+        self._terms.append(make)
+
+    def assemble(self, model: Model) -> tuple[TermSet, Evaluation]:
+        """The terms of a model, for Model itself."""
+        return TermSet(model, self._terms), Evaluation(model)
 
     def _own(self, thing: Any, what: str, *kinds: type) -> Body:
         """The body behind a handle, which must be of one of the kinds and of this builder."""
-        body = thing if isinstance(thing, Body) else getattr(thing, "body", None)
-        if not isinstance(body, Body):
-            raise ModelError(f"{what}: expected a handle of a body (such as body.nodes(...)), got {thing!r}")
-        if not isinstance(thing, kinds):
-            wanted = " or ".join(HANDLES[kind] for kind in kinds)
-            raise ModelError(f"{what}: expected {wanted} of body {body.name!r}, got {HANDLES[type(thing)]}")
-        if body not in self.bodies:
-            raise ModelError(f"{what}: body {body.name!r} belongs to another builder")
-        if isinstance(thing, (NodeSet, SurfaceSet)) and len(thing) == 0:
-            chosen = repr(thing.name) if thing.name else "of the predicate or list"
-            raise ModelError(f"{what}: the selection {chosen} on body {body.name!r} is empty")
-        if isinstance(thing, NodeSet):
-            unused = thing.indices[body.node_slot[thing.indices] < 0]
-            if len(unused) == len(thing.indices):
-                raise ModelError(f"{what}: no element of body {body.name!r} uses node {int(unused[0])}")
-        return body
+        return owner_of(thing, what, kinds, self.bodies)

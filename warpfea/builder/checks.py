@@ -2,19 +2,86 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ..base.errors import ModelError
+from ..base.errors import MeshWarning, ModelError
+from ..base.names import did_you_mean, listing
 from ..materials import Material
 from ..mesh import Mesh
 from ..model.bodies import Body
+from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
 
-__all__ = ["COMPONENTS", "assign_materials", "component_mask", "nodal", "slot_field", "vector"]
+__all__ = [
+    "COMPONENTS",
+    "assign_materials",
+    "component_mask",
+    "nodal",
+    "owner_of",
+    "slot_field",
+    "vector",
+    "warn_implausible",
+]
 
 COMPONENTS = {"x": 0, "y": 1, "z": 2}
+SIZES = (1e-6, 1e3)
+"""Least and largest plausible size of a body, m: the longest side of its box."""
+MASSES = (1e-12, 1e7)
+"""Least and largest plausible mass of a body, kg: a grain of dust, and more than a steel tower of 300 m."""
+HANDLES: dict[type, str] = {
+    Body: "the body",
+    NodeSet: "nodes (body.nodes)",
+    SurfaceSet: "a surface (body.surface)",
+    ElementSet: "elements (body.elements)",
+    MaterialPoint: "a point (body.at)",
+}
+
+
+def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body]) -> Body:
+    """The body behind a handle, which must be of one of the kinds and of one of the bodies, and not empty.
+
+    Raises:
+        ModelError: it is not; the text begins with `what`.
+    """
+    body = thing if isinstance(thing, Body) else getattr(thing, "body", None)
+    if not isinstance(body, Body):
+        raise ModelError(f"{what}: expected a handle of a body (such as body.nodes(...)), got {thing!r}")
+    if not isinstance(thing, kinds):
+        wanted = " or ".join(HANDLES[kind] for kind in kinds)
+        raise ModelError(f"{what}: expected {wanted} of body {body.name!r}, got {HANDLES[type(thing)]}")
+    if body not in bodies:
+        raise ModelError(f"{what}: body {body.name!r} belongs to another builder")
+    if isinstance(thing, (NodeSet, SurfaceSet)) and len(thing) == 0:
+        chosen = repr(thing.name) if thing.name else "of the predicate or list"
+        raise ModelError(f"{what}: the selection {chosen} on body {body.name!r} is empty")
+    if isinstance(thing, NodeSet):
+        unused = thing.indices[body.node_slot[thing.indices] < 0]
+        if len(unused) == len(thing.indices):
+            raise ModelError(f"{what}: no element of body {body.name!r} uses node {int(unused[0])}")
+    return body
+
+
+def warn_implausible(model: Any) -> None:
+    """Warn (MeshWarning) of bodies of a size or mass that a wrong unit of length is likely to have made."""
+    for body in model.bodies:
+        low, high = body.mesh.bounding_box()
+        size = float(np.max(high - low))
+        mass = None
+        if all(material.density is not None for _, material in body.materials):
+            mass = float(model.lumped_host[body.slots][body.slot_kind == 0].sum())
+        large = size > SIZES[1] or (mass is not None and mass > MASSES[1])
+        small = size < SIZES[0] or (mass is not None and mass < MASSES[0])
+        if not (large or small):
+            continue
+        what = f"is {size:.3g} m long" + ("" if mass is None else f" and weighs {mass:.3g} kg")
+        hint = "lengths are in metres, density in kg/m^3"
+        if body.mesh.path is not None:
+            unit = "; a mesh in mm needs scale=1e-3" if large else "; was it scaled twice?"
+            hint = f"is {body.mesh.label} in metres{unit}"
+        warnings.warn(f"body {body.name!r} {what}: {hint}", MeshWarning, stacklevel=3)
 
 
 def vector(value: Any, what: str) -> np.ndarray:
@@ -92,7 +159,7 @@ def assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[s
         if group not in mesh.element_sets:
             raise ModelError(
                 f"body {name!r}: material group {group!r} is not an element group of {mesh.label}; there are "
-                f"{sorted(mesh.element_sets)}"
+                f"{listing(sorted(mesh.element_sets))}{did_you_mean(group, mesh.element_sets)}{_bare_volume(mesh)}"
             )
         members = mesh.element_sets[group]
         twice = members[index[members] >= 0]
@@ -107,6 +174,16 @@ def assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[s
             f"{int(bare[0])}; groups given: {sorted(material)}"
         )
     return list(material.items()), index
+
+
+def _bare_volume(mesh: Mesh) -> str:
+    """What to do about a mesh whose groups are surfaces, edges or points only."""
+    if mesh.element_sets:
+        return ""
+    names = listing(dict.fromkeys([*mesh.surface_sets, *mesh.node_sets]))
+    text = f"; the volume has no group (the groups of surfaces and nodes are {names}): give one material for the whole "
+    text += "body, material=law"
+    return text if mesh.path is None else text + ', or name the volume in Gmsh, Physical Volume("body") = {1};'
 
 
 def _check_density(name: str, group: str, material: Any, mesh: Mesh) -> None:

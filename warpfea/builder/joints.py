@@ -11,221 +11,25 @@ A material direction n of a body is F n, linear in the slots, in place of a chor
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..base.errors import ModelError
+from ..base.names import did_you_mean
 from ..kernels.terms.constraints import DISTANCE, DOT, TURN
 from ..laws import TimeLaw, time_law
-from ..model import assembly
-from ..model.bodies import Body
-from ..model.description import support_slots
-from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
-from ..model.joints import Joint, Part, Row, Vector, constant
+from ..model.joints import Joint, Row, Vector, constant
+from .attachments import COINCIDENT, GROUND, UNKNOWN, Attachment, Ground, attach
 from .checks import vector
 
-__all__ = ["GROUND", "JOINTS", "Ground", "attach", "make_constraint", "make_joint", "pin_rows"]
+__all__ = ["GROUND", "JOINTS", "Ground", "make_constraint", "make_joint", "pin_rows"]
 
 JOINTS = ("spherical", "universal", "revolute", "cylindrical", "translational", "fixed", "distance")
 NEEDS_AXIS = ("universal", "revolute", "cylindrical", "translational")
 DRIVEN = ("revolute", "translational", "distance")
-COINCIDENT = 1e-9
-"""Distance of places that are one, over the size of their bodies."""
-FLAT_SURFACE, FLAT_NODES = 1e-2, 1e-3
-"""Variance of places across their plane, over that in it, below which a fit does not tell how its normal turns."""
-ACROSS = 0.5
-UNKNOWN = 10.0
 CONSTRAINTS = {"DP1": 4, "DP2": 4, "DIST": 2, "PIN": 2}
-
-
-class Ground:
-    """The world that does not move; `warpfea.GROUND`."""
-
-    def __repr__(self) -> str:
-        return "GROUND"
-
-
-GROUND = Ground()
-
-
-@dataclass(frozen=True, eq=False)
-class Attachment:
-    """A place on a body, or on the ground, with the affine motion around it: x + F (Y - X).
-
-    Attributes:
-        body: None for the ground.
-        X: (3,) reference position, m.
-        slots, weights, gradients: (n,), (n,), (n, 3): x = sum weights e, F = sum e gradients^T.
-        known: (3, 3) projector on the directions n for which F n is known.
-        weak: (3, 3) projector on those that bend at a point for next to nothing: a beam's axis, a shell's tangents;
-            less (`ACROSS`) of a solid's face.
-        label: for messages.
-        child: the joint's child side.
-    """
-
-    body: Body | None
-    X: np.ndarray
-    slots: np.ndarray
-    weights: np.ndarray
-    gradients: np.ndarray
-    known: np.ndarray
-    weak: np.ndarray
-    label: str
-    child: bool
-
-    def position(self, at: np.ndarray, what: str) -> Vector:
-        """The place of the point that is at `at` (3,) in the reference; off X it is carried along by F."""
-        arm = at - self.X
-        if self.body is None:
-            return constant(at)
-        weights = self.weights
-        if np.linalg.norm(arm) > COINCIDENT * self.size:
-            self._check(arm / np.linalg.norm(arm), what)
-            weights = weights + self.gradients @ arm
-        return Vector(at, (Part(self.body, self.slots, weights, self.child),))
-
-    def direction(self, n: np.ndarray, what: str) -> Vector:
-        """F n."""
-        if self.body is None:
-            return constant(n)
-        self._check(n, what)
-        return Vector(n, (Part(self.body, self.slots, self.gradients @ n, self.child),))
-
-    def _check(self, n: np.ndarray, what: str) -> None:
-        lost = np.linalg.norm(n - self.known @ n)
-        if lost > 1e-6:
-            raise ModelError(
-                f"{what}: {self.label} does not tell how the direction {np.round(n, 6).tolist()} turns; give a "
-                "surface, a material point, or more nodes that span it"
-            )
-
-    def weakness(self, n: np.ndarray) -> float:
-        """0 for a direction that the section, director or solid carries, 1 for one that it does not; 10: not known."""
-        if self.body is None:
-            return 0.0
-        return float(np.linalg.norm(self.weak @ n) + UNKNOWN * (np.linalg.norm(n - self.known @ n) > 1e-6))
-
-    @property
-    def size(self) -> float:
-        """Diagonal of the body's box, m; 0 of the ground."""
-        if self.body is None:
-            return 0.0
-        low, high = self.body.mesh.bounding_box()
-        return float(np.linalg.norm(np.asarray(high) - np.asarray(low)))
-
-    def same_as(self, other: Attachment) -> bool:
-        """Whether both are the same place of the same body."""
-        return (
-            self.body is not None
-            and self.body is other.body
-            and np.array_equal(self.slots, other.slots)
-            and np.array_equal(self.weights, other.weights)
-        )
-
-
-def attach(thing: Any, what: str, *, child: bool) -> Attachment:
-    """The attachment of a handle, or of a fixed place (3,). ModelError for anything else."""
-    all_known, none_weak = np.eye(3), np.zeros((3, 3))
-    if isinstance(thing, Ground):
-        return Attachment(None, np.full(3, np.nan), *_none(), all_known, none_weak, "the ground", child)
-    if isinstance(thing, MaterialPoint):
-        label = f"the point {np.round(thing.X, 6).tolist()} of body {thing.body.name!r}"
-        weak = _weak(thing.body, thing.axes)
-        return Attachment(
-            thing.body, thing.X, thing.slots, thing.weights, thing.gradients, all_known, weak, label, child
-        )
-    if isinstance(thing, NodeSet):
-        return _of_nodes(thing, child)
-    if isinstance(thing, SurfaceSet):
-        return _of_surface(thing, child)
-    if isinstance(thing, (tuple, list, np.ndarray)):
-        return Attachment(None, vector(thing, what), *_none(), all_known, none_weak, "a fixed point", child)
-    raise ModelError(
-        f"{what}: expected wf.GROUND, body.at(X), body.nodes(...), body.surface(...), beam.start or beam.end, got "
-        f"{thing!r}"
-    )
-
-
-def _none() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3))
-
-
-def _weak(body: Body, axes: np.ndarray) -> np.ndarray:
-    """Projector on the axes (columns) that do not belong to a beam's section or a shell's director."""
-    if body.family.solid:
-        return np.zeros((3, 3))
-    columns = axes[:, : 3 - body.family.spin_vectors]
-    return columns @ columns.T
-
-
-def _fit(weights: np.ndarray, X: np.ndarray, flat: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Affine least-squares fit of points X (n, 3): mean (3,), gradients (n, 3), projector on what they span."""
-    mean = weights @ X
-    arm = X - mean
-    C = arm.T @ (weights[:, None] * arm)
-    values, vectors = np.linalg.eigh(C)
-    good = vectors[:, values > flat * max(values.max(), 1e-300)]
-    good = good if values.max() > 0.0 else good[:, :0]
-    inverse = good @ np.diag(1.0 / np.diag(good.T @ C @ good)) @ good.T if good.size else np.zeros((3, 3))
-    return mean, weights[:, None] * arm @ inverse, good @ good.T
-
-
-def _of_nodes(nodes: NodeSet, child: bool) -> Attachment:
-    """Mean of the nodes and the best affine motion of them; directions off their span by their gradient slots."""
-    body = nodes.body
-    label = f"nodes {nodes.name!r} of body {body.name!r}" if nodes.name else f"{len(nodes)} nodes of body {body.name!r}"
-    position = support_slots(nodes, "position")
-    X = body.reference[position] + body.origin
-    weights = np.full(len(position), 1.0 / len(position))
-    mean, gradients, span = _fit(weights, X, FLAT_NODES)
-    weak = np.zeros((3, 3))
-    full = nodes.indices[body.node_slot_count[nodes.indices] == 4]
-    if len(full) and np.linalg.norm(span - np.eye(3)) > 1e-9:
-        slots = body.node_slot[full][:, None] + np.arange(1, 4)
-        axes = body.reference[slots]  # (n, slot, 3): e_k = F a_k
-        rest = np.eye(3) - span
-        position = np.concatenate([position, slots.ravel()])
-        weights = np.concatenate([weights, np.zeros(slots.size)])
-        gradients = np.concatenate([gradients, axes.reshape(-1, 3) @ rest / len(full)])
-        weak = rest @ _weak(body, axes[0].T) @ rest
-        span = np.eye(3)
-    return Attachment(body, mean, position, weights, gradients, span, weak, label, child)
-
-
-def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
-    """Area mean of a surface; in its plane the best affine motion, across it the mean of F."""
-    body = surface.body
-    label = f"surface {surface.name!r} of body {body.name!r}" if surface.name else f"a surface of body {body.name!r}"
-    t = assembly.facet_tables(surface)
-    X, dA = assembly.facet_places(body, t)
-    share = (dA / dA.sum()).ravel()
-    X = X.reshape(-1, 3)
-    mean, at_points, span = _fit(share, X, FLAT_SURFACE)
-    n = body.slot_count
-    weights, gradients = np.zeros(n), np.zeros((n, 3))
-    np.add.at(weights, t.conn, np.einsum("fq,fqi->fi", dA / dA.sum(), t.shape))
-    np.add.at(gradients, t.conn, np.einsum("fqk,fqi->fik", at_points.reshape(*dA.shape, 3), t.shape))
-    weak = np.zeros((3, 3))
-    rest = np.eye(3) - span
-    if np.linalg.norm(rest) > 1e-9:
-        rule = body.family.face_rule
-        for face in np.unique(surface.faces[:, 1]):
-            rows = np.flatnonzero(surface.faces[:, 1] == face)
-            members = surface.faces[rows, 0]
-            xi, _ = body.family.face_points(int(face), rule.points)
-            _, ds, J, _ = assembly.geometry(body, members, xi)
-            h = np.einsum("fq,fqsk->fsk", dA[rows] / dA.sum(), assembly.gradients(ds, J)) @ rest
-            np.add.at(gradients, body.connectivity[members], h)
-            weak = rest @ _weak(body, assembly.orthonormal(J[0, 0])) @ rest
-        if body.family.solid:  # the mean of F across a face feels the strain at it, the fit in its plane does not
-            weak = ACROSS * rest
-    slots = np.flatnonzero((weights != 0.0) | gradients.any(axis=1))
-    return Attachment(body, mean, slots, weights[slots], gradients[slots], np.eye(3), weak, label, child)
-
-
-# joints
 
 
 def make_joint(
@@ -234,7 +38,7 @@ def make_joint(
     """Compose a joint. Raises ModelError naming the joint and what is wrong."""
     what = f"joint {name!r}"
     if kind not in JOINTS:
-        raise ModelError(f"{what}: kind {kind!r} is unknown; there are {', '.join(JOINTS)}")
+        raise ModelError(f"{what}: kind {kind!r} is unknown; there are {', '.join(JOINTS)}{did_you_mean(kind, JOINTS)}")
     P, Q = attach(parent, f"{what}: parent", child=False), attach(child, f"{what}: child", child=True)
     if P.body is None and Q.body is None:
         raise ModelError(f"{what}: neither parent nor child is a body")
@@ -439,7 +243,9 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
     """
     what = f"constraint {name!r} ({kind})"
     if kind not in CONSTRAINTS:
-        raise ModelError(f"{what}: the kind is unknown; there are {', '.join(CONSTRAINTS)}")
+        raise ModelError(
+            f"{what}: the kind is unknown; there are {', '.join(CONSTRAINTS)}{did_you_mean(kind, CONSTRAINTS)}"
+        )
     count = CONSTRAINTS[kind]
     if not isinstance(points, (tuple, list)) or len(points) != count:
         raise ModelError(f"{what}: points must be {count} points, got {points!r}")

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec
 
 from ..base.errors import ModelError
+from ..base.names import did_you_mean
 
 if TYPE_CHECKING:
     from .builder import ModelBuilder
@@ -121,7 +122,8 @@ class Scene(Generic[P]):
             if not equals or not name:
                 raise ModelError(f"--set {setting}: expected name=value")
             if name not in self.parameters:
-                raise ModelError(f"scene {self.name!r} has no parameter {name!r}; {self._listing()}")
+                hint = did_you_mean(name, self.parameters)
+                raise ModelError(f"scene {self.name!r} has no parameter {name!r}; {self._listing()}{hint}")
             if name in out:
                 raise ModelError(f"--set {name}: given twice")
             try:
@@ -201,7 +203,10 @@ def names() -> list[str]:
 def find(name: str) -> Scene[Any]:
     """The scene `name` that comes with warpfea. ModelError lists what there is."""
     if name not in names():
-        raise ModelError(f"there is no scene {name!r}; there are {', '.join(names())}, or give a .py or mesh file")
+        hint = did_you_mean(name, names())
+        raise ModelError(
+            f"there is no scene {name!r}; there are {', '.join(names())}, or give a .py or mesh file{hint}"
+        )
     found = getattr(importlib.import_module(f"warpfea.scenes.{name}"), name, None)
     if not isinstance(found, Scene):
         raise ModelError(f"module warpfea.scenes.{name} does not define the scene {name!r}")

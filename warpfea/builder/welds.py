@@ -10,6 +10,7 @@ from ..base.errors import ModelError
 from ..model import assembly
 from ..model.bodies import Body
 from ..model.description import support_slots
+from ..model.discretisation import Discretisation
 from ..model.handles import NodeSet, SurfaceSet
 from ..model.joints import Joint, Part, Vector
 from ..model.locate import locate
@@ -55,7 +56,9 @@ def _face(nodes: NodeSet) -> SurfaceSet | None:
     return None if faces is None else SurfaceSet(body, faces, nodes.name)
 
 
-def _mortar(face: SurfaceSet, holder: Body, within: SurfaceSet | None, what: str) -> tuple[list[Vector], Vector]:
+def _mortar(
+    face: SurfaceSet, holder: Discretisation, within: SurfaceSet | None, what: str
+) -> tuple[list[Vector], Vector]:
     """One vector per slot i of the face: int phi_i (x - x_holder) dA / int |phi_i| dA."""
     body = face.body
     t = assembly.facet_tables(face, _parts(face, holder))
@@ -79,7 +82,7 @@ def _mortar(face: SurfaceSet, holder: Body, within: SurfaceSet | None, what: str
     return gaps, _anchor(body, mean @ own, mean @ X.reshape(-1, 3))
 
 
-def _parts(face: SurfaceSet, holder: Body) -> int:
+def _parts(face: SurfaceSet, holder: Discretisation) -> int:
     """Parts to split a face in, so that the kinks of the holder's functions between its elements are seen."""
     _, dA = assembly.facet_places(face.body, assembly.facet_tables(face))
     area = float(dA.sum(axis=1).max())
@@ -87,7 +90,7 @@ def _parts(face: SurfaceSet, holder: Body) -> int:
     return int(np.clip(np.ceil(PER_ELEMENT * np.sqrt(area) / size), 1, MOST_PARTS))
 
 
-def _pins(nodes: NodeSet, holder: Body, within: SurfaceSet | None, what: str) -> tuple[list[Vector], Vector]:
+def _pins(nodes: NodeSet, holder: Discretisation, within: SurfaceSet | None, what: str) -> tuple[list[Vector], Vector]:
     """Nodes at their places in the holder."""
     body = nodes.body
     slots = support_slots(nodes, "position")
@@ -121,18 +124,18 @@ def _check_near(X: np.ndarray, within: SurfaceSet | None, what: str) -> None:
         )
 
 
-def _locate(holder: Body, X: np.ndarray, what: str) -> Any:
+def _locate(holder: Discretisation, X: np.ndarray, what: str) -> Any:
     try:
         return locate(holder, X, slack=SLACK)
     except ModelError as error:
         raise ModelError(f"{what}: {error}; the welded face must lie in the other body") from None
 
 
-def _gap(body: Body, holder: Body, own: np.ndarray, other: np.ndarray) -> Vector:
+def _gap(body: Discretisation, holder: Discretisation, own: np.ndarray, other: np.ndarray) -> Vector:
     a, b = np.flatnonzero(own), np.flatnonzero(other)
     return Vector(np.zeros(3), (Part(body, a, own[a], True), Part(holder, b, -other[b], False)))
 
 
-def _anchor(body: Body, weights: np.ndarray, X: np.ndarray) -> Vector:
+def _anchor(body: Discretisation, weights: np.ndarray, X: np.ndarray) -> Vector:
     slots = np.flatnonzero(weights)
     return Vector(X, (Part(body, slots, weights[slots], True),))

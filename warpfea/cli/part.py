@@ -14,14 +14,15 @@ from typing import Any
 from .. import materials
 from .. import mesh as meshes
 from ..base.errors import Error, UsageError
+from ..base.names import did_you_mean
 from ..builder.builder import ModelBuilder
 from ..builder.scene import Scene
 from ..model.bodies import Body
-from .parser import MATERIAL_HINT, numbers
+from .arguments import numbers
+from .parser import MATERIAL_HINT
 
-__all__ = ["OPTIONS", "SUFFIXES", "parse_material", "part_scene"]
+__all__ = ["OPTIONS", "mesh_facts", "parse_material", "part_scene"]
 
-SUFFIXES = (".msh", ".vtu", ".inp")
 OPTIONS = ("material", "clamp", "traction", "pressure", "gravity", "scale", "up_axis", "quadrature")
 LAWS: dict[str, type[materials.Material]] = {
     "svk": materials.SVK,
@@ -69,6 +70,21 @@ def part_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
     return Scene(build, dt=1e-3, t_end=0.5, speed=0.2), parameters
 
 
+def mesh_facts(mesh: meshes.Mesh) -> dict[str, Any]:
+    """What a mesh holds: counts, box (m), volume (m^3; area of quads, m^2), and the size of each group."""
+    low, high = mesh.bounding_box()
+    return {
+        "cells": mesh.cell_type,
+        "elements": len(mesh.cells),
+        "nodes": len(mesh.used_nodes),
+        "bounding_box": [low.tolist(), high.tolist()],
+        "volume": mesh.volume(),
+        "element_groups": {name: len(ids) for name, ids in sorted(mesh.element_sets.items())},
+        "surface_groups": {name: len(rows) for name, rows in sorted(mesh.surface_sets.items())},
+        "node_groups": {name: len(ids) for name, ids in sorted(mesh.node_sets.items())},
+    }
+
+
 def _everywhere(body: Body) -> Any:
     return body.nodes(body.mesh.used_nodes)
 
@@ -86,7 +102,11 @@ def _load(text: str, option: str, size: int) -> tuple[str, tuple[float, ...]]:
 
 def _materials(path: pathlib.Path, mesh: Any, laws: list[tuple[str, materials.Material]]) -> Any:
     """One law, or laws by group; UsageError that lists the groups if there is none."""
-    groups = ", ".join(f"{name} ({len(ids)} elements)" for name, ids in mesh.element_sets.items()) or "none"
+    groups = ", ".join(f"{name} ({len(ids)} elements)" for name, ids in mesh.element_sets.items())
+    if not groups:
+        surfaces = f" (its surface groups: {', '.join(mesh.surface_sets)})" if mesh.surface_sets else ""
+        groups = f"none{surfaces}: the whole mesh takes one LAW:..., or name the volume in Gmsh, "
+        groups += 'Physical Volume("body") = {1};'
     if not laws:
         raise UsageError(
             f"{path}: no material; give --material LAW:..., {MATERIAL_HINT}, for the whole mesh, or "
@@ -108,7 +128,8 @@ def parse_material(text: str) -> tuple[str, materials.Material]:
     head, colon, tail = text.partition(":")
     group, _, name = head.rpartition("=")
     if not colon or name not in LAWS:
-        raise UsageError(f"{where}: expected [GROUP=]LAW:NAME=VALUE,... with LAW one of {', '.join(LAWS)}")
+        hint = did_you_mean(name, LAWS)
+        raise UsageError(f"{where}: expected [GROUP=]LAW:NAME=VALUE,... with LAW one of {', '.join(LAWS)}{hint}")
     values: dict[str, Any] = {}
     for item in tail.split(","):
         match = re.fullmatch(r"\s*(\w+)\s*=\s*(\S+)\s*", item)
@@ -145,11 +166,17 @@ def _damping(where: str, values: dict[str, Any]) -> dict[str, Any]:
 def _maker(where: str, law: Any, values: dict[str, Any]) -> Callable[..., materials.Material]:
     """The constructor that takes these names: the law's own, or from_E_nu."""
     makers = [law, law.from_E_nu]
-    wanted = []
+    wanted: list[str] = []
+    known = [*DAMPING]
     for make in makers:
         names = [n for n in inspect.signature(make).parameters if n != "damping"]
-        needed = [n for n in names if n != "ratio"]
+        needed = [n for n in names if n not in ("ratio", "density")]  # the model says where a density is missing
         if set(values) <= set(names) and set(needed) <= set(values):
             return make  # type: ignore[no-any-return]
-        wanted.append(", ".join(needed))
-    raise UsageError(f"{where}: the law takes {' or '.join(dict.fromkeys(wanted))}; given are {', '.join(values)}")
+        wanted.append(", ".join([*needed, "density"]))
+        known += names
+    odd = [name for name in values if name not in known]
+    hint = did_you_mean(odd[0], known) if odd else ""
+    raise UsageError(
+        f"{where}: the law takes {' or '.join(dict.fromkeys(wanted))}; given are {', '.join(values)}{hint}"
+    )

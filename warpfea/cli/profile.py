@@ -8,15 +8,13 @@ import statistics
 import sys
 from typing import Any
 
-from tqdm import tqdm
-
 from ..base.console import number, plain, quiet_warp, table, write_json
-from ..base.launch import PARTS
 from ..base.provenance import machine, versions
 from ..base.writer import write_whole
 from ..simulation.simulation import Simulation
 from ..studies.profile.profiling import WARM_UP, KernelTime, Profile
 from ..studies.profile.profiling import profile as measure
+from ..terms.term_set import all_parts
 from . import DONE
 from .run import check_targets
 from .source import Source, progress, resolve
@@ -59,9 +57,11 @@ def profile(options: argparse.Namespace) -> int:
     """Do `warpfea profile SCENE`."""
     check_targets(options)
     if options.png:  # before any work
-        from ..studies.ancf_tets.plots import require_matplotlib
+        from ..studies.plots import require_matplotlib
 
         require_matplotlib()
+    from tqdm import tqdm
+
     source = resolve(options)
     with quiet_warp():
         show = progress(options)
@@ -154,7 +154,7 @@ def _human(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
         ["copy", f"{number(c['copy_GBps'], 3)} GB/s, read and written, for a large array"],
     ]
     parts = [["part", *HEADER, ""]]
-    parts += [[name, *_cells(k, found), PARTS[name]] for name, k in found.parts.items()]
+    parts += [[name, *_cells(k, found), all_parts().get(name, "")] for name, k in found.parts.items()]
     gap, share = found.between_ms, 100.0 * found.between_ms / found.total_ms
     cells = [number(gap, 3), f"{share:.1f} %"] if gap > 0.0 else ["-", "-"]
     parts.append(["between", *cells, "", "", "", "", BETWEEN])

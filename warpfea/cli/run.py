@@ -14,7 +14,9 @@ from ..base.errors import ConstraintError, ConvergenceError, OutputError, UsageE
 from ..base.writer import Output, check_folder, check_target
 from ..simulation.checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
 from ..simulation.checkpoint import Checkpoint, load_checkpoint, read_meta
+from ..simulation.run_loop import interruptible
 from ..simulation.simulation import Simulation
+from ..simulation.statics import run_static
 from . import DONE
 from .source import Source, progress, resolve
 from .summary import human, summarize
@@ -29,10 +31,15 @@ TARGETS: dict[str, Sequence[str]] = {
     "checkpoint": CHECKPOINT_SUFFIXES,
 }
 
+STATIC_SPEED = 0.5
+"""Of the load per second of an animation of --static."""
+
 
 def run(options: argparse.Namespace) -> int:
     """Do `warpfea run`."""
     check_targets(options)
+    _check_kind(options)
+    _check_look(options)
     saved = read_meta(options.resume) if options.resume else None
     began = clock.perf_counter()
     source = resolve(options, saved)
@@ -47,7 +54,10 @@ def run(options: argparse.Namespace) -> int:
                 raise UsageError(f"{options.resume}: is at t = {now:g} s already, the end is {t_end:g} s; give --t-end")
         status = "failed"
         try:
-            sim.run(t_end, outputs=outputs, progress=progress(options))
+            if options.static:
+                run_static(sim, outputs=outputs, progress=progress(options))
+            else:
+                sim.run(t_end, outputs=outputs, progress=progress(options))
             status = "done"
         except (ConvergenceError, ConstraintError):
             status = "not converged"
@@ -59,14 +69,14 @@ def run(options: argparse.Namespace) -> int:
             status = "interrupted"
             raise
         finally:
-            _report(options, source, sim, status, clock.perf_counter() - began)
+            with interruptible():  # all is done but the report: Ctrl-C does not take it away
+                _report(options, source, sim, status, clock.perf_counter() - began)
     return DONE
 
 
 def _report(options: argparse.Namespace, source: Source, sim: Simulation, status: str, wall_s: float) -> None:
     """Write the summary, and print it. An output that fails here does not hide what ended the run."""
-    reached = float(sim.time.max())
-    summary = summarize(source, sim, t_end=reached, status=status, wall_s=wall_s)
+    summary = summarize(source, sim, status=status, wall_s=wall_s)
     wrote = _written(options) if status != "output failed" else []
     if options.json:
         try:
@@ -95,27 +105,65 @@ def check_targets(options: argparse.Namespace) -> None:
         check_folder(folder if folder.is_dir() else folder.parent, folder)
 
 
+FOR_MOTION = ("t_end", "dt", "integrator", "png_time", "checkpoint", "resume")
+
+
+def _check_kind(options: argparse.Namespace) -> None:
+    """UsageError for options that belong to a motion given with --static, or the other way round."""
+    if not options.static:
+        if options.load_steps:
+            raise UsageError("--load-steps is for --static")
+        return
+    given = [name for name in FOR_MOTION if getattr(options, name) is not None]
+    if given:
+        raise UsageError(f"--{given[0].replace('_', '-')} is for a motion; --static finds the equilibrium at full load")
+    if options.solver != "newton-pcg":
+        raise UsageError(f"--solver {options.solver} is for a motion; --static needs newton-pcg")
+
+
+def _check_look(options: argparse.Namespace) -> None:
+    """UsageError for options of pictures where none is drawn, and for one that can't go on after --resume."""
+    for name, uses in {"field": ("png", "gif", "usd"), "range": ("png", "gif", "usd"), "view": ("png", "gif")}.items():
+        if getattr(options, name) is not None and not any(getattr(options, use) for use in uses):
+            raise UsageError(f"--{name} is for pictures: give {' or '.join(f'--{use}' for use in uses)} too")
+    if options.resume and options.gif and pathlib.Path(options.gif).exists():
+        raise UsageError(
+            f"--gif {options.gif}: is there, and a GIF can't be gone on with after --resume; give another name, or "
+            "draw the whole motion of --usd with warpfea render"
+        )
+
+
 def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> list[Output]:
     """The writers that were asked for; their libraries are imported here."""
     out: list[Output] = []
     fps = options.fps or source.scene.fps
+    extend = options.resume is not None
+    field = None if options.field == "none" else options.field or "von_mises"
+    look: dict[str, Any] = {"field": field, "color_range": options.range}
+    if options.view:
+        look["view"] = options.view
+    if options.static:
+        fps = max(fps, 2.0 * (options.load_steps or 10))  # a frame per load step
     if options.usd:
         from ..outputs.usd import USDWriter
 
-        out.append(USDWriter(options.usd, fps=fps))
+        out.append(USDWriter(options.usd, fps=fps, color=field, color_range=options.range, extend=extend))
     if options.vtu:
         from ..outputs.vtk import VTUWriter
 
-        out.append(VTUWriter(options.vtu, fps=fps))
+        out.append(VTUWriter(options.vtu, fps=fps, extend=extend))
     if options.png:
         from ..outputs.render import PNGWriter
 
         time = source.scene.picture if options.png_time is None else options.png_time
-        out.append(PNGWriter(options.png, time=None if time is not None and time > t_end else time))
+        if options.static or (time is not None and time > t_end):
+            time = None
+        out.append(PNGWriter(options.png, time=time, **look))
     if options.gif:
         from ..outputs.render import GIFWriter
 
-        out.append(GIFWriter(options.gif, speed=options.speed or source.scene.speed, progress=progress(options)))
+        speed = options.speed or (STATIC_SPEED if options.static else source.scene.speed)
+        out.append(GIFWriter(options.gif, speed=speed, progress=progress(options), **look))
     if options.checkpoint:
         out.append(Checkpoint(options.checkpoint, every=options.every))
     return out

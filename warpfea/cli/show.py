@@ -7,13 +7,16 @@ import pathlib
 import sys
 from typing import Any
 
+from .. import mesh as meshes
 from ..base.console import number, plain, quiet_warp, size, table, write_json
 from ..base.errors import UsageError
 from ..builder.scene import Scene, find, load_file, names
 from . import DONE
+from .parser import MATERIAL_HINT
+from .part import mesh_facts
 from .run import check_targets
-from .source import find_scene, progress, resolve
-from .summary import MANY
+from .source import find_scene, is_mesh, progress, resolve
+from .summary import MANY, box_text, mass_text, model_box, model_mass
 
 __all__ = ["info", "render", "scenes"]
 
@@ -55,12 +58,17 @@ def _one_scene(found: Scene[Any]) -> str:
 def info(options: argparse.Namespace) -> int:
     """Do `warpfea info SCENE`."""
     check_targets(options)
+    if is_mesh(options.what) and not options.material:
+        return _mesh_info(options)
     source = resolve(options)
     with quiet_warp():
         model = source.model()
         sim = source.simulation(model, progress(options))
         launcher = sim.stepper.launch
         content = {"scene": source.label, "parameters": source.parameters} | model.info()
+        content |= {"mass": model_mass(model), "bounding_box": model_box(model)}
+        if is_mesh(options.what):
+            content["mesh"] = mesh_facts(model.bodies[0].mesh)
         content["integrator"] = sim.integrator.name
         content["methods"] = sim.methods
         content["bytes"] = sim.bytes()
@@ -75,12 +83,44 @@ def info(options: argparse.Namespace) -> int:
     return DONE
 
 
+def _mesh_info(options: argparse.Namespace) -> int:
+    """What a mesh file holds, without a material."""
+    path = pathlib.Path(options.what)
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
+    facts = mesh_facts(meshes.read(path, scale=options.scale or 1.0))
+    if options.json:
+        write_json(options.json, plain({"scene": options.what, "mesh": facts}))
+    if options.json != "-":
+        print(table([["mesh", options.what], *_mesh_rows(facts)]))
+        if not options.quiet:
+            print(f"\nwith --material {MATERIAL_HINT.removeprefix('e.g. ')} also what a simulation of it costs")
+    return DONE
+
+
+def _mesh_rows(facts: dict[str, Any]) -> list[list[str]]:
+    """Rows for a mesh: counts, size, and its groups."""
+    what, unit = ("area", "m^2") if facts["cells"] == "quad" else ("volume", "m^3")
+    rows = [
+        ["cells", f"{facts['elements']} {facts['cells']}, {facts['nodes']} nodes"],
+        ["size", f"{box_text(facts['bounding_box'])}, {what} {number(facts['volume'])} {unit}"],
+    ]
+    items = {"element": "elements", "surface": "faces", "node": "nodes"}
+    for kind, counted in items.items():
+        groups = [f"{name} ({count} {counted})" for name, count in facts[f"{kind}_groups"].items()]
+        lines = [groups[k : k + 6] for k in range(0, len(groups), 6)] or [["none"]]
+        rows += [[f"{kind} groups" if k == 0 else "", ", ".join(line)] for k, line in enumerate(lines)]
+    return rows
+
+
 def _info_table(content: dict[str, Any]) -> str:
     c = content
     rows = [["scene", c["scene"]], ["device", f"{c['device']}, {c['dtype']}, {c['integrator']}"]]
     rows += _body_rows(c["bodies"])
     rows += _joint_rows(c["joints"])
-    rows.append(["model", f"{c['unknowns']} unknowns, {number(c['mass'])} kg"])
+    if "mesh" in c:
+        rows += _mesh_rows(c["mesh"])[1:]
+    rows.append(["model", f"{c['unknowns']} unknowns, {mass_text(c['mass'])}, {box_text(c['bounding_box'])}"])
     methods = c["methods"]
     details = [f"{name} {value}" for name, value in methods.items() if name != "solver"]
     rows.append(["solver", ", ".join([methods["solver"], *details])])
@@ -139,7 +179,7 @@ def render(options: argparse.Namespace) -> int:
     source = pathlib.Path(options.file)
     if not source.is_file():
         raise UsageError(f"{source}: no such file")
-    extra: dict[str, Any] = {}
+    extra: dict[str, Any] = {"color_range": options.range}
     if options.view:
         extra["view"] = options.view
     with quiet_warp():

@@ -10,13 +10,19 @@ from typing import Any
 
 from ..base.console import compile_bar
 from ..base.errors import Error, ModelError, UsageError
+from ..base.names import did_you_mean
 from ..builder.scene import Scene, find, load_file
+from ..mesh import FORMATS
 from ..model.model import Model
 from ..simulation.simulation import Simulation
+from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
-from .part import OPTIONS, SUFFIXES, part_scene
+from .part import OPTIONS, part_scene
 
-__all__ = ["Source", "find_scene", "progress", "resolve"]
+__all__ = ["Source", "find_scene", "is_mesh", "progress", "resolve"]
+
+SURFACES = (".stl", ".obj", ".ply", ".off", ".step", ".stp", ".iges", ".igs", ".brep", ".geo", ".3mf")
+"""Formats of surfaces and shapes, which hold no elements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +34,7 @@ class Source:
         scene: the scene. values: what it is called with.
         parameters: what a summary says.
         dt, integrator, dtype, device, tol, solver: of the run.
+        load_steps, static_tol: of statics; None: a motion, the solver's default.
     """
 
     label: str
@@ -40,6 +47,8 @@ class Source:
     device: str | None
     tol: float | None
     solver: str
+    load_steps: int | None = None
+    static_tol: float | None = None
 
     def model(self) -> Model:
         """Call the scene and finalize; an error of the scene's own code is a ModelError with file and line."""
@@ -55,7 +64,10 @@ class Source:
         return builder.finalize(device=self.device, dtype=self.dtype)
 
     def simulation(self, model: Model, show: bool | None) -> Simulation:
-        """The simulation; shows a bar while kernels compile."""
+        """The simulation, or with load steps that of statics; shows a bar while kernels compile."""
+        if self.load_steps is not None:
+            with compile_bar(show) as bar:
+                return begin_static(model, load_steps=self.load_steps, tol=self.static_tol, on_compile=bar)
         solver = SOLVERS[self.solver](tol=self.tol)
         with compile_bar(show) as bar:
             return Simulation(model, dt=self.dt, integrator=self.integrator, solver=solver, on_compile=bar)
@@ -66,12 +78,18 @@ def progress(options: argparse.Namespace) -> bool | None:
     return False if options.quiet or options.no_progress else None
 
 
+def is_mesh(what: str) -> bool:
+    """Whether SCENE is a mesh file."""
+    return pathlib.Path(what).suffix.lower() in FORMATS
+
+
 def find_scene(what: str) -> Scene[Any]:
     """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
     file, colon, name = what.rpartition(":")
     if not (colon and file.endswith(".py")):
         file, name = what, ""
     if not file.endswith(".py"):
+        _check_suffix(what)
         return find(what)
     found = load_file(file)
     if not name:
@@ -79,14 +97,27 @@ def find_scene(what: str) -> Scene[Any]:
             raise UsageError(f"{file} holds several scenes, give {file}:NAME with one of {', '.join(found)}")
         return next(iter(found.values()))
     if name not in found:
-        raise UsageError(f"{file} has no scene {name!r}; it has {', '.join(found)}")
+        raise UsageError(f"{file} has no scene {name!r}; it has {', '.join(found)}{did_you_mean(name, found)}")
     return found[name]
+
+
+def _check_suffix(what: str) -> None:
+    """UsageError for a file that is neither a scene nor a mesh that can be read."""
+    suffix = pathlib.Path(what).suffix
+    if not suffix:
+        return
+    formats = ", ".join(f"{end} ({name})" for end, name in FORMATS.items())
+    text = f"{what}: {suffix} is not a format of meshes that is read, nor a scene; meshes are read from {formats}, "
+    text += "scenes from .py"
+    if suffix.lower() in SURFACES:
+        text += f"; {suffix} describes a surface or a shape, not elements: fill it with tetrahedra, in Gmsh for example"
+    raise UsageError(text)
 
 
 def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = None) -> Source:
     """The scene and options of `run` and `info`; dt, integrator and precision of a checkpoint go before the scene's."""
     saved = checkpoint or {}
-    if pathlib.Path(options.what).suffix.lower() in SUFFIXES:
+    if is_mesh(options.what):
         found, parameters = part_scene(options)
         values: dict[str, Any] = {}
     else:
@@ -107,4 +138,6 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         device=options.device,
         tol=options.tol or found.tol,
         solver=options.solver,
+        load_steps=(options.load_steps or 10) if getattr(options, "static", False) else None,
+        static_tol=options.tol,
     )

@@ -9,21 +9,24 @@ import numpy as np
 
 from ..base.console import number, plain, table
 from ..base.provenance import versions
+from ..model.model import Model
 from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
 from .source import Source
 
-__all__ = ["KEYS", "SCHEMA", "human", "summarize"]
+__all__ = ["KEYS", "SCHEMA", "box_text", "human", "mass_text", "model_box", "model_mass", "summarize"]
 
 SCHEMA = 1
 KEYS = (
     "schema",
     "scene",
+    "analysis",
     "parameters",
     "device",
     "dtype",
     "dt",
     "t_end",
+    "load",
     "steps",
     "status",
     "wall_s",
@@ -32,6 +35,8 @@ KEYS = (
     "pcg_iterations",
     "max_residual",
     "rough_steps",
+    "mass",
+    "bounding_box",
     "energies",
     "probes",
     "violation",
@@ -44,12 +49,14 @@ WORST = 4
 """Joints listed of more."""
 
 
-def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wall_s: float) -> dict[str, Any]:
+def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) -> dict[str, Any]:
     """The summary of a run of one world, SI units.
 
-    `t_end` is the time that was reached, `wall_s` the seconds from building to the closing of files, `compile_s` those
-    of them in which the simulation was made; `rough_steps` are those accepted short of the tolerance (Jacobi); energies
-    and probes are the last values, `violation` the largest of the constraints in any step, m.
+    `analysis` is "dynamic" or "static"; `t_end` the time that was reached, of statics `load` the part of the load, 0 to
+    1, with `steps` load steps; `mass` is null where a density is missing, `bounding_box` that of the reference;
+    `wall_s` are the seconds from building to the closing of files, `compile_s` those of them in which the simulation
+    was made; `rough_steps` are those accepted short of the tolerance (Jacobi); energies and probes are the last values,
+    of statics the strain energy alone; `violation` is the largest of the constraints in any step, m.
     """
     probes = {}
     for probe in sim.model.probes:
@@ -57,14 +64,21 @@ def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wal
         names = ("position", "displacement", "velocity")
         if record.time.size:
             probes[probe.name] = {name: getattr(record, name)[0, -1] for name in names}
+    static = sim.load is not None
+    if static:
+        energies = {"strain": sim.model.strain_energy(sim.state)}
+    else:
+        energies = sim.energies()
     content = {
         "schema": SCHEMA,
         "scene": source.label,
+        "analysis": "static" if static else "dynamic",
         "parameters": source.parameters,
         "device": str(sim.model.device),
         "dtype": sim.model.dtype,
-        "dt": sim.dt,
-        "t_end": t_end,
+        "dt": None if static else sim.dt,
+        "t_end": None if static else float(sim.time.max()),
+        "load": None if sim.load is None else float(sim.load.max()),
         "steps": sim.steps,
         "status": status,
         "wall_s": wall_s,
@@ -73,7 +87,9 @@ def summarize(source: Source, sim: Simulation, *, t_end: float, status: str, wal
         "pcg_iterations": int(sim.totals["pcg"].sum()),
         "max_residual": sim.max_residual,
         "rough_steps": int(sim.totals["rough"].sum()),
-        "energies": {name: float(values[0]) for name, values in sim.energies().items()},
+        "mass": model_mass(sim.model),
+        "bounding_box": model_box(sim.model),
+        "energies": {name: float(values[0]) for name, values in energies.items()},
         "probes": probes,
         "violation": sim.max_violation,
         "versions": versions(),
@@ -87,11 +103,15 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
     """The summary as a table."""
     s, info = summary, sim.model.info()
     steps = max(s["steps"], 1)
+    done = f"{s['status']}, static, at {number(100.0 * (s['load'] or 0.0))} % of the load, {s['steps']} load steps"
+    if s["load"] is None:
+        done = f"{s['status']} at t = {number(s['t_end'], 6)} s, {s['steps']} steps of {number(s['dt'])} s"
     rows = [
         ["scene", s["scene"] + "".join(f"  {k}={v}" for k, v in _short(s["parameters"]))],
-        ["model", f"{info['elements']} elements, {info['unknowns']} unknowns, {number(info['mass'])} kg"],
+        ["model", f"{info['elements']} elements, {info['unknowns']} unknowns"],
+        ["size", f"{box_text(s['bounding_box'])}, {mass_text(s['mass'])}"],
         ["device", f"{s['device']}, {s['dtype']}, {sim.integrator.name}"],
-        ["status", f"{s['status']} at t = {number(s['t_end'], 6)} s, {s['steps']} steps of {number(s['dt'])} s"],
+        ["status", done],
         ["time", f"{s['wall_s']:.1f} s, of which {s['compile_s']:.1f} s for kernels and set-up"],
         [
             "iterations",
@@ -106,16 +126,40 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
             ["NOT CONVERGED", f"{reached} of {s['steps']} steps ({reached / steps:.0%}) reached the tolerance {tol}"]
         )
     e = s["energies"]
-    parts = [f"{name} {_text(e[name])}" for name in ("kinetic", "strain", "potential", "work", "viscous")]
+    parts = [f"{name} {_text(e[name])}" for name in ("kinetic", "strain", "potential", "work", "viscous") if name in e]
     rows.append(["energy", f"{', '.join(parts)} J"])
-    lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
-    rows.append(["", f"lost by the integrator {lost} J, unbalanced {left} J"])
+    if s["load"] is None:
+        lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
+        rows.append(["", f"lost by the integrator {lost} J, unbalanced {left} J"])
     for name, values in s["probes"].items():
         u = ", ".join(_text(x) for x in values["displacement"])
         rows.append([f"probe {name}", f"displaced by ({u}) m"])
     rows += _joints(sim)
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return table(rows)
+
+
+def model_mass(model: Model) -> float | None:
+    """Mass of all bodies, kg; None where a material has no density."""
+    if any(material.density is None for body in model.bodies for _, material in body.materials):
+        return None
+    return float(model.info()["mass"])
+
+
+def model_box(model: Model) -> list[list[float]]:
+    """Lowest and highest corner of the reference of all bodies, m."""
+    boxes = np.array([body.mesh.bounding_box() for body in model.bodies])
+    return [boxes[:, 0].min(axis=0).tolist(), boxes[:, 1].max(axis=0).tolist()]
+
+
+def box_text(box: Sequence[Sequence[float]]) -> str:
+    """The sides of a box for reading."""
+    return " x ".join(number(high - low) for low, high in zip(*box)) + " m"
+
+
+def mass_text(mass: float | None) -> str:
+    """A mass for reading."""
+    return "no density" if mass is None else f"{number(mass)} kg"
 
 
 def _counts(s: dict[str, Any], sim: Simulation) -> str:

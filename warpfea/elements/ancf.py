@@ -1,9 +1,9 @@
 """What the ANCF families share: monomial bases, the nodal basis B^-1 b of Paper I, and Cartesian gradient slots.
 
-A family's functions live on a parent square, cube or simplex, with slots r, r_xi, r_eta, r_zeta at each node. The slots
-that neighbours share are gradients along axes of the node; a frame T = dX/dxi per element and node, in those axes,
-folds one into the other (T's S* = S T). Curved, stretched or turned elements then need nothing else, and elements that
-meet at a node share its slots whatever their own lines are.
+The functions of a family live on a parent square, cube or simplex, with slots r, r_xi, r_eta, r_zeta at each node. What
+neighbours share are gradients along axes of the node instead. A frame T = dX/dxi per element and node, in those axes,
+turns the functions of one into those of the other (Paper T's S* = S T; `fold`). Curved, stretched or turned elements
+then need nothing else, and elements that meet at a node share its slots however their own parent lines run.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def monomials(powers: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def nodal_basis(powers: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """B^-1 (m, m) with B = [b, b_u, b_v, b_w at each node]: the functions are s = B^-1 b (Paper I, 1.3).
+    """B^-1 (m, m) with B = [b, b_u, b_v, b_w at each node]: the functions are s = B^-1 b, Eqs. (2b) and (3b).
 
     Raises:
         ModelError: the basis does not fit these nodes, e.g. that of 3443 with nodes in the u-v plane, whose B has rank

@@ -1,24 +1,24 @@
-"""ANCF beam 3243: two nodes, each with position and three gradients (Paper I, 1.3.1), and the split against locking.
+"""ANCF beam 3243: two nodes, each with position and three gradients (Paper I, 1.3.1), and its remedies against locking.
 
 On the parent xi in [0, 1], eta, zeta in [-1/2, 1/2] the basis [1, u, v, w, uv, uw, u^2, u^3] of Eq. (2) is: Hermite
-cubics along the axis, linear in the section. Slot 1 is the gradient along the beam's axis, 2 and 3 lie in the section
-(width, height); the axes are each node's own.
+cubics along the axis, linear in the section. Slot 1 is the gradient along the beam's axis, slots 2 and 3 are those
+along width and height of the section; each node has its own axes.
 
 Locking, and what the integrations do about it:
 - Poisson: a section that stays a parallelogram can't widen on one side and narrow on the other, so bending meets the
-  stiffness of uniaxial *strain*: with nu = 0.3, 1.35 E. The part D0 of the SVK law that couples nothing is integrated
-  over the volume, the Poisson part D - D0 on the axis alone (Gerstmayr, Matikainen, Mikkola 2008, Multibody Syst. Dyn.
-  20:359); bending then has E, tension the full law.
-- shear: section vectors turn linearly along an element, a cubic axis does not. At Gauss points both must agree, and the
-  axis loses its cubic. "tied" takes the transverse shear at the nodes, where neighbours share it, and gives the axis's
-  deviation b from the sections in the middle the energy that its curvature would have: where a moment varies linearly
-  along the element that is what bending lacks (the residual bending flexibility of MacNeal 1978, Comput. Struct.
-  8:175).
+  stiffness of uniaxial *strain*: with nu = 0.3, 1.35 E. The part D0 of the SVK law without coupling of the normal
+  strains is integrated over the volume, the Poisson part D - D0 on the axis alone (Gerstmayr, Matikainen, Mikkola
+  2008, Multibody Syst. Dyn. 20:359); bending then has E, tension the full law.
+- shear: section vectors turn linearly along an element, the slope of a cubic axis does not. Shear at the Gauss points
+  makes both agree there, and the axis loses its cubic part. "tied" takes the transverse shear at the nodes, where
+  neighbours share it. The deviation b of the axis from the sections in the middle of the element gets the energy that
+  its curvature would have, which is what bending lacks where a moment varies linearly along the element (the residual
+  bending flexibility of MacNeal 1978, Comput. Struct. 8:175).
 - thickness: a section vector interpolated between two directions is too short in between; "tied" takes the strain in
   the section at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
 - torsion and shear of a plane section (not locking, but too stiff as well): "tied" takes the section's own constants.
 "tied" has all of it, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I). What "tied"
-gives up: it is exact in a patch under tension, not under shear tractions or pressure on its sides, which disturb the
+gives up: it passes the patch test under tension, not under shear tractions or pressure on its sides, which disturb the
 gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft by
 about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Tried and dropped:
 the curvature extrapolated from the middle and the ends, exact to fourth order in that angle, but it lets the axis's
@@ -71,21 +71,21 @@ def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.nd
 
 
 def svk_only(material: Material) -> SVK:
-    """The split is of the SVK law."""
+    """The material as SVK, which is the law that these integrations split. Raises ModelError for any other."""
     if not isinstance(material, SVK):
         raise ModelError(f"this integration splits the St. Venant-Kirchhoff law, not {type(material).__name__}")
     return material
 
 
 def _poisson_free(material: Material) -> tuple[str, tuple[float, ...]]:
-    """D0: E in each direction without coupling, and the shear modulus."""
+    """D0: Young's modulus in each direction without coupling, and the shear modulus."""
     m = svk_only(material)
     _, mu = m.lame
     return "orthotropic", (m.E, m.E, m.E, 0.0, 0.0, 0.0, mu, mu, mu)
 
 
 def _poisson_part(material: Material) -> tuple[str, tuple[float, ...]]:
-    """D - D0: what couples the normal strains."""
+    """D - D0: the coupling of the normal strains."""
     m = svk_only(material)
     lam, _ = m.lame
     d = 2.0 * m.nu * lam
@@ -109,7 +109,7 @@ def box_corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.nda
 
 
 def box_lattice(low: tuple[float, ...], high: tuple[float, ...], parts: tuple[int, int, int]) -> Lattice:
-    """A box cut into hexahedra."""
+    """A box cut into parts[0] x parts[1] x parts[2] hexahedra, for drawing."""
     axes = [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, parts)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     k = np.arange(len(points)).reshape([n + 1 for n in parts])
@@ -138,7 +138,7 @@ def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
 
 
 def _shear_stress(material: Material) -> tuple[str, tuple[float, ...]]:
-    """The shears along the axis at points, for the stress of "tied"."""
+    """The transverse shears at quadrature points, which "tied" needs for its stress output."""
     _, mu = svk_only(material).lame
     return "orthotropic", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, mu, mu)
 
@@ -146,11 +146,12 @@ def _shear_stress(material: Material) -> tuple[str, tuple[float, ...]]:
 def _shear_coupling(
     at: np.ndarray, J: np.ndarray, det: np.ndarray, rule: Rule, material: Material, section: Rectangle
 ) -> np.ndarray:
-    """A (E, 24, 12): for each direction V/2 times the sum over modes of k [(g_0^2 + g_1^2)/2 + (c/mu) b^2].
+    """A (E, 24, 12) with e.A e / 2 = V/2 times the sum of k (g_0^2 + g_1^2)/2 + (c/mu) b^2, over directions and modes.
 
-    g = e/(|X_a| |X_b|) at the ends (0, 1) and in the middle (m), b = g_m - (g_0 + g_1)/2; the modes of the section are
-    the mean, k the shear factor; what is odd across the direction, torsion, k = J_t/I_p; and the rest, k = 1.
-    c = (4/9) E t^2/h^2, which makes c b^2 V/2 the energy of a curvature that varies linearly along the element.
+    The shear angles are g = e/(|X_a| |X_b|) at the ends (0, 1) and in the middle (m), and b = g_m - (g_0 + g_1)/2.
+    Modes of the four points of a section: the mean with the section's shear factor k; the one that is odd across the
+    direction, torsion, with k = J_t/I_p; the two others with k = 1. With c = (4/9) E t^2/h^2, where t is the height
+    and h the length, c b^2 V/2 is the energy of a curvature that varies linearly along the element.
     """
     m = svk_only(material)
     size = np.linalg.norm(at, axis=2)
@@ -181,7 +182,7 @@ SHEAR = Tying(np.array(2 * STATIONS), np.repeat([(0, 1), (0, 2)], 12, axis=0), _
 
 
 def at_ends(rule: Rule) -> Rule:
-    """A rule of two points along the axis moved to its ends (trapezoidal)."""
+    """A rule of two points along the axis with the points moved to the ends of the element (trapezoidal rule)."""
     points = rule.points.copy()
     points[:, 0] = np.round(points[:, 0])
     return Rule(f"ends {rule.name}", points, rule.weights, 1, rule.counts)

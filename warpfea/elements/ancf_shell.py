@@ -7,24 +7,25 @@ shared nodes make the surface continuous also on distorted quads.
 
 Locking and its remedies, all in the choice of what is integrated where ("tied"):
 - Poisson (thickness): a director that is one vector per point can't strain linearly through the thickness, so bending
-  meets (1-nu)^2/(1-2nu) of its stiffness (1.225 for nu = 0.3). The law is split into plane stress through the
-  thickness, which needs no such strain, and what couples the thickness to the surface, on the mid-surface alone (the
-  split of Gerstmayr, Matikainen, Mikkola 2008 for beams, taken to shells).
+  is (1-nu)^2/(1-2nu) times too stiff (1.225 for nu = 0.3). The law is split into plane stress, integrated through the
+  thickness, which needs no such strain, and the part that couples the thickness to the surface, integrated on the
+  mid-surface alone (the split of Gerstmayr, Matikainen, Mikkola 2008 for beams, taken to shells).
 - shear: the bilinear director can't follow the slopes of the cubic surface, so a thin plate would have to bend with
   constant curvature in each direction: it locks (a clamped 8x8 plate of t/L = 1e-3 deflects 3 % of what it should, with
   3x3 points as with 4x4). The covariant transverse shears are taken at the corners and the middles of the edges they
   run along, where neighbours share them, and interpolated (assumed natural strain, Dvorkin and Bathe 1984, Eng. Comput.
-  1:77; here with the quadratic that Hermite's edges have): two conditions per node and one per edge are left, fewer
-  than unknowns. With Reissner's factor 5/6, as the shear stress of a real plate vanishes at its faces.
+  1:77; here quadratically along the edges, as the slopes of their Hermite cubics): two conditions per node and one per
+  edge are left, fewer than unknowns. Reissner's factor 5/6 counts for the shear stress that vanishes at the faces of a
+  real plate.
 - curvature thickness: a director interpolated between two directions is too short in between; on a curved or strongly
   bent shell that costs more than bending (a thin quarter arc of 16 elements bends 0.13 of what it should). The strain
   across the thickness is taken at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
-- membrane: the cubic surface follows an arc without stretching to fourth order in its angle; with the thickness strain
-  out of the way a thin arc (R/t = 1000) bends as a thick one does, so plane stress stays at 4x4 points.
-"full" is Paper I's law at 4x4x2 points, without remedies. What "tied" gives up: a patch under plane stress is exact on
-any mesh, and under uniform transverse shear on parallelograms; on general quads that is off by a few percent of the
-shear, and a uniform stress across the thickness disturbs the surface gradients (not the positions) by a tenth of its
-strain. "full" is exact in all of these.
+- membrane: needs no remedy. The cubic surface follows an arc without stretching to fourth order in its angle; with the
+  thickness strain out of the way a thin arc (R/t = 1000) bends as a thick one does: plane stress stays at 4x4 points.
+"full" is Paper I's law at 4x4x2 points, without remedies. What "tied" gives up: it passes the patch test under plane
+stress on any mesh, and under uniform transverse shear on parallelograms; on general quads that is off by a few percent
+of the shear, and a uniform stress across the thickness disturbs the surface gradients (not the positions) by a tenth of
+its strain. "full" passes all of these.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.nd
 
 
 def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
-    """Through the thickness: plane stress in the surface; no strain across it, no transverse shear."""
+    """The part integrated through the thickness: plane stress, without strain across it and transverse shear."""
     m = svk_only(material)
     _, mu = m.lame
     c = m.E / (1.0 - m.nu**2)
@@ -69,7 +70,7 @@ def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
 
 
 def _thickness_part(material: Material) -> tuple[str, tuple[float, ...]]:
-    """On the mid-surface: the strain across it, and what of the full law couples it to the surface."""
+    """The part integrated on the mid-surface: the strain across it, and its coupling to the strains in the surface."""
     m = svk_only(material)
     lam, mu = m.lame
     c = m.E / (1.0 - m.nu**2)
@@ -78,13 +79,13 @@ def _thickness_part(material: Material) -> tuple[str, tuple[float, ...]]:
 
 
 def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
-    """Transverse shear."""
+    """The transverse shear, taken at tying points."""
     _, mu = svk_only(material).lame
     return "assumed_strain", (mu,)
 
 
 def _tie_weights(xi: np.ndarray) -> np.ndarray:
-    """(Q, 12): quadratic along a shear's own direction, linear across."""
+    """(Q, 12) interpolation from the tying points: quadratic along a shear's own direction, linear across it."""
 
     def across(x: np.ndarray) -> list[np.ndarray]:
         return [1.0 - x, x]
@@ -101,7 +102,7 @@ def _tie_weights(xi: np.ndarray) -> np.ndarray:
 def _shear_coupling(
     at: np.ndarray, J: np.ndarray, det: np.ndarray, rule: Rule, material: Material, section: object
 ) -> np.ndarray:
-    """A of Psi = (5/6) (mu/2) int e_a e_b (g^ab g^33 + g^a3 g^b3), e interpolated from the tying points."""
+    """A (E, 12, 12) of (mu/2) e.A e = (5/6) (mu/2) int e_a e_b (g^ab g^33 + g^a3 g^b3) dV, with e interpolated."""
     g = np.linalg.inv(np.swapaxes(J, 2, 3) @ J)
     metric = g[:, :, :2, :2] * g[:, :, 2, 2][:, :, None, None] + g[:, :, :2, 2, None] * g[:, :, None, :2, 2]
     D = SHEAR.pairs[:, 0]

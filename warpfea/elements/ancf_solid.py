@@ -1,9 +1,9 @@
-"""ANCF tetrahedra ENMC, FN, FN18 (Paper T) and the ANCF brick 3843: cubic solids with gradient slots.
+"""ANCF tetrahedra ENMC, FN, FN18 (Paper T) and the ANCF brick H3843: cubic solids with gradient slots.
 
 ENMC: four corners with position and three gradients, four face centroids with a position: the complete cubic. FN: the
 face centroids are eliminated, r_c = (r_1 + r_2 + r_3)/3 + c sum of the edge derivatives that leave the face's corners
-(T-A.2), with c = 2/81 as printed, which holds linear fields only, or 1/18 (FN18), which holds all quadratics.
-Slots are Cartesian gradients d/dX_k (T's S* = S T). Paper T's own formulas are in `paper_t`, checked against these.
+(T-A.2), with c = 2/81 as printed, which reproduces linear fields only, or 1/18 (FN18), which reproduces all quadratics.
+Slots are Cartesian gradients d/dX_k (Paper T's S* = S T). Its printed formulas are in `paper_t`; a test compares both.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ def _elimination(c: float) -> np.ndarray:
 
 
 def tet_functions(xi: np.ndarray, elimination: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Functions of the volume parameterisation, slots (r, r_xi, r_eta, r_zeta) per corner, then the centroids.
+    """Functions in volume parameterisation: slots (r, r_xi, r_eta, r_zeta) of each corner, then the face centroids.
 
     Args:
         xi: (Q, 3) points of the unit tetrahedron.
-        elimination: c of FN's face centroids; None: ENMC.
+        elimination: the coefficient c of FN's face centroids; None for ENMC, which keeps them.
 
     Returns:
-        (Q, S), (Q, S, 3), S = 20 or 16.
+        s (Q, S) and ds/dxi (Q, S, 3), with S = 20 or 16.
     """
     C = _enmc_inverse()
     if elimination is not None:
@@ -87,7 +87,7 @@ def _tet(name: str, cell: str, elimination: float | None) -> Family:
             rules={"tet14": TET_RULES["tet14"], "conical4": conical_tet(4)},
             curved_rule=TET_RULES["tet14"],
             mass_rule=conical_tet(4),
-            # the cubic map of FN on a curved body makes degree 12; the others degree 9
+            # on a curved body the cubic map makes degree 12 with FN, degree 9 with the others
             curved_mass_rule=conical_tet(7) if name == "FN" else conical_tet(5),
             vertices=CORNERS,
             affine=False,
@@ -115,7 +115,8 @@ UNIT = tuple(zip(LOW, HIGH))
 
 
 def _brick_powers() -> np.ndarray:
-    """Trilinear monomials, and x^2, x^3 times the bilinear ones of the other two directions, for each direction."""
+    """Exponents (32, 3): the trilinear monomials, and for each direction its square and cube times the bilinear ones of
+    the two others."""
     out = list(itertools.product((0, 1), repeat=3))
     for k in range(3):
         for high in (2, 3):

@@ -1,4 +1,4 @@
-"""What an element family is: slots per node, shape functions, rules, faces. Nothing else in the code knows families."""
+"""What an element family is: slots per node, shape functions, quadrature rules, faces. All else reads these tables."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["Family", "Lattice", "Parent", "Part", "Tying", "families", "for_cell
 
 @dataclass(frozen=True, eq=False)
 class Tying:
-    """Covariant strains e = 2 E_ab taken at tying points, and the energy Psi = (mu/2) e.A e made of them.
+    """Covariant strains e = 2 E_ab taken at tying points, and their energy (mu/2) e.A e in an element, J.
 
     Attributes:
         points: (n, 3) parent coordinates.
         pairs: (n, 2) parent directions a, b of each strain.
         coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q), the
             rule, the material, the body's section) -> A (E, n, width).
-        width: A couples the points of each run of so many.
+        width: A couples the points of each run of `width` points.
     """
 
     points: np.ndarray
@@ -35,14 +35,14 @@ class Tying:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One integral of an element's strain energy; most elements have one, a remedy against locking splits it.
+    """One integral of an element's strain energy; most elements have one, remedies against locking split it in several.
 
     Attributes:
-        name: for reports.
-        rule: quadrature.
+        name: name in reports.
+        rule: quadrature of the integral.
         law: function Material -> (device law, coefficients), or None for the material's own.
-        framed: the law has axes along the element (first parent line, then the rest made orthonormal).
-        tying: the energy is of strains at tying points (law: its coefficient mu); None: of the strain at the rule.
+        framed: the law has axes of the element: its first parent line, and the others made orthonormal to it.
+        tying: the energy is that of strains at tying points, and the law gives mu; None: of strains at the rule.
     """
 
     name: str
@@ -65,11 +65,11 @@ class Parent:
 
     @property
     def center(self) -> np.ndarray:
-        """(3,)."""
+        """(3,) parent coordinates of the middle."""
         return np.full(3, 0.25) if self.low is None else 0.5 * (np.array(self.low) + np.array(self.high))
 
     def outside(self, xi: np.ndarray) -> np.ndarray:
-        """How far points (..., 3) lie outside, in parent units; 0 inside."""
+        """How far points (..., 3) lie outside, (...,) in parent units; 0 inside."""
         if self.low is None:
             least = np.minimum(xi.min(axis=-1), 1.0 - xi.sum(axis=-1))
             return np.maximum(-least, 0.0)
@@ -87,7 +87,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """An element family as tables (DESIGN: r = sum e_i s_i, F = sum e_i h_i^T).
+    """An element family as tables: r = sum e_i s_i, F = sum e_i h_i^T (Eq. (1)) over its slots i.
 
     Attributes:
         name: how users select it, e.g. "T10".
@@ -97,7 +97,7 @@ class Family:
             ds (E or 1, Q, S, 3)), ds = ds/dxi. A family whose functions do not depend on the element's shape returns
             one row.
         rules: force quadrature rules by name; the first is the default.
-        curved_rule: default force rule of curved elements; the patch test on a curved T10 needs degree 3.
+        curved_rule: default force rule of curved elements (the patch test on a curved T10 needs degree 3).
         mass_rule: rule that integrates s_i s_j rho det J0 exactly on straight elements.
         curved_mass_rule: the same on curved ones.
         vertices: (4, 3) parent coordinates of the vertices where J is tested beside the points.
@@ -105,16 +105,16 @@ class Family:
         parent: the parent domain.
         faces: parent corners of each face, (3, 3) triangles or (4, 3) quadrilaterals, outward; mesh cells of solids
             count their faces in the same order.
-        face_rule: rule on the unit triangle or square, exact for a pressure on a plane face.
-        divisions: parts (a, b) that each face is drawn with along its two sides; triangles take the first.
-        node_samples: (n, k, 3) parent points at each element node where fields are taken for drawing.
-        lattice: how an element is drawn.
-        schemes: integrations of several parts by name, beside the rules.
-        output_schemes: integrations that are for stresses only.
-        slot_sets: names of slot kinds that supports may hold.
+        face_rule: rule on the unit triangle or square, exact for a pressure on a flat face.
+        divisions: parts (a, b) into which each face is cut along its two sides for drawing; triangles take the first.
+        node_samples: (n, k, 3) parent points at each element node where fields are evaluated for drawing.
+        lattice: how an element is drawn in VTK.
+        schemes: integrations of several parts by name; every force rule is one of a single part besides.
+        output_schemes: integrations that are for stress output only.
+        slot_sets: slot kinds by the name under which supports may hold them.
         spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
-            or a shell's surface can kink at a point for next to nothing, and must not carry it.
-        solid: the mesh cell is the body itself; beams and shells have a section or thickness beside it.
+            or a shell's surface offers almost no rotational stiffness at a point, and must not carry it.
+        solid: the mesh cell is the body itself; False for beams and shells, which add a section or a thickness.
     """
 
     name: str
@@ -140,7 +140,7 @@ class Family:
     solid: bool = True
 
     def scheme(self, name: str) -> tuple[Part, ...]:
-        """The parts of an integration."""
+        """The parts of the integration `name`, a scheme or a force rule. Raises KeyError."""
         known = {**self.schemes, **self.output_schemes}
         return known[name] if name in known else (Part(name, self.rules[name]),)
 
@@ -195,7 +195,7 @@ class Family:
         return self.node_samples.mean(axis=1)
 
     def sample_weights(self, xi: np.ndarray) -> np.ndarray:
-        """(Q, n k) interpolation of fields from the nodes' samples: linear between corners, exact at a sample."""
+        """(Q, n k) weights of the nodes' samples for fields at xi (Q, 3): linear between corners, exact at a sample."""
         samples = self.node_samples.reshape(-1, 3)
         out = np.zeros((len(xi), len(samples)))
         if self.parent.low is None:
@@ -227,7 +227,7 @@ _families: dict[str, Family] = {}
 
 
 def register(family: Family) -> Family:
-    """Make a family selectable by name."""
+    """Make a family selectable by its name, and return it."""
     _families[family.name] = family
     return family
 
@@ -245,7 +245,7 @@ def get(name: str) -> Family:
 
 
 def for_cell(cell_type: str) -> Family:
-    """The solid family that a cell type gives by default: the one with the fewest slots."""
+    """The default solid family of a cell type: the one with the fewest slots. Raises ModelError."""
     fits = [f for f in _families.values() if f.cell_type == cell_type and f.solid]
     if fits:
         return min(fits, key=lambda f: f.slots)

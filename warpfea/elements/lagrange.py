@@ -1,4 +1,4 @@
-"""Lagrange tetrahedra T4 and T10 (Paper I, Eqs. (4)-(9); node order 1-4, then edges 12, 23, 31, 14, 24, 34)."""
+"""Lagrange tetrahedra T4 and T10, Eqs. (4)-(9); nodes are corners 1-4, then edges 12, 23, 31, 14, 24, 34."""
 
 from __future__ import annotations
 

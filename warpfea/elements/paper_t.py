@@ -1,4 +1,4 @@
-"""Paper T's printed equations of the ANCF tetrahedra, to check the tables of `ancf_solid` against; no run needs them.
+"""Paper T's printed equations of the ANCF tetrahedra: the tests check the tables of `ancf_solid` against them.
 
 A.n: appendix of Pappalardo, Wang, Shabana, Nonlinear Dyn. 89 (2017) 2905-2932. Corners, edges and faces count from 0
 here and from 1 in the paper. Conventions:

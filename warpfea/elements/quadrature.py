@@ -1,4 +1,4 @@
-"""Quadrature on the unit tetrahedron and triangle: points in parent coordinates, weights that sum to 1/6 or 1/2."""
+"""Quadrature on the unit tetrahedron and triangle and on boxes; weights sum to the volume or area of the parent."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ class Rule:
 
     @property
     def radial(self) -> bool:
-        """Of a tetrahedron: one point on each line from the centroid to vertices 0-3, after at most the centroid."""
+        """Whether a tetrahedron's rule has a point on each line from the centroid to vertices 0-3, in this order.
+
+        The centroid may come before them.
+        """
         if self.points.shape not in ((4, 3), (5, 3)):
             return False
         own = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
@@ -51,7 +54,7 @@ class Rule:
 
 
 def _barycentric(name: str, degree: int, orbits: list[tuple[float, np.ndarray]]) -> Rule:
-    """Rule from (weight in units of the volume, barycentric points (n, 4))."""
+    """Rule on the tetrahedron from orbits (weight of a point over the volume, barycentric points (n, 4))."""
     points = np.concatenate([bary[:, 1:] for _, bary in orbits])
     weights = np.concatenate([np.full(len(bary), w / 6.0) for w, bary in orbits])
     return Rule(name, points, weights, degree)
@@ -94,7 +97,7 @@ def _tet14() -> Rule:
 TET_RULES: dict[str, Rule] = {
     "tet1": Rule("tet1", np.full((1, 3), 0.25), np.array([1.0 / 6.0]), 1),
     "tet4": _barycentric("tet4", 2, [(0.25, _orbit4((5.0 - np.sqrt(5.0)) / 20.0))]),
-    # Paper I's rule, Eq. (11); its negative weight is why it must not integrate the mass
+    # Paper I's rule, Eq. (11); its negative weight makes a T10 mass matrix indefinite
     "tet5_paper": _barycentric("tet5_paper", 3, [(-0.8, np.full((1, 4), 0.25)), (0.45, _orbit4(1.0 / 6.0))]),
     "tet8": _tet8(),
     "tet14": _tet14(),
@@ -102,12 +105,12 @@ TET_RULES: dict[str, Rule] = {
 
 
 def tet_rule(name: str) -> Rule:
-    """The tetrahedron rule `name`; KeyError lists what there is."""
+    """The tetrahedron rule `name` of TET_RULES. Raises KeyError."""
     return TET_RULES[name]
 
 
 def _gauss(n: int, alpha: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Jacobi on [0, 1] with weight (1 - x)^alpha."""
+    """Gauss-Jacobi points and weights (n,) on [0, 1] for the weight function (1 - x)^alpha."""
     x, w = roots_jacobi(n, alpha, 0)
     return (1.0 + x) / 2.0, w / 2.0 ** (alpha + 1)
 
@@ -160,7 +163,7 @@ def _product(name: str, counts: tuple[int, ...], ranges: Ranges) -> Rule:
 
 @functools.cache
 def box_rule(counts: tuple[int, int, int], ranges: Ranges) -> Rule:
-    """Product Gauss rule on a box, named e.g. "3x2x2"; one point is the mid-point, with the length as its weight."""
+    """Product Gauss rule on a box, named e.g. "3x2x2"; a single point lies in the middle, its weight is the length."""
     return _product("x".join(map(str, counts)), counts, ranges)
 
 
@@ -171,7 +174,7 @@ def square_rule(n: int) -> Rule:
 
 
 def composite(rule: Rule, parts: int) -> Rule:
-    """A rule on the unit square or triangle repeated on parts x parts equal parts of it, for integrands with kinks."""
+    """A rule on the unit square or triangle repeated on parts x parts equal parts, for integrands with kinks."""
     if parts == 1:
         return rule
     cells = [(np.array([i, j]), 1.0) for i in range(parts) for j in range(parts)]

@@ -1,4 +1,4 @@
-"""Sections of beams."""
+"""Cross-sections of beams."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["Rectangle"]
 class Rectangle:
     """A rectangular section: width and height, m; the height lies along the beam's normal.
 
-    A section that stays plane is too stiff in shear and in torsion, where a real one warps; integration "tied" corrects
-    both with the constants of beam theory.
+    The section of an element stays plane, which makes it too stiff in shear and in torsion, where a real one warps;
+    integration "tied" corrects both with the constants of beam theory.
 
     Args:
-        width, height: m.
+        width, height: sides of the rectangle, m.
         shear: shear correction factor; Reissner's 5/6 by default.
         torsion: torsion constant, m^4; Saint-Venant's by default.
 
@@ -45,7 +45,7 @@ class Rectangle:
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
         return self.width * self.height
 
     @property

@@ -1,10 +1,10 @@
-"""Meshes: :class:`Mesh`, :func:`read` for files, generators with named sides, :func:`check` and :func:`linear`.
+"""Meshes: :class:`Mesh`, :func:`read` for files, :func:`from_meshio` for what meshio has read, generators with named
+sides, :func:`check` and :func:`linear`.
 
-Lengths are in metres once read (``scale``). Set names come from the file's groups, or from the generator's
-sides.
+Lengths are in metres once read (``scale``). Set names come from the file's groups, or from the generator's sides.
 """
 
-from .adapter import read
+from .adapter import FORMATS, from_meshio, is_meshio, read
 from .cells import CELL_TYPES, CellType
 from .checks import check
 from .convert import linear
@@ -12,4 +12,18 @@ from .generators import box, cylinder, sphere
 from .grids import grid
 from .mesh import Mesh
 
-__all__ = ["CELL_TYPES", "CellType", "Mesh", "box", "check", "cylinder", "grid", "linear", "read", "sphere"]
+__all__ = [
+    "CELL_TYPES",
+    "FORMATS",
+    "CellType",
+    "Mesh",
+    "box",
+    "check",
+    "cylinder",
+    "from_meshio",
+    "grid",
+    "is_meshio",
+    "linear",
+    "read",
+    "sphere",
+]

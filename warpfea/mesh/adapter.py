@@ -18,6 +18,7 @@ import re
 import struct
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,10 @@ from .cells import FILE_CELLS, cell_dimension
 from .checks import check
 from .mesh import Mesh, transformation
 
-__all__ = ["read"]
+__all__ = ["FORMATS", "from_meshio", "is_meshio", "read"]
+
+FORMATS = {".msh": "Gmsh 2.2 and 4.1", ".vtu": "VTK", ".inp": "Abaqus"}
+"""The mesh files that are read."""
 
 
 def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None, cell_type: str | None = None) -> Mesh:
@@ -75,10 +79,10 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
         raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(FILE_CELLS)}")
     if not file.exists():
         raise MeshError(f"{label}: no such mesh file")
-    readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}
     suffix = file.suffix.lower()
-    if suffix not in readers or not file.is_file():
-        raise MeshError(f"{label}: unknown mesh format {suffix!r}, known are {', '.join(readers)}")
+    if suffix not in FORMATS or not file.is_file():
+        raise MeshError(f"{label}: unknown mesh format {suffix!r}, known are {', '.join(FORMATS)}")
+    readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}
     try:
         with _quiet(label):
             raw = readers[suffix](file)
@@ -86,6 +90,44 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
         raise MeshError(f"{label}: can't be read: {error}") from error
     mesh = assemble(raw, file, cell_type)
     return check(mesh.transformed(transform=(matrix, shift)))
+
+
+def is_meshio(mesh: Any) -> bool:
+    """Whether an object is a meshio.Mesh; meshio itself is not imported."""
+    kind = type(mesh)
+    return kind.__name__ == "Mesh" and kind.__module__.partition(".")[0] == "meshio"
+
+
+def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type: str | None = None) -> Mesh:
+    """The mesh of a meshio.Mesh, checked; arguments as of :func:`read`.
+
+    Sets
+    ----
+    Its `cell_sets` and `point_sets`; Gmsh's physical groups by their names in `field_data`; other integer cell and
+    point arrays as of a VTU file. What meshio loses of a file's groups is lost: :func:`read` takes the file itself.
+
+    Raises
+    ------
+    MeshError
+        Not a meshio.Mesh, or as :func:`read`.
+    """
+    label = "meshio.Mesh"
+    if not is_meshio(mesh):
+        raise MeshError(f"from_meshio: expected a meshio.Mesh, got {type(mesh).__module__}.{type(mesh).__qualname__}")
+    matrix, shift = transformation(scale, transform, label)
+    if cell_type is not None and cell_type not in FILE_CELLS:
+        raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(FILE_CELLS)}")
+    raw = _raw(mesh)
+    raw.duplicates = "gmsh:physical" in mesh.cell_data  # MSH 2.2 repeats a cell that is in two groups
+    for name, arrays in mesh.cell_sets.items():
+        if not name.startswith("gmsh:"):
+            for k, numbers in enumerate(arrays):
+                if numbers is not None and len(numbers):
+                    raw.groups.append((str(name), k, np.asarray(numbers, dtype=np.int64)))
+    for name, nodes in mesh.point_sets.items():
+        raw.node_groups[str(name)] = np.unique(np.asarray(nodes, dtype=np.int64))
+    found = assemble(raw, Path(label), cell_type)
+    return check(replace(found.transformed(transform=(matrix, shift)), name="mesh", path=None))
 
 
 @contextlib.contextmanager
@@ -218,6 +260,15 @@ def _read_vtu(file: Path) -> RawMesh:
     skipped = re.search(r"cannot handle \(type (\d+)\)", " ".join(said.getvalue().split()))
     if skipped:
         raise MeshError(f"unknown VTK cell type {skipped[1]}")
+    return _raw(mesh)
+
+
+def _raw(mesh: Any) -> RawMesh:
+    """Points, cells, and the groups that integer arrays of a meshio.Mesh make."""
+    named = {}
+    for name, value in (mesh.field_data or {}).items():
+        if np.size(value) == 2:  # of Gmsh: tag and dimension
+            named[int(value[1]), int(value[0])] = str(name)
     points = np.asarray(mesh.points, dtype=float)
     raw = RawMesh(points, [(c.type, np.asarray(c.data).astype(np.int64)) for c in mesh.cells])
     for name, arrays in mesh.cell_data.items():
@@ -228,7 +279,8 @@ def _read_vtu(file: Path) -> RawMesh:
                 for k, column in enumerate(flat):
                     numbers = np.flatnonzero(column[:, 0] == value)
                     if numbers.size:
-                        group = f"physical_{cell_dimension(raw.blocks[k][0])}_{value}"
+                        dim = cell_dimension(raw.blocks[k][0])
+                        group = named.get((dim, value), f"physical_{dim}_{value}")
                         raw.groups.append((group if name == "gmsh:physical" else name + suffix, k, numbers))
     for name, array in (mesh.point_data or {}).items():
         column = np.asarray(array).reshape(len(points), -1)

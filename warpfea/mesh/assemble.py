@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.errors import MeshError
+from ..base.names import listing
 from .cells import FILE_CELLS, Floats, Ints, cell_dimension, row_keys
 from .checks import check_topology
 from .mesh import Mesh, check_range
@@ -120,6 +121,12 @@ def _body_type(raw: RawMesh, label: str, cell_type: str | None) -> str:
         if "quad" in surfaces:
             raise MeshError(f"{label}: holds {held}; a shell needs quads of 4 nodes only: recombine the others")
         hint = ": is this a 2D mesh? A shell needs quads of 4 nodes (recombine)" if surfaces else ""
+        names = dict.fromkeys(name for name, k, _ in raw.groups if cell_dimension(raw.blocks[k][0]) == 2)
+        if names and not any(cell_dimension(raw.blocks[k][0]) == 3 for _, k, _ in raw.groups):
+            hint += (
+                f"; all its groups are surfaces ({listing(names)}), and Gmsh saves only what is in a group: name the "
+                'volume too, Physical Volume("body") = {1};, or save all elements (Mesh.SaveAll = 1;)'
+            )
         raise MeshError(f"{label}: no quads, no hexahedra and no tetrahedra, the file holds {held}{hint}")
     body = solids[0] if solids else "quad"
     if cell_type is not None and body != cell_type:

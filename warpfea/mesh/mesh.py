@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import MeshError
+from ..base.names import did_you_mean, listing
 from .cells import (
     CELL_TYPES,
     CellType,
@@ -271,9 +272,15 @@ class Mesh:
 
     def _named(self, what: str, sets: dict[str, Ints], name: str) -> Ints:
         if name not in sets:
-            known = ", ".join(repr(k) for k in sorted(sets)) or "none"
-            raise MeshError(f"{self.label}: no {what} set named {name!r}; there are: {known}")
+            elsewhere = self._kinds_of(name)
+            hint = f"; {name!r} is a set of {' and '.join(elsewhere)}" if elsewhere else did_you_mean(name, sets)
+            raise MeshError(f"{self.label}: no {what} set named {name!r}; there are: {listing(sorted(sets))}{hint}")
         return sets[name]
+
+    def _kinds_of(self, name: str) -> list[str]:
+        """What a name stands for in this mesh: "nodes", "elements", "faces"."""
+        kinds = {"elements": self.element_sets, "faces": self.surface_sets, "nodes": self.node_sets}
+        return [kind for kind, sets in kinds.items() if name in sets]
 
     def _mask(self, predicate: Callable[[Floats], Any], coordinates: Floats, what: str) -> np.ndarray:
         mask = np.asarray(predicate(coordinates))

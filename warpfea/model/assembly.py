@@ -1,8 +1,8 @@
-"""Host tables of a model: geometry, mass, connectivity. Everything here is numpy and scipy in float64."""
+"""Host tables of a model, by numpy and scipy in float64: geometry, mass, connectivity."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from ..base.errors import MeshError, ModelError
 from ..elements import Part, Rule
 from ..elements.family import Tying
 from ..elements.quadrature import composite
+from ..materials import Material
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
 
@@ -22,10 +23,12 @@ __all__ = [
     "FacetTables",
     "HostBlock",
     "body_mass",
+    "density_of",
     "facet_places",
     "facet_tables",
     "gather_table",
     "host_blocks",
+    "require_density",
     "rigid_modes",
     "surface_weights",
 ]
@@ -37,7 +40,7 @@ TABLE = 20_000_000
 
 
 def chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[np.ndarray]:
-    """Elements in runs whose tables stay small."""
+    """The elements in runs for which tables at `points` points stay small."""
     per_element = points * body.family.slots if body.family.has_gradients else 1
     size = max(1, min(CHUNK, TABLE // per_element))
     for first in range(0, len(elements), size):
@@ -46,7 +49,7 @@ def chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[
 
 @dataclass(frozen=True)
 class BlockKey:
-    """What elements must share to be done by one kernel."""
+    """What elements must have in common to be processed by one kernel."""
 
     family: str
     scheme: str
@@ -62,36 +65,37 @@ class BlockKey:
 
     @property
     def integral(self) -> Part:
-        """The part of the energy."""
+        """The part of the strain energy that the block integrates."""
         return families.get(self.family).scheme(self.scheme)[self.part]
 
     @property
     def rule(self) -> Rule:
-        """Quadrature of the part."""
+        """Quadrature rule of the part."""
         return self.integral.rule
 
     @property
     def vertex(self) -> bool:
-        """Whether kernels/elements/vertex.py does the product: straight T10 with points towards the vertices."""
+        """Whether kernels/elements/vertex.py can do the product: straight T10 with points on lines to the vertices."""
         family = families.get(self.family)
         quadratic = family.cell_type == "tetra10" and family.slots == 10
         return self.affine and quadratic and not self.framed and self.rule.radial
 
     @property
     def tying(self) -> Tying | None:
-        """Assumed shear, of tied parts."""
+        """The tying of assumed shears, of parts that have them; else None."""
         return self.integral.tying
 
 
 @dataclass(eq=False)
 class HostBlock:
-    """Elements with one key, of one body.
+    """The elements of one body that have one key.
 
     Attributes:
         body: the body.
         elements: (E,) element indices in the body.
         material: index into the body's materials.
         coefficients: of the device law.
+        row: of the model's table of coefficients, set by the model.
     """
 
     key: BlockKey
@@ -99,9 +103,11 @@ class HostBlock:
     elements: np.ndarray
     material: int
     coefficients: tuple[float, ...]
+    row: int = -1
 
     @property
     def conn(self) -> np.ndarray:
+        """(E, S) body slots of the elements."""
         return self.body.connectivity[self.elements]
 
     @property
@@ -132,7 +138,7 @@ def gradients(ds: np.ndarray, J0: np.ndarray) -> np.ndarray:
 
 
 def straight(body: Discretisation) -> np.ndarray:
-    """(E,) whether an element has one J0."""
+    """(E,) whether an element has the same J0 everywhere."""
     if not body.family.affine:
         return np.zeros(len(body.mesh.cells), dtype=bool)
     return body.mesh.straight_sided()
@@ -144,6 +150,28 @@ def mass_rule(body: Discretisation, affine: bool) -> Rule:
     return body.family.mass_rule if affine and not varying else body.family.curved_mass_rule
 
 
+UNIT = 1.0
+"""Density, kg/m^3, that stands in tables where a material has none; nothing that uses the mass is done with it."""
+
+
+def density_of(material: Material) -> Any:
+    """The density of a material as it was given, or `UNIT`."""
+    return UNIT if material.density is None else material.density
+
+
+def require_density(bodies: Iterable[Discretisation], what: str) -> None:
+    """Raise ModelError for the first material without a density; `what`: what needs one."""
+    for body in bodies:
+        for group, material in body.materials:
+            if material.density is None:
+                law = f"{type(material).__name__} of group {group!r}" if group else type(material).__name__
+                without = ", or gravity=(0, 0, 0)" if what == "gravity" else ""
+                raise ModelError(
+                    f"body {body.name!r}: the material {law} has no density, which {what} needs; give it density=..., "
+                    f"kg/m^3 (steel 7850, water 1000){without}"
+                )
+
+
 def density_at(body: Discretisation, elements: np.ndarray, s: np.ndarray, conn: np.ndarray) -> np.ndarray:
     """(E, Q) density of elements at points."""
     out = np.empty((len(elements), s.shape[1]))
@@ -152,24 +180,25 @@ def density_at(body: Discretisation, elements: np.ndarray, s: np.ndarray, conn: 
         rows = np.flatnonzero(index == k)
         if not len(rows):
             continue
-        if callable(material.density):
+        density = density_of(material)
+        if callable(density):
             position = body.slot_kind[conn[rows]] == 0
             E = body.reference[conn[rows]] + position[:, :, None] * body.origin
             table = np.broadcast_to(s, (len(elements), *s.shape[1:]))[rows]
             X = np.einsum("eqs,esk->eqk", table, E)
-            values = np.asarray(material.density(X.reshape(-1, 3)), dtype=float).reshape(X.shape[:2])
+            values = np.asarray(density(X.reshape(-1, 3)), dtype=float).reshape(X.shape[:2])
             if not np.all(np.isfinite(values) & (values > 0.0)):
                 raise ModelError(f"body {body.name!r}: density f(X) is not positive and finite everywhere")
             out[rows] = values
-        elif np.ndim(material.density) == 1:
-            out[rows] = np.asarray(material.density, dtype=float)[elements[rows], None]
+        elif np.ndim(density) == 1:
+            out[rows] = np.asarray(density, dtype=float)[elements[rows], None]
         else:
-            out[rows] = float(material.density)
+            out[rows] = float(density)
     return out
 
 
 def parent_mass(family: Any) -> np.ndarray:
-    """int s_i s_j over the parent element, of families whose functions there are those of every straight element."""
+    """(S, S) int s_i s_j over the parent element, for families whose functions do not depend on the element."""
     s, _ = family.shape(family.mass_rule.points, np.zeros((1, len(family.node_slots), 3)))
     table = np.asarray(s[0])
     return np.einsum("q,qi,qj->ij", family.mass_rule.weights, table, table)
@@ -177,7 +206,7 @@ def parent_mass(family: Any) -> np.ndarray:
 
 def element_density(host: HostBlock) -> np.ndarray:
     """(E,) density of the elements of a block, constant in each, kg/m^3."""
-    density = np.asarray(host.body.materials[host.material][1].density, dtype=float)
+    density = np.asarray(density_of(host.body.materials[host.material][1]), dtype=float)
     return np.full(len(host.elements), float(density)) if density.ndim == 0 else density[host.elements]
 
 
@@ -204,7 +233,7 @@ def body_mass(body: Discretisation) -> sp.csr_matrix:
 
 
 def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
-    """Split a body's elements by what a kernel must know. `tables`: straight elements take the table path too."""
+    """The elements of a body by key; `tables`: straight elements get tables of h_i as well, like curved ones."""
     flat = straight(body)
     for k, (_, material) in enumerate(body.materials):
         damping = material.damping.form if material.damping else None
@@ -229,7 +258,7 @@ def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
 
 
 def element_volumes(body: Discretisation) -> np.ndarray:
-    """(E,) m^3, with section and thickness."""
+    """(E,) reference volumes of the elements, section and thickness included, m^3."""
     rule = body.family.rule(None)
     every = np.arange(len(body.mesh.cells))
     parts = [geometry(body, part, rule.points)[3] @ rule.weights for part in chunks(body, every, len(rule.weights))]
@@ -243,7 +272,7 @@ class TiedTables:
     Attributes:
         first, second: (E, n, S) ds_i/dxi_a and ds_i/dxi_b at the tying points.
         X_first, X_second: (E, n, 3) X_a and X_b.
-        coupling: (E, n, width) A of Psi = (mu/2) e.A e.
+        coupling: (E, n, width) A of the energy (mu/2) e.A e.
     """
 
     first: np.ndarray
@@ -254,7 +283,7 @@ class TiedTables:
 
 
 def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
-    """Tables of a tied part of some elements of a block."""
+    """Tables of the tied part of some elements of a block."""
     part, body = host.key.integral, host.body
     tying = part.tying
     assert tying is not None
@@ -269,7 +298,7 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
 
 
 def orthonormal(J0: np.ndarray) -> np.ndarray:
-    """Axes along the first parent line, then by Gram-Schmidt; columns, same shape as J0 (..., 3, 3)."""
+    """Orthonormal axes (columns) from the columns of J0 (..., 3, 3) by Gram-Schmidt, the first along the first."""
     a = J0[..., 0] / np.linalg.norm(J0[..., 0], axis=-1, keepdims=True)
     b = J0[..., 1] - np.sum(J0[..., 1] * a, axis=-1, keepdims=True) * a
     b = b / np.linalg.norm(b, axis=-1, keepdims=True)
@@ -277,7 +306,7 @@ def orthonormal(J0: np.ndarray) -> np.ndarray:
 
 
 def check_orientation(body: Discretisation, rule: Rule) -> None:
-    """Raise MeshError where det J0 <= 0 at a force point."""
+    """Raise MeshError where det J0 <= 0 at a point of the rule."""
     for part in chunks(body, np.arange(len(body.mesh.cells)), len(rule.weights)):
         det = geometry(body, part, rule.points)[3]
         bad = np.flatnonzero((det <= 0.0).any(axis=1))
@@ -289,7 +318,10 @@ def check_orientation(body: Discretisation, rule: Rule) -> None:
 
 
 def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.ndarray]:
-    """Who contributes to each slot: CSR start (slots + 1,) and entries, entry k of [local, elem] in order of `conn`."""
+    """The contributions to each slot as CSR: start (slots + 1,) and indices into the contributions of all blocks.
+
+    Those lie in the order of `conn`, within a block as [local, elem].
+    """
     flat = np.concatenate([c.T.ravel() for c in conn]) if conn else np.zeros(0, dtype=np.int64)
     order = np.argsort(flat, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=slots))])
@@ -297,7 +329,7 @@ def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.nda
 
 
 def slot_graph(conn: list[np.ndarray], slots: int) -> sp.csr_matrix:
-    """Which slots share an element (the mass alone does not tell: it vanishes between some slots)."""
+    """Which slots share an element. The mass matrix does not tell: between some of them its entry is zero."""
     rows = np.concatenate([np.repeat(first + np.arange(len(c)), c.shape[1]) for first, c in _offsets(conn)])
     columns = np.concatenate([c.ravel() for c in conn])
     incidence = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(rows.max() + 1, slots))
@@ -313,12 +345,13 @@ def _offsets(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
 
 @dataclass(eq=False)
 class FacetTables:
-    """Faces of a surface with the slots that their functions need (the rest of an element's vanish there).
+    """Functions of the faces of a surface, for the slots whose functions do not vanish there.
 
     Attributes:
-        conn: (F, n) body slots; faces with fewer repeat their first with functions of 0.
-        shape, d_a, d_b: (F, Q, n) functions and derivatives along the two sides of the face, outward by the right hand.
-        weights: (Q,).
+        conn: (F, n) body slots; faces that have fewer repeat their first one with functions of zero.
+        shape, d_a, d_b: (F, Q, n) functions and their derivatives along the two sides of a face, whose cross product
+            points outward.
+        weights: (Q,) of the face rule.
     """
 
     conn: np.ndarray
@@ -329,7 +362,7 @@ class FacetTables:
 
 
 def facet_tables(surface: SurfaceSet, parts: int = 1) -> FacetTables:
-    """Functions of the faces of a surface at the points of its family's face rule, repeated on parts x parts of it."""
+    """Functions of the faces of a surface at the points of the face rule, repeated on parts x parts of a face."""
     body, faces = surface.body, surface.faces
     rule = composite(body.family.face_rule, parts)
     Q, S = len(rule.weights), body.family.slots
@@ -353,7 +386,7 @@ def facet_tables(surface: SurfaceSet, parts: int = 1) -> FacetTables:
 
 
 def facet_places(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.ndarray]:
-    """Reference places X (F, Q, 3), m, of the points of faces, and the areas (F, Q), m^2, that they stand for."""
+    """Reference positions X (F, Q, 3), m, of the points of faces, and the areas (F, Q), m^2, that they stand for."""
     x = body.reference[t.conn]
     normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
     X = np.einsum("fqi,fik->fqk", t.shape, x) + body.origin
@@ -361,7 +394,7 @@ def facet_places(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.n
 
 
 def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
-    """Integral of each function over faces: body slots and weights (m^2; m^3 for gradients); curved faces too."""
+    """Body slots, and the integral of the function of each over a surface, curved or flat (m^2; m^3 of gradients)."""
     t = facet_tables(surface)
     _, dA = facet_places(surface.body, t)
     weights = np.einsum("fq,fqi->fi", dA, t.shape)
@@ -377,7 +410,7 @@ def center_of_mass(body: Discretisation, values: np.ndarray) -> np.ndarray:
 
 
 def rigid_modes(x: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """Six rigid motions on slots with values x: (6, slots, 3), rotations about the mean position."""
+    """(6, slots, 3) rigid motions of slots with values x: translations, and rotations about the mean position."""
     modes = np.zeros((6, len(x), 3))
     position = kind == 0
     arm = x.copy()
@@ -391,5 +424,5 @@ def rigid_modes(x: np.ndarray, kind: np.ndarray) -> np.ndarray:
 
 
 def components_of(graph: Any) -> np.ndarray:
-    """Connected component of each row of a sparse matrix."""
+    """(n,) connected component of each row of a symmetric sparse matrix."""
     return sp.csgraph.connected_components(graph, directed=False)[1]

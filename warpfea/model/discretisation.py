@@ -1,4 +1,4 @@
-"""A body as its mesh, its element family and their slots: what tables are made from."""
+"""A discretised body: its mesh, element family and slots, from which the tables of a model are made."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .partition import morton_order
 __all__ = ["Discretisation", "boundary_faces", "element_boxes", "element_functions"]
 
 LARGE = 20000
-"""Nodes from which a body's slots and elements are ordered by place; smaller ones fit into caches anyway."""
+"""Bodies of more nodes have their slots and elements ordered by place; smaller ones fit into caches anyway."""
 
 
 @dataclass(eq=False)
@@ -36,9 +36,9 @@ class Discretisation:
             families with gradient slots.
         section: section of a beam.
         node_axes: (nodes, 3, 3) orthonormal axes (columns) of each node's gradient slots; None: the global ones.
-        origin: (3,) body origin; device positions are relative to it.
-        element_offset: number of elements of the bodies before it, set at finalize.
-        slots: (used nodes x slots per node) model slots in body order, set at finalize; -1 before.
+        index: number of the body in its builder, -1 before it is added.
+        slot_offset, element_offset: slots and elements of the bodies before it, set at finalize; -1 before.
+        velocity, initial_displacement: (slots, 3) initial values, m/s and m; None: zero.
     """
 
     name: str
@@ -64,6 +64,7 @@ class Discretisation:
 
     @cached_property
     def origin(self) -> np.ndarray:
+        """(3,) middle of the bounding box, m; positions on the device are relative to it."""
         low, high = self.mesh.bounding_box()
         return 0.5 * (np.asarray(low) + np.asarray(high))
 
@@ -79,7 +80,7 @@ class Discretisation:
     def node_slot(self) -> np.ndarray:
         """(nodes,) first body slot of each mesh node, -1 for unused nodes.
 
-        Large bodies number them along a curve that fills space, so that neighbours lie close in memory.
+        Slots of large bodies are numbered along a space-filling curve, so that neighbours lie close in memory.
         """
         counts = self.node_slot_count
         order = morton_order(self.mesh.points) if len(counts) > LARGE else np.arange(len(counts))
@@ -115,7 +116,7 @@ class Discretisation:
 
     @cached_property
     def reference(self) -> np.ndarray:
-        """(slots, 3) reference slot values E_i: positions relative to the origin, gradients the node's axes."""
+        """(slots, 3) reference slot values E_i: positions relative to the origin (m), gradients as the node's axes."""
         E = self.mesh.points[self.slot_node] - self.origin
         for k in (1, 2, 3):
             rows = self.slot_kind == k
@@ -133,19 +134,19 @@ class Discretisation:
 
     @cached_property
     def element_order(self) -> np.ndarray:
-        """(elements,) the order that elements are computed in: large bodies as their nodes are numbered."""
+        """(elements,) the order in which elements are processed: in large bodies along a space-filling curve."""
         if len(self.mesh.points) <= LARGE:
             return np.arange(len(self.mesh.cells))
         return morton_order(self.mesh.points[self.mesh.cells].mean(axis=1))
 
     @cached_property
     def boundary(self) -> np.ndarray:
-        """(K, 2) all outer faces, rows (element, local face)."""
+        """(K, 2) outer faces, rows (element, local face); see `boundary_faces`."""
         return boundary_faces(self)
 
     @cached_property
     def element_boxes(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Boxes of the elements, for finding points."""
+        """Bounding boxes of the elements, for finding points; see `element_boxes`."""
         return element_boxes(self)
 
 
@@ -157,7 +158,7 @@ def element_functions(body: Discretisation, elements: np.ndarray, xi: np.ndarray
 
 
 def boundary_faces(body: Discretisation) -> np.ndarray:
-    """Outer faces, rows (element, local face): of solids the mesh's, of beams and shells their own."""
+    """(K, 2) outer faces, rows (element, local face): of solids those of the mesh, of beams and shells their own."""
     mesh, family = body.mesh, body.family
     if family.solid:
         return mesh.boundary()
@@ -173,7 +174,7 @@ def boundary_faces(body: Discretisation) -> np.ndarray:
 
 
 def element_boxes(body: Discretisation) -> tuple[np.ndarray, np.ndarray, float]:
-    """Corners (E, 3) of the boxes of the elements in the reference, and the longest side of any, m."""
+    """Lower and upper corners (E, 3) of the elements' bounding boxes in the reference, and their longest side, m."""
     E = body.reference[body.connectivity] + (body.slot_kind[body.connectivity] == 0)[:, :, None] * body.origin
     coords = E
     if body.family.has_gradients:

@@ -1,4 +1,4 @@
-"""Sets of nodes, faces and elements of a body, and material points."""
+"""Handles of parts of a body: sets of nodes, faces and elements, and material points."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ElementSet:
 
 @dataclass(frozen=True, eq=False)
 class MaterialPoint:
-    """A material point X = sum weights_i X_i of a body, held by body slots.
+    """A material point of a body: its position is the sum of weights times the values of body slots.
 
     Attributes:
         body: the body.
@@ -62,8 +62,9 @@ class MaterialPoint:
         weights: (n,) shape functions at the point.
         X: (3,) reference position, m.
         gradients: (n, 3) dweights/dX, 1/m: the deformation gradient is sum e_i gradients_i^T.
-        axes: (3, 3) columns: of a beam axis, width, height there; of a shell two tangents and the director; else
-            global.
+        axes: (3, 3) columns: in a beam its axis, width and height there; in a shell two tangents and the director;
+            in a solid the global axes.
+        element: index of the element that holds the point.
     """
 
     body: Discretisation

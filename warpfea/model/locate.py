@@ -15,9 +15,9 @@ __all__ = ["locate"]
 
 
 def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
-    """Find X (3,), m, in the reference of a body, by Newton's method in every element near it.
+    """The material point at X (3,), m, in the reference of a body, by Newton's method in every element near it.
 
-    A point outside by no more than `slack` of an element's size is found by the element's functions there.
+    A point that lies outside by at most `slack` times the size of an element counts as inside that element.
 
     Raises:
         ModelError: X is not three finite numbers, or lies outside of the body.
@@ -78,6 +78,6 @@ def _own_point(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tu
 
 
 def _near(body: Discretisation, x: np.ndarray) -> tuple[np.ndarray, float]:
-    """Elements whose drawn box, grown by a tenth, holds x; and the size of the largest (m)."""
+    """Elements whose bounding box, enlarged by a tenth of the largest, holds x; and the size of the largest (m)."""
     low, high, size = body.element_boxes
     return np.flatnonzero(np.all((low - 0.1 * size <= x) & (high + 0.1 * size >= x), axis=1)), size

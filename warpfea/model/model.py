@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,17 +21,24 @@ from ..kernels.elements.points import block_struct
 from ..kernels.elements.tied import tied_kernels, tied_struct
 from ..kernels.elements.with_mass import with_mass_kernel
 from ..kernels.solvers.pcg import groups_struct
-from ..terms.constraints import Constraints
-from ..terms.loads import Loads
 from . import assembly
 from .bodies import Body
-from .evaluation import Evaluation
+from .description import Description
 from .state import State
 
-if TYPE_CHECKING:
-    from ..builder.builder import ModelBuilder
-
 __all__ = ["Block", "Model", "find_device"]
+
+
+class Source(Protocol):
+    """What a Model is made from: a ModelBuilder."""
+
+    bodies: list[Body]
+    description: Description
+    gravity: np.ndarray
+    up_axis: str
+
+    def assemble(self, model: Model) -> tuple[Any, Any]:
+        """The TermSet of a model, and what evaluates it at a state."""
 
 
 @dataclass(eq=False)
@@ -89,7 +96,7 @@ class Model:
 
     def __init__(
         self,
-        builder: ModelBuilder,
+        builder: Source,
         *,
         device: Any = None,
         dtype: str = "float64",
@@ -114,13 +121,13 @@ class Model:
         self._number()
         self._assemble_mass()
         self._build_blocks(tables)
-        self.constraints = Constraints(self, self.description.joints) if self.description.joints else None
+        self.gravity = np.asarray(builder.gravity, dtype=float)
+        self.probes = list(builder.description.probes)
+        self.terms, self.evaluation = builder.assemble(self)
         self._label_components()
-        self.loads = Loads(self, builder.gravity)
+        self.terms.build()
         self._build_topology()
         self._build_groups()
-        self.probes = list(builder.description.probes)
-        self.evaluation = Evaluation(self)
 
     # construction
 
@@ -184,7 +191,6 @@ class Model:
     def _build_blocks(self, tables: bool) -> None:
         groups: dict[assembly.BlockKey, list[assembly.HostBlock]] = {}
         rows: list[np.ndarray] = []
-        self._row: dict[int, int] = {}
         self.materials = [(body, group, material) for body in self.bodies for group, material in body.materials]
         for body in self.bodies:
             for host in assembly.host_blocks(body, tables=tables):
@@ -194,7 +200,7 @@ class Model:
                 damping = body.materials[host.material][1].damping
                 if damping:
                     row[-2:] = damping.eta, damping.lambda_v
-                self._row[id(host)] = len(rows)
+                host.row = len(rows)
                 rows.append(row)
         self.coefficients = self.array("materials", np.array(rows)[None], self.types.T)
         self.blocks: list[Block] = []
@@ -216,7 +222,7 @@ class Model:
         data = (tied_struct if key.tying else block_struct)(self.dtype)()
         data.conn = self.array("elements", conn.T, wp.int32)
         data.is_position = self.array("elements", (family.slot_kind == 0).astype(float), self.types.T)
-        rows = [np.full(len(p.elements), self._row[id(p)]) for p in parts]
+        rows = [np.full(len(p.elements), p.row) for p in parts]
         data.material = self.array("elements", np.concatenate(rows), wp.int32)
         data.coefficients = self.coefficients
         data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
@@ -303,6 +309,12 @@ class Model:
         if key.framed:
             data.frame = self.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)
 
+    @property
+    def constraints(self) -> Any:
+        """Tables of the constraints (see terms.constraint_tables), or None."""
+        term = self.terms.constraints
+        return term and term.tables
+
     def _build_topology(self) -> None:
         T, vec3 = self.types.T, self.types.vec3
         topo = topology_struct(self.dtype)()
@@ -314,6 +326,7 @@ class Model:
         topo.mass_value = self.array("mass", self.mass_host.data, T)
         topo.free = self.array("slots", self.free_host, vec3)
         topo.held = self.array("slots", (self.free_host == 0.0) @ [1, 2, 4], wp.uint8)
+        self.terms.join(topo)
         self.topology = topo
 
     def graph(self) -> sp.csr_matrix:
@@ -324,9 +337,10 @@ class Model:
         """Connected component of each slot: by elements alone (`part`), and with what joints tie (`component`)."""
         self.part = assembly.components_of(self.graph())
         self.component = self.part
-        if self.constraints:
+        groups = self.terms.ties()
+        if groups:
             ties = sp.lil_matrix((self.part.max() + 1, self.part.max() + 1))
-            for slots in self.constraints.slot_groups():
+            for slots in groups:
                 parts = np.unique(self.part[slots])
                 ties[parts[0], parts] = 1.0
             self.component = assembly.components_of(ties.tocsr())[self.part]
@@ -340,8 +354,7 @@ class Model:
         for c in range(3):
             held = np.unique(label[self.free_host[:, c] == 0.0])
             free[held, c] = 0.0
-        if self.constraints:
-            self.constraints.hold(free)
+        self.terms.hold(free)
         if count > 1:
             order = np.argsort(label, kind="stable")
             edges = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
@@ -413,21 +426,8 @@ class Model:
     @property
     def features(self) -> dict[str, bool]:
         """Which optional features the scene uses."""
-        forms = {b.key.damping for b in self.blocks}
-        d = self.description
-        return {
-            "straight elements": any(b.key.affine for b in self.blocks),
-            "table elements": any(not b.key.affine for b in self.blocks),
-            "damping incremental": "incremental" in forms,
-            "damping rate": "rate" in forms,
-            "damping explicit": "explicit" in forms,
-            "gravity": bool(np.any(self.loads.gravity_host)),
-            "dead loads": bool(d.dead_loads),
-            "body forces": bool(d.body_forces),
-            "follower pressure": bool(d.pressures),
-            "moments": bool(d.moments),
-            "constraints": self.constraints is not None,
-            "driven nodes": any(s.law or s.node_laws for s in d.supports),
+        return self.terms.features | {
+            "driven nodes": any(s.law or s.node_laws for s in self.description.supports),
             "free groups": self.group_count > 0,
             "separate components": self.component_count > 1,
             "probes": bool(self.probes),
@@ -465,7 +465,7 @@ class Model:
                 for j in (self.constraints.joints if self.constraints else ())
             ],
             "features": [k for k, on in features.items() if on],
-            "left_out": [k for k, on in features.items() if not on] + ["contact", "friction", "per-world parameters"],
+            "left_out": [k for k, on in features.items() if not on] + list(self.terms.later),
             "blocks": [
                 {
                     "element": b.key.family,
@@ -540,7 +540,7 @@ class Model:
 
     def set_gravity(self, gravity: Any) -> None:
         """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2."""
-        self.loads.set_gravity(gravity)
+        self.terms.dead.set_gravity(gravity)
 
     def set_parameter(self, name: str, values: Any) -> None:
         """Per-world material parameters are not part of this version."""
@@ -561,9 +561,7 @@ class Model:
         h.update(self.free_host.tobytes())
         h.update(self.mass_host.data.tobytes())
         h.update(self.coefficients.numpy().tobytes())
-        self.loads.hash(h)
-        if self.constraints:
-            self.constraints.hash(h)
+        self.terms.hash(h)
         return h.hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""Nearby nodes: groups by recursive bisection, and an order that keeps them together."""
+"""Grouping of nearby nodes by recursive bisection, and an order of nodes that keeps neighbours together."""
 
 from __future__ import annotations
 
@@ -9,21 +9,25 @@ __all__ = ["bisect", "connected_groups", "morton_order"]
 
 
 def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity: int) -> np.ndarray:
-    """Group of each item: compact, of one label, and of total weight up to `capacity`.
+    """Group of each item: groups are compact, of one label, and of a total weight up to `capacity`.
 
-    A group is halved across its longest side until it fits, so that groups of twice the capacity hold whole ones.
+    Groups are halved across their longest side until they fit, so that groups of twice the capacity consist of whole
+    ones of the capacity.
 
     Args:
         places: (n, 3) m.
         weights: (n,) whole numbers, each up to the capacity.
-        labels: (n,) items of different labels never meet.
+        labels: (n,) items of different labels never share a group.
 
     Returns:
         (n,) group numbers from 0, without gaps.
+
+    Raises:
+        ValueError: an item that weighs more than the capacity.
     """
     if np.any(weights > capacity):
         raise ValueError(f"an item of weight {weights.max()} does not fit into a group of {capacity}")
-    # groups of equal parts of the largest weight always fit
+    # a multiple of the largest weight can be filled however the weights are cut
     room = capacity // int(weights.max()) * int(weights.max())
     group = np.unique(labels, return_inverse=True)[1].ravel().astype(np.int64)
     while True:
@@ -48,7 +52,7 @@ def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity
 
 
 def connected_groups(group: np.ndarray, graph: sp.csr_matrix) -> np.ndarray:
-    """The groups split into their connected parts; `graph` says which items touch."""
+    """(n,) numbers of the groups when split into connected parts; `graph` says which items touch."""
     links = graph.tocoo()
     inside = group[links.row] == group[links.col]
     within = sp.coo_matrix(
@@ -58,7 +62,7 @@ def connected_groups(group: np.ndarray, graph: sp.csr_matrix) -> np.ndarray:
 
 
 def morton_order(places: np.ndarray) -> np.ndarray:
-    """Order of points (n, 3) along Morton's curve over their box."""
+    """(n,) order of points (n, 3) along a Morton curve over their bounding box."""
     low = places.min(axis=0)
     extent = max(float(np.ptp(places, axis=0).max()), 1e-300)
     cell = np.minimum((places - low) / extent * 2**20, 2**20 - 1).astype(np.uint64)

@@ -18,7 +18,7 @@ from ..kernels.common.state import state_kernels
 if TYPE_CHECKING:
     from ..base.launch import Launcher
 
-__all__ = ["ArraySpec", "State"]
+__all__ = ["ArraySpec", "State", "words_of"]
 
 MEMORY = ("preconditioner", "operator", "predictor")
 """What names of arrays begin with that solvers remember; a state can do without."""
@@ -113,7 +113,7 @@ class State:
         for name, target in self._arrays.items():
             if name in skip:
                 continue
-            a, b = _words(source._arrays[name]), _words(target)
+            a, b = words_of(source._arrays[name]), words_of(target)
             if b.shape[1]:
                 launch(kernel, b.shape, [flags, a, b])
 
@@ -156,7 +156,7 @@ def remembered(name: str) -> bool:
     return name.partition("_")[0] in MEMORY
 
 
-def _words(array: wp.array) -> wp.array:
+def words_of(array: wp.array) -> wp.array:
     """The array seen as [world, 32-bit word]."""
     size = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
     out: Any = wp.array(

@@ -1,4 +1,4 @@
-"""Faces of a body and what is drawn of it, from its elements' functions: true curved faces, sections and thickness."""
+"""Faces of a body, and how it is drawn by its elements' functions: with its curved faces, sections and thickness."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Skin:
     """The drawn surface of a body.
 
     Attributes:
-        triangles: (T, 3) indices of skin points, outward.
+        triangles: (T, 3) indices of the skin's points, outward by the right hand.
         slot_weights: sparse (points, slots): skin positions from slot values.
         node_weights: sparse (points, mesh nodes x samples): skin fields from fields at the nodes' samples.
     """
@@ -38,7 +38,14 @@ class Skin:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A body as cells of VTK: cells (C, n) of one type over points, their elements (C,), and weights as in Skin."""
+    """A body as cells of VTK.
+
+    Attributes:
+        cell_type: of all cells, by its name in meshio.
+        cells: (C, n) indices of the drawing's points.
+        element: (C,) element of each cell.
+        slot_weights, node_weights: as of Skin.
+    """
 
     cell_type: str
     cells: np.ndarray
@@ -67,7 +74,7 @@ def named_faces(body: Discretisation) -> dict[str, np.ndarray]:
 
 
 def select_faces(body: Discretisation, selection: Any) -> np.ndarray:
-    """Rows (element, local face) by name, predicate of the outer faces' centroids, or rows.
+    """Rows (element, local face) of a surface given by name, by a predicate of outer faces' centroids, or as rows.
 
     Raises:
         ModelError: an unknown name (lists the names), a predicate without a mask, or rows out of range.
@@ -95,7 +102,7 @@ def select_faces(body: Discretisation, selection: Any) -> np.ndarray:
 
 
 def face_centroids(body: Discretisation, faces: np.ndarray) -> np.ndarray:
-    """(K, 3) m, the point in the middle of each face."""
+    """(K, 3) reference point in the middle of each face, m."""
     out = np.empty((len(faces), 3))
     for face, rows in _by_face(faces):
         middle = np.full((1, 2), 1.0 / 3.0 if len(body.family.faces[face]) == 3 else 0.5)
@@ -111,7 +118,7 @@ def _by_face(faces: np.ndarray) -> list[tuple[int, np.ndarray]]:
 
 
 def _cut(corners: int, parts: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Points (P, 2) of the unit triangle or square cut into parts, and triangles (T, 3)."""
+    """Points (P, 2) of the unit triangle or square cut into parts, and the triangles (T, 3) over them."""
     na, nb = parts
     if corners == 4:
         a, b = np.meshgrid(np.linspace(0, 1, na + 1), np.linspace(0, 1, nb + 1), indexing="ij")
@@ -130,7 +137,7 @@ def _cut(corners: int, parts: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Points:
-    """Collects material points of elements; points with the same weights on the same slots are one."""
+    """Collects material points of elements, and merges those that have the same weights on the same slots."""
 
     def __init__(self, body: Discretisation) -> None:
         self.body = body
@@ -144,7 +151,10 @@ class _Points:
         self.count = 0
 
     def add(self, elements: np.ndarray, xi: np.ndarray, label: int) -> np.ndarray:
-        """(E, P) numbers of the points before merging; `label` keeps points of different faces apart."""
+        """Add the points xi (P, 3) of each element; returns their (E, P) numbers before merging.
+
+        Points of different `label` are not merged.
+        """
         body = self.body
         s, _ = element_functions(body, elements, xi)
         conn = body.connectivity[elements]
@@ -170,7 +180,7 @@ class _Points:
         return first + np.arange(E * P).reshape(E, P)
 
     def merge(self) -> tuple[np.ndarray, sp.csr_matrix, sp.csr_matrix]:
-        """New number of each point, slot weights and sample weights of the merged ones."""
+        """The new number of each point, and the slot and sample weights of the merged points."""
         _, first, inverse = np.unique(np.concatenate(self._keys), return_index=True, return_inverse=True)
         rank = np.empty(len(first), dtype=np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
@@ -193,7 +203,7 @@ def _sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sp.csr_matri
 
 
 def make_skin(body: Discretisation) -> Skin:
-    """The outer faces, each cut into triangles; along the sharp edges of beams and shells points are not shared."""
+    """The outer faces cut into triangles; faces of beams and shells share no points, so that their edges stay sharp."""
     points = _Points(body)
     triangles = []
     for face, rows in _by_face(body.boundary):
@@ -218,5 +228,5 @@ def make_drawing(body: Discretisation) -> Drawing:
 
 
 def reference_points(body: Discretisation, weights: sp.csr_matrix) -> np.ndarray:
-    """(P, 3) m: points of the reference from weights on slots."""
+    """(P, 3) reference positions, m, of points given by their weights (P, slots) on slots."""
     return weights @ body.reference + np.asarray(weights @ (body.slot_kind == 0))[:, None] * body.origin

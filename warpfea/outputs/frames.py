@@ -1,12 +1,13 @@
 """What all output writers share: the protocol, due frames, safe file replacement and the drawn surface.
 
-A writer gets the simulation itself and asks it for `time` (B,), `dt`, `model.bodies`, `model.worlds`,
-`model.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for nodal formats,
+A writer gets the simulation itself and asks it for `time` (B,), of statics `load` (B,), `dt`, `model.bodies`,
+`model.worlds`, `model.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for nodal formats,
 `positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,16 @@ import numpy.typing as npt
 
 from warpfea.base.errors import OutputError
 
-__all__ = ["FrameClock", "Surface", "field_label", "grid_offsets", "vertex_normals"]
+__all__ = [
+    "FrameClock",
+    "Surface",
+    "check_colors",
+    "check_fields",
+    "field_label",
+    "grid_offsets",
+    "is_static",
+    "vertex_normals",
+]
 
 Array = npt.NDArray[Any]
 
@@ -35,8 +45,38 @@ def field_label(name: str) -> tuple[str, str]:
 
 
 def time_of(sim: Any) -> float:
-    """The simulated time (s) of a frame: that of the world which is furthest (frozen worlds stay behind)."""
-    return float(np.max(np.asarray(sim.time, dtype=np.float64)))
+    """The simulated time (s) of a frame: that of the world which is furthest (frozen worlds stay behind).
+
+    Of statics the part of the load that acts, 0 to 1.
+    """
+    load = getattr(sim, "load", None)
+    return float(np.max(np.asarray(sim.time if load is None else load, dtype=np.float64)))
+
+
+def is_static(sim: Any) -> bool:
+    """Whether a simulation is one of statics, whose frames are parts of the load."""
+    return getattr(sim, "load", None) is not None
+
+
+def check_fields(sim: Any, names: Sequence[str]) -> None:
+    """Raise the simulation's ModelError for a field that it does not have, before anything is computed."""
+    check = getattr(sim, "check_field", None)
+    if check is not None:
+        for name in names:
+            check(name)
+
+
+def check_colors(pair: Any) -> tuple[float, float] | None:
+    """The colour range (low, high), or None. OutputError unless it is two finite rising numbers."""
+    if pair is None:
+        return None
+    try:
+        low, high = map(float, pair)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise OutputError(f"color_range must be two finite rising numbers, got {pair!r}")
+    return low, high
 
 
 class FrameClock:

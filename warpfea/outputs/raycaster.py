@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from warpfea.base.console import quiet_warp
 from warpfea.base.errors import OutputError
 from warpfea.outputs.colormap import to_linear, to_srgb
 from warpfea.outputs.frames import scatter_rows, unit_rows
@@ -137,7 +138,7 @@ class Renderer:
             base = points if self._reference is None else self.turned(self._reference)
             self._groups = smooth_corners(base, self.triangles)
         unit = (points - camera.target) / camera.size
-        with wp.ScopedDevice("cpu"):
+        with quiet_warp(), wp.ScopedDevice("cpu"):
             scene = self._scene(wp, raycast, unit, np.asarray(colors), camera, size)
             self._cast_shadow(wp, raycast, scene, unit)
             image = self._cast(wp, raycast, scene, pixel_grid(width, height)).reshape(height, width, 3)

@@ -35,7 +35,12 @@ class Frame:
 
 @dataclass
 class Reel:
-    """Frames of one surface and how to show them; `shown` is the colour range, None for the extremes."""
+    """Frames of one surface and how to show them.
+
+    Attributes:
+        shown: colour range; None: the extremes.
+        static: the frames' times are parts of a static load.
+    """
 
     triangles: npt.NDArray[np.integer[Any]]
     up_axis: str
@@ -43,6 +48,7 @@ class Reel:
     title: str = ""
     units: str = ""
     shown: tuple[float, float] | None = None
+    static: bool = False
     frames: list[Frame] = field(default_factory=list)
 
     def draw(
@@ -69,7 +75,7 @@ class Reel:
             image = renderer.render(frame.points, colors, camera, size)
             yield label(
                 image,
-                f"t = {frame.time:.{decimals}f} s",
+                f"load {100.0 * frame.time:.4g} %" if self.static else f"t = {frame.time:.{decimals}f} s",
                 (low, high, self.title, self.units) if barred else None,
             )
 

@@ -14,10 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from warpfea.base.errors import OutputError
+from warpfea.base.names import did_you_mean
 from warpfea.base.writer import Output, check_target
-from warpfea.outputs.frames import FrameClock, Surface, field_label, time_of
+from warpfea.outputs.frames import (
+    FrameClock,
+    Surface,
+    check_colors,
+    check_fields,
+    field_label,
+    is_static,
+    time_of,
+)
 from warpfea.outputs.raycaster import VIEW, Camera, Renderer
 from warpfea.outputs.reel import Frame, Reel
+from warpfea.outputs.usd_check import in_words
 
 __all__ = ["Camera", "GIFWriter", "PNGWriter", "Renderer", "render_usd"]
 
@@ -49,12 +59,13 @@ class _Drawing(Output):
     ) -> None:
         self.path = pathlib.Path(path)
         self.field, self.size, self.view = field, _checked_size(size), view
-        self.color_range, self.spacing, self.ground = color_range, spacing, ground
+        self.color_range, self.spacing, self.ground = check_colors(color_range), spacing, ground
         self._reel: Reel | None = None
 
     def open(self, sim: Any) -> None:
         self.abort()
         check_target(self.path, (self.suffix,))
+        check_fields(sim, [self.field] if self.field else [])
         self._surface = Surface(sim, self.spacing)
         start = self._surface.points(sim)
         self._origin = 0.5 * (start.min(axis=0) + start.max(axis=0))
@@ -66,6 +77,7 @@ class _Drawing(Output):
             title,
             units,
             self.color_range,
+            is_static(sim),
         )
 
     def _frame(self, sim: Any) -> Frame:
@@ -212,14 +224,17 @@ def render_usd(
     field: str | None = None,
     time: float | None = None,
     view: tuple[float, float] = VIEW,
+    color_range: tuple[float, float] | None = None,
     ground: bool = True,
     progress: bool | None = None,
 ) -> pathlib.Path:
     """Draw a USD file of :class:`warpfea.USDWriter` to `out` (.png or .gif) and return that path.
 
     Args:
-        field: a field of the file; None: the one that it shows in colour. time: of a PNG (s); None: the last.
+        field: a field of the file, or "none" for grey; None: the one that it shows in colour.
+        time: of a PNG (s); None: the last.
         fps, speed, max_frames: of a GIF, which spans the whole file; more frames are spread over the span.
+        color_range: (low, high) of the colours; None: those of the file, or the extremes of the run.
         size: (width, height), default (960, 540) for PNG and (640, 360) for GIF.
 
     OutputError: missing or unreadable file, not written by warpfea, no mesh, no such field, unknown suffix.
@@ -228,6 +243,7 @@ def render_usd(
     animated = target.suffix.lower() == ".gif"
     size = _checked_size(size or ((640, 360) if animated else (960, 540)))
     check_rates(fps, speed, max_frames)
+    color_range = check_colors(color_range)
     source = _Source(pathlib.Path(path))
     if animated:
         count = int(np.floor((source.end - source.start) * fps / speed * (1 + 1e-9))) + 1
@@ -243,6 +259,7 @@ def render_usd(
             raise OutputError(f"{path}: time {at:g} s lies outside {source.start:g} .. {source.end:g} s")
         times = np.array([at])
     reel = source.reel(field, times)
+    reel.shown = color_range or reel.shown
     if animated:
         reel.save_gif(target, size, view, ground, speed, progress)
     else:
@@ -262,7 +279,7 @@ class _Source:
         try:
             self.stage = Usd.Stage.Open(str(path))
         except Tf.ErrorException as error:
-            raise OutputError(f"{path}: not a readable USD file ({error})") from error
+            raise OutputError(f"{path}: not a readable USD file ({in_words(error)})") from error
         self.meshes = [UsdGeom.Mesh(prim) for prim in self.stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
         if not self.meshes:
             raise OutputError(f"{path}: holds no mesh")
@@ -280,10 +297,11 @@ class _Source:
         """The frames at `times` (s); values between samples are interpolated linearly by USD."""
         from pxr import UsdGeom
 
-        name = field or self.about["color"] or None
+        name = None if field == "none" else field or self.about["color"] or None
         if name is not None and name not in self.about["fields"]:
             have = ", ".join(self.about["fields"]) or "none"
-            raise OutputError(f"{self.path}: has no field {name!r}; fields: {have}")
+            hint = did_you_mean(name, self.about["fields"])
+            raise OutputError(f"{self.path}: has no field {name!r}; fields: {have}{hint}")
         triangles, first = [], 0
         for mesh in self.meshes:
             counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
@@ -295,6 +313,7 @@ class _Source:
         self.origin = 0.5 * (start.min(axis=0) + start.max(axis=0))
         reference = np.asarray(start - self.origin, dtype=np.float32)
         reel = Reel(np.concatenate(triangles), str(UsdGeom.GetStageUpAxis(self.stage)), reference)
+        reel.static = bool(self.about.get("static", False))
         if name is not None:
             about = self.about["fields"][name]
             pair = self.about["colorRange"] if name == self.about["color"] else about["range"]

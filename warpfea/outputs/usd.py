@@ -9,13 +9,15 @@ Layout of a stage (metres, kilograms):
     /World/Camera /World/Sky /World/Sun
 
 Points are float32 about the body's own centre, so nothing is lost far from the origin. The time code of a
-sample is its time times `fps`, a fraction where no step ended on the frame's time.
+sample is its time times `fps`, a fraction where no step ended on the frame's time. Of statics the time is the part of
+the load, 0 to 1.
 """
 
 from __future__ import annotations
 
 import os
 import pathlib
+import shutil
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,8 +27,18 @@ import numpy.typing as npt
 from warpfea.base.errors import OutputError
 from warpfea.base.writer import Output, check_target, temporary_beside
 from warpfea.outputs.colormap import map_colors
-from warpfea.outputs.frames import FrameClock, Surface, field_label, time_of, vertex_normals
-from warpfea.outputs.usd_check import validate_usd
+from warpfea.outputs.frames import (
+    FrameClock,
+    Surface,
+    check_colors,
+    check_fields,
+    field_label,
+    is_static,
+    time_of,
+    vertex_normals,
+)
+from warpfea.outputs.usd_check import in_words, validate_usd
+from warpfea.outputs.usd_extend import read_earlier
 
 __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
 
@@ -46,10 +58,12 @@ class USDWriter(Output):
         color: the field shown as display colour (kept as primvar too), or None for plain grey.
         color_range: (low, high) of the colours; without it the extremes over the whole run and all worlds.
         spacing: distance of worlds (m); see :class:`warpfea.outputs.frames.Surface`.
+        extend: go on with the file if it is there, of the run that this one resumes: it must be of the same bodies and
+            settings and end at the present time.
 
-    Frames go into the layer as they come, and binary layers to disk every 32 MB. The state at `close` is
-    always the last frame. OutputError: bad suffix or folder (at `open`), positions that are not finite (at
-    `write`), a file that does not validate (at `close`; the target is then left as it was).
+    Frames go into the layer as they come, and binary layers to disk every 32 MB. The state at `close` is always the
+    last frame. OutputError: bad suffix or folder, or a file that can't be extended (at `open`), positions that are not
+    finite (at `write`), a file that does not validate (at `close`; the target is then left as it was).
     """
 
     def __init__(
@@ -61,15 +75,15 @@ class USDWriter(Output):
         color: str | None = "von_mises",
         color_range: tuple[float, float] | None = None,
         spacing: float | tuple[float, float] | None = None,
+        extend: bool = False,
     ) -> None:
         self.path = pathlib.Path(path)
         self.fps = FrameClock(fps).fps
         self.color = color
         self.fields = list(dict.fromkeys([*fields, *([color] if color else [])]))
-        if color_range is not None and not (np.isfinite(color_range).all() and color_range[0] < color_range[1]):
-            raise OutputError(f"color_range must be two finite rising numbers, got {color_range!r}")
-        self.color_range = color_range
+        self.color_range = check_colors(color_range)
         self.spacing = spacing
+        self.extend = extend
         self._stage: Any = None
         self._temporary: pathlib.Path | None = None
 
@@ -78,6 +92,7 @@ class USDWriter(Output):
 
         self.abort()
         target = check_target(self.path, SUFFIXES)
+        check_fields(sim, self.fields)
         self._surface = Surface(sim, self.spacing)
         self._clock = FrameClock(self.fps)
         self._codes: list[float] = []
@@ -86,10 +101,17 @@ class USDWriter(Output):
         self._unsaved = 0
         self._temporary = temporary_beside(target)
         try:
+            if self.extend and target.is_file():
+                self._take_up(sim, target)
+                return
             self._stage = stage = Usd.Stage.CreateNew(str(self._temporary))
-        except Tf.ErrorException as error:
+        except (OSError, Tf.ErrorException) as error:
             self.abort()
-            raise OutputError(f"{target}: can't be created ({error})") from error
+            reason = in_words(error) if isinstance(error, Tf.ErrorException) else error.strerror
+            raise OutputError(f"{target}: can't be written ({reason})") from error
+        except OutputError:
+            self.abort()
+            raise
         UsdGeom.SetStageUpAxis(stage, self._surface.up_axis)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
@@ -99,9 +121,9 @@ class USDWriter(Output):
         stage.SetDefaultPrim(root)
         self._define()
 
-    def _define(self) -> None:
-        """Author all that does not change: transforms, topology, attributes without samples."""
-        from pxr import Gf, Tf, UsdGeom, Vt
+    def _names(self) -> list[str]:
+        """Names of the bodies' prims."""
+        from pxr import Tf
 
         names: list[str] = []
         for body in self._surface.bodies:
@@ -109,7 +131,36 @@ class USDWriter(Output):
             while name in names:
                 name += "_"
             names.append(name)
-        self._meshes: list[list[_Mesh]] = [[] for _ in names]
+        return names
+
+    def _take_up(self, sim: Any, target: pathlib.Path) -> None:
+        """Open a copy of the file that is there, to go on with it."""
+        from pxr import Usd, UsdGeom
+
+        assert self._temporary is not None
+        shutil.copyfile(target, self._temporary)
+        self._stage = stage = Usd.Stage.Open(str(self._temporary))
+        worlds = range(self._surface.worlds)
+        paths = [[f"/World/world_{world:04d}/{name}/skin" for world in worlds] for name in self._names()]
+        wanted = {"fps": self.fps, "fields": self.fields, "color": self.color}
+        earlier = read_earlier(target, stage, sim, self._surface, paths, wanted)
+        self._codes, self._box, self._surface.offsets = list(earlier.codes), earlier.box, earlier.offsets
+        self._range = {name: earlier.ranges[name] for name in self.fields}
+        self._clock.due(earlier.time)
+        self._meshes: list[list[_Mesh]] = []
+        for of_body in paths:
+            meshes = [UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in of_body]
+            moves = [UsdGeom.Xformable(m.GetPrim().GetParent()).GetOrderedXformOps()[0] for m in meshes]
+            self._meshes.append([_Mesh(mesh, move, self.fields) for mesh, move in zip(meshes, moves)])
+        for name in ("Camera", "Sky", "Sun"):  # they are made anew, for all frames
+            stage.RemovePrim(f"/World/{name}")
+
+    def _define(self) -> None:
+        """Author all that does not change: transforms, topology, attributes without samples."""
+        from pxr import Gf, UsdGeom, Vt
+
+        names = self._names()
+        self._meshes = [[] for _ in names]
         for world in range(self._surface.worlds):
             place = UsdGeom.Xform.Define(self._stage, f"/World/world_{world:04d}")
             place.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(
@@ -155,7 +206,7 @@ class USDWriter(Output):
             if self._unsaved > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
                 self._save()
         except Tf.ErrorException as error:
-            raise OutputError(f"{self.path}: can't be written ({error})") from error
+            raise OutputError(f"{self.path}: can't be written ({in_words(error)})") from error
 
     def _field(self, sim: Any, name: str, body: Any) -> npt.NDArray[np.float32]:
         values = np.ascontiguousarray(sim.skin_field(name, body), dtype=np.float32)
@@ -187,8 +238,10 @@ class USDWriter(Output):
             if problems:
                 raise OutputError(f"{self.path}: the stage is not valid: " + "; ".join(problems[:10]))
             os.replace(temporary, self.path)
-        except (OSError, Tf.ErrorException) as error:
+        except OSError as error:
             raise OutputError(f"{self.path}: can't be written ({error})") from error
+        except Tf.ErrorException as error:
+            raise OutputError(f"{self.path}: can't be written ({in_words(error)})") from error
         finally:
             self.abort()
         stale = Sdf.Layer.Find(str(self.path))
@@ -219,6 +272,7 @@ class USDWriter(Output):
         dt = np.ravel(np.asarray(getattr(sim, "dt", np.nan), dtype=np.float64))
         data["dt"] = float(dt[0]) if dt.size else float("nan")
         data["color"] = self.color or ""
+        data["static"] = is_static(sim)
         data["colorRange"] = _pair(shown)
         data["fields"] = {
             name: {"title": field_label(name)[0], "units": field_label(name)[1], "range": _pair(ranges[name])}

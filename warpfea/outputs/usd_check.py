@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 from typing import Any
 
 import numpy as np
 
-__all__ = ["validate_usd"]
+__all__ = ["in_words", "validate_usd"]
+
+
+def in_words(error: Exception) -> str:
+    """What USD says went wrong, without the places in its source."""
+    texts = re.findall(r" : '(.*)'\s*$", str(error), re.MULTILINE)
+    return texts[0] if texts else "USD gives no reason"
 
 
 def validate_usd(path: str | os.PathLike[str], max_samples: int = 64) -> list[str]:
@@ -22,7 +29,7 @@ def validate_usd(path: str | os.PathLike[str], max_samples: int = 64) -> list[st
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        return [f"{path}: can't be opened ({error})"]
+        return [f"{path}: can't be opened ({in_words(error)})"]
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     problems = [
         f"{error.GetName()}: {error.GetMessage()}"

@@ -6,6 +6,7 @@ import functools
 import os
 import pathlib
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -15,7 +16,7 @@ import numpy as np
 from warpfea.base.errors import OutputError
 from warpfea.base.writer import Output, check_folder, write_whole
 from warpfea.model.surfaces import reference_points
-from warpfea.outputs.frames import FrameClock, time_of
+from warpfea.outputs.frames import FrameClock, check_fields, time_of
 
 __all__ = ["VTUWriter"]
 
@@ -27,6 +28,8 @@ class VTUWriter(Output):
         folder: the target folder; made if its parent exists. Files of the same names are overwritten.
         every: write each n-th accepted step (the default, with 1). fps: or by time, as USD does. Not both.
         fields: scalar fields at the mesh nodes, SI units.
+        extend: go on with the series that is there, of the run that this one resumes; frames after the present time
+            are left out of it, and written anew.
 
     Points are the *current* positions in float64, each world where it is simulated (no grid); subtract the
     point data `displacement` for the reference shape. `velocity` is written where the simulation has it.
@@ -44,6 +47,7 @@ class VTUWriter(Output):
         every: int | None = None,
         fps: float | None = None,
         fields: Sequence[str] = ("von_mises",),
+        extend: bool = False,
     ) -> None:
         if every is not None and fps is not None:
             raise OutputError("VTUWriter takes every= or fps=, not both")
@@ -53,6 +57,7 @@ class VTUWriter(Output):
         self.every = int(every or 1)
         self.fps = None if fps is None else FrameClock(fps).fps
         self.fields = [name for name in dict.fromkeys(fields) if name not in ("displacement", "velocity")]
+        self.extend = extend
         self._open = False
 
     @property
@@ -61,6 +66,7 @@ class VTUWriter(Output):
         return self.folder / f"{self.folder.resolve().name}.pvd"
 
     def open(self, sim: Any) -> None:
+        check_fields(sim, self.fields)
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder}: is a file, not a folder")
         self._made = not self.folder.exists()
@@ -76,6 +82,29 @@ class VTUWriter(Output):
         self._frames: list[tuple[float, list[str]]] = []
         self._listed = 0
         self._names = self._file_names(sim.model.bodies)
+        self._kept = 0
+        if self.extend and self.series.is_file():
+            self._take_up(time_of(sim))
+
+    def _take_up(self, now: float) -> None:
+        """Go on with the frames of the series up to the time `now`, s."""
+        try:
+            entries = ElementTree.parse(self.series).getroot().iter("DataSet")
+            for entry in entries:
+                time, file = float(entry.attrib["timestep"]), entry.attrib["file"]
+                if time > now + 1e-9 * max(1.0, abs(now)):
+                    continue
+                if not self._frames or time != self._frames[-1][0]:
+                    self._frames.append((time, []))
+                self._frames[-1][1].append(file)
+        except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
+            self._open = False
+            raise OutputError(f"{self.series}: can't go on with this series ({error}); give another folder") from error
+        self._kept = self._listed = len(self._frames)
+        if self._frames:
+            self._last = self._frames[-1][0]
+            if self._clock:
+                self._clock.due(self._last)
 
     @staticmethod
     def _file_names(bodies: Sequence[Any]) -> list[str]:
@@ -92,7 +121,7 @@ class VTUWriter(Output):
         time = time_of(sim)
         due = self._clock.due(time) if self._clock else self._calls % self.every == 0
         self._calls += 1
-        if due:
+        if due and time > self._last:
             self._frame(sim, time)
 
     def _frame(self, sim: Any, time: float) -> None:
@@ -136,10 +165,13 @@ class VTUWriter(Output):
         """Remove the files that this run wrote, and the folder if it made it and it is empty."""
         if not self._open:
             return
-        for _, files in self._frames:
+        for _, files in self._frames[self._kept :]:
             for file in files:
                 (self.folder / file).unlink(missing_ok=True)
-        if self._listed:
+        if self._kept:
+            self._frames = self._frames[: self._kept]
+            self._write_series()
+        elif self._listed:
             self.series.unlink(missing_ok=True)
         if self._made and not any(self.folder.iterdir()):
             self.folder.rmdir()

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..base.errors import CheckpointError, OutputError
 from ..base.writer import Output, check_target, write_whole
+from .reports import idle_report
 
 __all__ = ["Checkpoint", "load_checkpoint", "read_meta", "save_checkpoint"]
 
@@ -76,7 +77,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "worlds": sim.model.worlds,
         "slots": sim.model.slots,
         "integrator": sim.integrator.name,
-        "gravity": sim.model.loads.gravity_host.tolist(),
+        "gravity": sim.model.terms.dead.gravity_host.tolist(),
         "dt": sim.dt,
         "steps": sim.steps,
         "max_residual": sim.max_residual,
@@ -130,7 +131,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     sim.max_residual = float(meta["max_residual"])
     sim.max_violation = float(meta.get("max_violation", 0.0))
     sim._history = list(history)
-    sim.last = sim._idle_report()
+    sim.last = idle_report(sim)
 
 
 def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
@@ -142,7 +143,7 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
         "slots": ("number of slots", sim.model.slots),
         "probes": ("probes", [probe.name for probe in sim.model.probes]),
         "fingerprint": ("model", sim.model.fingerprint()),
-        "gravity": ("gravity", sim.model.loads.gravity_host.tolist()),
+        "gravity": ("gravity", sim.model.terms.dead.gravity_host.tolist()),
     }
     for key, (what, value) in expected.items():
         if meta.get(key) == value:

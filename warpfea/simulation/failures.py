@@ -16,7 +16,7 @@ from ..kernels.solvers.newton import (
     FAIL_LINE_SEARCH,
     FAIL_NAN,
 )
-from ..model.evaluation import lowest_jacobian
+from ..terms.evaluation import lowest_jacobian
 from ..solvers import NewtonPCG
 
 if TYPE_CHECKING:
@@ -56,11 +56,18 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
         reason = "H is singular (a body or mechanism that nothing holds?)"
     return ConvergenceError(
-        f"step from t = {time:.6g} s with dt = {sim.dt:g} s was not accepted in world {world}: "
+        f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
         f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}",
         time=time, world=world, residuals=history, element=element, state=sim.state,
     )  # fmt: skip
+
+
+def _step_from(sim: Any, time: float) -> str:
+    """The refused step, by its time (s) or part of the load."""
+    if sim.integrator.static:
+        return f"load step from {100.0 * time:.4g} % to {100.0 * (time + sim.dt):.4g} % of the load"
+    return f"step from t = {time:.6g} s with dt = {sim.dt:g} s"
 
 
 def check_closed(sim: Any, mask: np.ndarray | None = None) -> None:
@@ -88,7 +95,7 @@ def _unsatisfied(sim: Any, world: int, time: float, halvings: int) -> Constraint
     listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
     few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
     return ConstraintError(
-        f"step from t = {time:.6g} s with dt = {sim.dt:g} s: constraints could not be satisfied in world {world} after "
+        f"{_step_from(sim, time)}: constraints could not be satisfied in world {world} after "
         f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or with "
         f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}",
         joints=names, violations=values, time=time, world=world, state=sim.state,

@@ -15,6 +15,7 @@ from typing import Any
 import warp as wp
 
 from ..base.errors import ModelError
+from ..base.names import did_you_mean
 
 __all__ = ["INTEGRATORS", "Integrator", "get"]
 
@@ -62,11 +63,13 @@ INTEGRATORS = {
 }
 
 
-def get(name: str) -> Integrator:
-    """The integrator `name`. Raises ModelError listing the names."""
+def get(name: str | Integrator) -> Integrator:
+    """The integrator `name`, or the one that is given. Raises ModelError listing the names."""
+    if isinstance(name, Integrator):
+        return name
     if name == "energy_momentum":
         raise NotImplementedError("integrator 'energy_momentum' is not part of this version")
     if name not in INTEGRATORS or name == "static":
         names = [n for n in INTEGRATORS if n != "static"]
-        raise ModelError(f"integrator {name!r} is unknown; there are {', '.join(names)}")
+        raise ModelError(f"integrator {name!r} is unknown; there are {', '.join(names)}{did_you_mean(name, names)}")
     return INTEGRATORS[name]

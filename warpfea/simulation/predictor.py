@@ -1,4 +1,4 @@
-"""The first iterate of a step, see kernels/step/predictor.py."""
+"""The predictor of a step, its first iterate: see kernels/step/predictor.py."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Predictor"]
 
 
 class Predictor:
-    """Extrapolation of velocities, of the order that served the last step best; its past is part of the state."""
+    """Extrapolates velocities in the order that fitted the last step best; the earlier ones are part of the state."""
 
     def __init__(
         self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State, module: wp.Module,
@@ -33,21 +33,21 @@ class Predictor:
             setattr(self.control, name, work.array(f"predictor {name}", (model.worlds,), wp.int32))
         self.control.sums = work.array("predictor sums", (PREDICTOR_ROWS, model.worlds), wp.float64)
         self.control.kept = state.register("predictor", wp.float64, (4,))
-        # multistep schemes keep v_{n-1} themselves
+        # multistep schemes store v_{n-1} themselves
         self.own = not multistep
         field = model.types.vec3, (model.slots,)
         before = state.register("predictor_before", *field) if self.own else state.previous_velocity
         self.past = before, state.register("predictor_first", *field)
 
     def begin(self) -> None:
-        """Put the iterate into work.v, where predict has put v_n."""
+        """Put the first iterate into work.v, where the kernel `predict` has put v_n."""
         m, w, step = self.model, self.work, self.work.step
         self.launch(self.kernels.begin, m.worlds, [self.control, step, w.newton])
         args = [self.control, step, m.topology.free, self.state.velocity, *self.past, w.v]
         self.launch(self.kernels.extrapolate, self.dim, args)
 
     def commit(self) -> None:
-        """The attempt was accepted, and is not yet the state."""
+        """After an accepted attempt, before it becomes the state: choose the next order, move the past on."""
         m, w, step = self.model, self.work, self.work.step
         args = [self.control, step, m.topology.free, m.is_position, w.diagonal, w.v, self.state.velocity, *self.past]
         self.launch(self.kernels.compare, self.dim, [*args, w.rows])

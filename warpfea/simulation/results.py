@@ -7,15 +7,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ModelError
+from ..base.names import did_you_mean
 from ..model.bodies import Body
-from ..model.evaluation import von_mises
 from ..model.state import State
 from ..model.surfaces import reference_points
+from ..terms.evaluation import von_mises
+from ..terms.term import FieldSpec
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["Results"]
+__all__ = ["FIELDS", "Results"]
+
+FIELDS = {"von_mises": FieldSpec("von Mises stress", "Pa"), "displacement": FieldSpec("displacement", "m")}
+"""Scalar fields of every model; terms have their own."""
 
 
 class Results:
@@ -56,30 +61,48 @@ class Results:
         """(B, skin points) scalars of a field at the drawn surface."""
         return self.field_on(name, body, body.skin)
 
+    @property
+    def fields(self) -> dict[str, FieldSpec]:
+        """Scalar fields there are, by name."""
+        return FIELDS | {name: spec for name, (_, spec) in self.model.terms.fields.items()}
+
+    def check_field(self, name: str) -> None:
+        """Raise ModelError, with the names there are, unless `name` is a field."""
+        known = self.fields
+        if name not in known:
+            raise ModelError(f"field {name!r} is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
+
     def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
         """(B, P) scalars of a field at the points of a Skin or Drawing of the body."""
+        self.check_field(name)
         if name == "displacement":
             moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
             return np.linalg.norm(moved, axis=2)
+        if name != "von_mises":
+            samples = body.family.node_samples.shape[1]
+            return np.stack([drawn.node_weights @ np.repeat(row, samples) for row in self.field(name, body)])
         stress = self._stress(name, body)  # the tensor is interpolated: a bent section shows its neutral axis
         return von_mises(np.stack([drawn.node_weights @ row for row in stress]))
 
     def field(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress) or "displacement" (m, magnitude).
+        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), or one of a term.
 
         The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
         """
         if not isinstance(body, Body):
             raise ModelError(f"field: expected field(name, body), got field({name!r}, {body!r})")
+        self.check_field(name)
         if name == "displacement":
             return np.linalg.norm(self.displacements(body), axis=2)
+        if name != "von_mises":
+            term, _ = self.model.terms.fields[name]
+            return term.sample(name, body, self.state)
         samples = von_mises(self._stress(name, body))
         return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
 
     def _stress(self, name: str, body: Body) -> np.ndarray:
         """(B, nodes x samples, 6) Cauchy stress, Pa, behind a field."""
-        if name != "von_mises":
-            raise ModelError(f"field {name!r} is unknown; there are von_mises, displacement")
+        assert name == "von_mises"
         return self.model.evaluation.sample_stress(self.state, body)
 
     def node_gradients(self, body: Body) -> np.ndarray:

@@ -1,14 +1,61 @@
-"""Around the step loop: closing outputs, Ctrl-C, the progress bar."""
+"""The step loop of a run: outputs, Ctrl-C, the progress bar."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-__all__ = ["close_all", "interruptible", "step_bar"]
+from ..kernels.step.step import STATUS
+
+__all__ = ["interruptible", "run_steps", "step_bar"]
+
+
+def run_steps(
+    sim: Any,
+    total: int,
+    t_end: float,
+    outputs: Sequence[Any],
+    on_step: Callable[[Any], Any] | None,
+    progress: bool | None,
+) -> None:
+    """Do `total` steps with outputs; see Simulation.run.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C came while steps were left to do; outputs are closed.
+    """
+    opened: list[Any] = []
+    cut = False
+    with interruptible() as interrupted, step_bar(total, t_end, progress, static=sim.load is not None) as bar:
+        try:
+            for out in outputs:
+                opened.append(out)
+                out.open(sim)
+            for out in opened:
+                out.write(sim)
+        except BaseException:  # nothing has been done yet: leave no half-empty files
+            for out in opened:
+                out.abort()
+            raise
+        try:
+            for done in range(1, total + 1):
+                report = sim.step()
+                for out in opened:
+                    out.write(sim)
+                bar(report)
+                if on_step is not None and on_step(sim) is False:
+                    break
+                cut = interrupted() and done < total
+                if cut or (report.status != STATUS["running"]).all():
+                    break
+        except BaseException:
+            close_all(opened, sim)
+            raise
+        close_all(opened, sim, quiet=False)
+        if cut:
+            raise KeyboardInterrupt
 
 
 def close_all(opened: list[Any], sim: Any, *, quiet: bool = True) -> None:
@@ -45,7 +92,10 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
-def step_bar(total: int, t_end: float, progress: bool | None) -> Iterator[Callable[[Any], None]]:
+def step_bar(
+    total: int, t_end: float, progress: bool | None, *, static: bool = False
+) -> Iterator[Callable[[Any], None]]:
+    """A bar on stderr with time, or load, and iterations; None: when stderr is a terminal."""
     if progress is None:
         progress = sys.stderr.isatty()
     if not progress:
@@ -56,7 +106,8 @@ def step_bar(total: int, t_end: float, progress: bool | None) -> Iterator[Callab
     with tqdm(total=total, unit="step", dynamic_ncols=True) as bar:
 
         def update(report: Any) -> None:
-            bar.set_description(f"t {report.time.min():.4g}/{t_end:g} s", refresh=False)
+            now = report.time.min()
+            bar.set_description(f"load {100.0 * now:.4g} %" if static else f"t {now:.4g}/{t_end:g} s", refresh=False)
             bar.set_postfix_str(f"newton {report.newton.max()} pcg {report.pcg.max()}", refresh=False)
             bar.update()
 

@@ -5,23 +5,26 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .. import solvers
+from ..base.console import compile_bar, quiet_warp
 from ..base.errors import ConstraintError, ConvergenceError, ModelError
-from ..kernels.step.step import LEDGER, REPORT, STATUS
+from ..base.names import did_you_mean, listing
+from ..kernels.step.step import REPORT, STATUS
 from ..kernels.terms.constraints import JOINT_COLUMNS
+from ..model.assembly import require_density
 from ..model.handles import NodeSet
 from ..model.joints import Joint
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
 from .failures import check_closed, step_error
+from .reports import JointRecord, ProbeRecord, StepReport, describe, idle_report
 from .results import Results
-from .run_loop import close_all, interruptible, step_bar
+from .run_loop import run_steps
 from .stepper import Stepper
 
 if TYPE_CHECKING:
@@ -30,65 +33,17 @@ if TYPE_CHECKING:
 __all__ = ["JointRecord", "ProbeRecord", "Simulation", "StepReport"]
 
 
-@dataclass(frozen=True, eq=False)
-class StepReport:
-    """What a step took, each an array [world].
-
-    Attributes:
-        converged: the step was accepted and is within the solver's tolerance. With wf.Jacobi a world may go on without:
-            False with status 0.
-        newton, pcg: iterations, refused attempts included; Jacobi's count as newton.
-        residual: |g| over the largest force, of the last attempt.
-        halvings: refused attempts.
-        status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
-        min_J: smallest det F; a value <= 0 means that an element turned inside out (SVK only; others refuse it).
-        time: s.
-        residual_force: |g| over the free components, N, of the last attempt.
-        violation: largest of the constraints, m.
-        outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
-    """
-
-    converged: np.ndarray
-    newton: np.ndarray
-    pcg: np.ndarray
-    residual: np.ndarray
-    halvings: np.ndarray
-    status: np.ndarray
-    min_J: np.ndarray
-    time: np.ndarray
-    failure: np.ndarray
-    violation: np.ndarray
-    outer: np.ndarray
-    residual_force: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class JointRecord:
-    """A joint over time: time (steps,); force (worlds, steps, 3), N, and moment about its anchor, N m, on the child in
-    world axes; violation (worlds, steps), m, the largest of its rows."""
-
-    time: np.ndarray
-    force: np.ndarray
-    moment: np.ndarray
-    violation: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class ProbeRecord:
-    """A probe over time: time (steps,), position, displacement and velocity (worlds, steps, 3), in m and m/s."""
-
-    time: np.ndarray
-    position: np.ndarray
-    displacement: np.ndarray
-    velocity: np.ndarray
-
-
 def check_model(model: Any) -> None:
     """Raise ModelError for what is not a Model, such as a builder."""
     from ..model.model import Model
 
     if not isinstance(model, Model):
         raise ModelError(f"expected a Model, got {type(model).__name__}; builder.finalize() makes one")
+
+
+def _check_dt(value: Any) -> None:
+    if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
+        raise ModelError(f"dt = {value!r} must be a positive finite time (s)")
 
 
 class Simulation(Results):
@@ -105,12 +60,13 @@ class Simulation(Results):
         ledger: keep the energy ledger.
         record: keep what probes and joints tell of every step, else of the last alone.
         capture: record a step as one graph, on the GPU and on the CPU; never done with linear="direct".
-        on_compile: called with (modules ready, modules in all, name) while kernels compile.
+        on_compile: called with (modules ready, modules in all, name) while kernels compile; by default a bar on stderr
+            where that is a terminal. Warp's own lines about modules are not shown, unless its log level was lowered.
         on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
             several only once all have failed.
 
     Raises:
-        ModelError: dt or an option out of range.
+        ModelError: dt or an option out of range, or a material without a density.
         ConstraintError: joints that are open at the start.
     """
 
@@ -120,7 +76,7 @@ class Simulation(Results):
         state: State | None = None,
         *,
         dt: float,
-        integrator: str = "backward_euler",
+        integrator: str | integrators.Integrator = "backward_euler",
         solver: NewtonPCG | Jacobi | str | None = None,
         constraint_tol: float | None = None,
         ledger: bool = True,
@@ -130,36 +86,12 @@ class Simulation(Results):
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
         scheme, options = integrators.get(integrator), solvers.get(solver)
-        self._start(model, state, scheme, options, ledger, capture, on_compile, constraint_tol)
-        self.dt = dt
+        check_model(model)
+        if not scheme.static:
+            require_density(model.bodies, "motion")
         if on_failure not in (None, "raise", "freeze"):
             raise ModelError(f"on_failure = {on_failure!r} is neither 'raise' nor 'freeze'")
-        self.on_failure = on_failure
-        self.record = record
-
-    @classmethod
-    def _static(
-        cls, model: Model, state: State, solver: NewtonPCG, dt: float, constraint_tol: float | None
-    ) -> Simulation:
-        """The same loop for load steps of statics."""
-        self = cls.__new__(cls)
-        self._start(model, state, integrators.INTEGRATORS["static"], solver, False, True, None, constraint_tol)
-        self.dt = dt
-        self.on_failure = "raise"
-        return self
-
-    def _start(
-        self,
-        model: Model,
-        state: State | None,
-        scheme: Any,
-        solver: NewtonPCG | Jacobi,
-        ledger: bool,
-        capture: bool,
-        on_compile: Callable[[int, int, str], None] | None = None,
-        constraint_tol: float | None = None,
-    ) -> None:
-        check_model(model)
+        _check_dt(dt)
         if constraint_tol is None:
             constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
         if not (isinstance(constraint_tol, (int, float, np.floating)) and 0.0 < constraint_tol < 1.0):
@@ -173,23 +105,29 @@ class Simulation(Results):
                 f"the state is of another model: displacement {got.shape} of {got.dtype.__name__} on {got.device}, "
                 f"expected {expected} of {model.types.vec3.__name__} on {model.device}"
             )
-        self.integrator = scheme
-        self.solver = solver
+        self.integrator, self.solver = scheme, options
+        self.on_failure, self.record = on_failure, record
         began = clock.perf_counter()
-        self.stepper = Stepper(
-            model, self.state, scheme, solver,
-            ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, on_compile=on_compile,
-        )  # fmt: skip
+        with quiet_warp(), compile_bar(None if on_compile is None else False) as bar:
+            self.stepper = Stepper(
+                model, self.state, scheme, options,
+                ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size,
+                on_compile=on_compile or bar,
+            )  # fmt: skip
         self.compile_s = clock.perf_counter() - began
+        self.dt = dt
         check_closed(self)
         self.steps = 0
         self.last: StepReport | None = None
         self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough")}
         self.max_residual = 0.0
         self.max_violation = 0.0
-        self.record = True
+        self._load: np.ndarray | None = None
         self._stepped = np.zeros(model.worlds, dtype=bool)
         self._history: list[np.ndarray] = []
+
+    def __repr__(self) -> str:
+        return describe(self)
 
     # stepping
 
@@ -200,8 +138,7 @@ class Simulation(Results):
 
     @dt.setter
     def dt(self, value: float) -> None:
-        if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
-            raise ModelError(f"dt = {value!r} must be a positive finite time (s)")
+        _check_dt(value)
         self._dt = float(value)
         self.stepper.work.step.dt.fill_(self._dt)
 
@@ -209,6 +146,13 @@ class Simulation(Results):
     def time(self) -> np.ndarray:
         """[world], s."""
         return self.state.time.numpy().copy()
+
+    @property
+    def load(self) -> np.ndarray | None:
+        """Part of the load that acts, 0 to 1, [world], of statics; None of a motion."""
+        if not self.integrator.static:
+            return None
+        return self.time if self._load is None else self._load
 
     @property
     def methods(self) -> dict[str, str]:
@@ -288,7 +232,7 @@ class Simulation(Results):
     @property
     def _recorded(self) -> bool:
         """Whether there is anything to record of each step."""
-        return bool(self.model.probes or self.model.constraints)
+        return self.model.terms.report_width > len(REPORT)
 
     def _failure(self, world: int) -> ConvergenceError | ConstraintError:
         """The error for a failed world; its status is cleared so that a caller may try again with another dt."""
@@ -317,7 +261,7 @@ class Simulation(Results):
 
         Raises:
             ConvergenceError, ConstraintError, OutputError: the outputs hold what came before.
-            KeyboardInterrupt: after Ctrl-C, once outputs are closed.
+            KeyboardInterrupt: after Ctrl-C, once outputs are closed; not when no step was left to do.
         """
         if not math.isfinite(t_end):
             raise ModelError(f"t_end = {t_end!r} must be finite")
@@ -326,46 +270,10 @@ class Simulation(Results):
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
         total = max(0, round((t_end - now) / self._dt))
-        opened: list[Any] = []
-        with interruptible() as interrupted, step_bar(total, t_end, progress) as bar:
-            try:
-                for out in outputs:
-                    opened.append(out)
-                    out.open(self)
-                for out in opened:
-                    out.write(self)
-            except BaseException:  # nothing has been done yet: leave no half-empty files
-                for out in opened:
-                    out.abort()
-                raise
-            try:
-                for _ in range(total):
-                    report = self.step()
-                    for out in opened:
-                        out.write(self)
-                    bar(report)
-                    if (
-                        (on_step is not None and on_step(self) is False)
-                        or interrupted()
-                        or (report.status != STATUS["running"]).all()
-                    ):
-                        break
-            except BaseException:
-                close_all(opened, self)
-                raise
-            close_all(opened, self, quiet=False)
-            if interrupted():
-                raise KeyboardInterrupt
+        run_steps(self, total, t_end, outputs, on_step, progress)
         if self.last is None:
-            self.last = self._idle_report()
+            self.last = idle_report(self)
         return self.last
-
-    def _idle_report(self) -> StepReport:
-        B = self.model.worlds
-        zero, none = np.zeros(B, int), np.zeros(B)
-        return StepReport(
-            self.status == 0, zero, zero, none, zero, self.status, none, self.time, zero, none, zero, none
-        )
 
     def freeze(self, worlds: Any) -> None:
         """Leave worlds (indices or mask) as they are from now on."""
@@ -388,8 +296,8 @@ class Simulation(Results):
         self.state.load(values)
         self.stepper.forget(mask)
         self._stepped[mask] = False
+        self.stepper.start_terms()
         if self.model.constraints:
-            self.stepper.begin_constraints()
             check_closed(self, mask)
         if self.stepper.ledger:
             self.stepper.begin_ledger(mask)
@@ -400,7 +308,7 @@ class Simulation(Results):
         """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""
         names = [p.name for p in self.model.probes]
         if name not in names:
-            raise ModelError(f"probe {name!r} is unknown; there are {names}")
+            raise ModelError(f"probe {name!r} is unknown; there are: {listing(names)}{did_you_mean(name, names)}")
         k = names.index(name)
         table = self._table([0, *range(1 + 6 * k, 7 + 6 * k)])
         d, v = table[:, :, 1:4], table[:, :, 4:7]
@@ -425,12 +333,7 @@ class Simulation(Results):
         """
         if not self.stepper.ledger:
             raise ModelError("energies: the simulation was made with ledger=False")
-        table = self.state.ledger.numpy()
-        out = {name: table[:, k].copy() for k, name in enumerate(LEDGER)}
-        out["work"] = out["work_loads"] + out["work_supports"] + out["work_fields"] + out["work_joints"]
-        out["contact"] = np.zeros(len(table))
-        out["friction"] = np.zeros(len(table))
-        return out
+        return self.model.terms.energies(self.state.ledger.numpy())
 
     def reaction(self, nodes: NodeSet) -> np.ndarray:
         """Force of the supports on the prescribed components of nodes at the last accepted step, (B, 3), N.
@@ -448,7 +351,7 @@ class Simulation(Results):
 
     def joint_record(self, joint: Joint | str) -> JointRecord:
         """What has been recorded of a joint (handle or name), one entry per step."""
-        first = 1 + 6 * len(self.model.probes) + JOINT_COLUMNS * self._joint(joint).index
+        first = 1 + self._joint_column(joint) - len(REPORT)
         columns = [0, *range(first, first + JOINT_COLUMNS)]
         table = self._table(columns)
         return JointRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
@@ -458,8 +361,7 @@ class Simulation(Results):
 
         (B, 6) in world axes; `joint_record` has them over time. NaN as for `reaction`.
         """
-        k = self._joint(joint).index
-        first = len(REPORT) + 6 * len(self.model.probes) + JOINT_COLUMNS * k
+        first = self._joint_column(joint)
         out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
         out[~self._stepped] = np.nan
         return out
@@ -471,7 +373,7 @@ class Simulation(Results):
         assert constraints is not None
         values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
         # where the last step has brought it, the right sides are that step's: statics runs in a time of its own
-        column = len(REPORT) + 6 * len(self.model.probes) + JOINT_COLUMNS * k + 6
+        column = self._joint_column(joint) + 6
         return np.where(self._stepped, self.stepper.work.report.numpy()[:, column], values)
 
     def joint_value(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
@@ -486,6 +388,11 @@ class Simulation(Results):
         assert constraints is not None
         return constraints.measure(known, what, self.state)
 
+    def _joint_column(self, joint: Joint | str) -> int:
+        """First column of a joint in the report of a step."""
+        known = self._joint(joint)
+        return self.model.terms.constraints.report_offset + JOINT_COLUMNS * known.index
+
     def _joint(self, joint: Joint | str) -> Joint:
         """A joint of this model, by handle or name."""
         known = self.model.constraints.joints if self.model.constraints else []
@@ -495,7 +402,7 @@ class Simulation(Results):
         names = [j.name for j in known]
         raise ModelError(
             f"expected a joint of this model (a handle from add_joint, add_constraint or weld, or a name), "
-            f"got {joint!r}; it has {names}"
+            f"got {joint!r}; it has: {listing(names)}{did_you_mean(joint, names) if isinstance(joint, str) else ''}"
         )
 
     def contact_report(self, *pair: Any) -> Any:

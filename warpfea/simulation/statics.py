@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..base.errors import ModelError
+from ..model.assembly import require_density
 from ..model.state import State
 from ..solvers import NewtonPCG
+from .integrators import INTEGRATORS
 from .simulation import Simulation, StepReport, check_model
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["StaticResult", "solve_static"]
+__all__ = ["StaticResult", "begin_static", "run_static", "solve_static"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StaticResult:
     """A static solution.
 
@@ -35,6 +38,10 @@ class StaticResult:
     simulation: Simulation
     newton: np.ndarray
     pcg: np.ndarray
+
+    def __repr__(self) -> str:
+        count = f"{self.simulation.steps} load step{'s' * (self.simulation.steps != 1)}"
+        return f"StaticResult({count}, {int(self.newton.max())} Newton, {int(self.pcg.max())} PCG iterations)"
 
     def probe(self, name: str) -> Any:
         """The probe `name`, with one entry per load step; the last is at full load."""
@@ -77,6 +84,7 @@ def solve_static(
     solver: NewtonPCG | None = None,
     state: State | None = None,
     constraint_tol: float | None = None,
+    outputs: Sequence[Any] = (),
     progress: bool | None = False,
 ) -> StaticResult:
     """Find the static equilibrium.
@@ -90,15 +98,38 @@ def solve_static(
         solver: NewtonPCG options; by default with room for slender bodies, max_pcg = 20000.
         constraint_tol: as of Simulation.
         state: start; by default model.state(). It is copied.
+        outputs: writers (PNGWriter, USDWriter, VTUWriter, ...), which get each load step as a state; what they say of
+            time is the part of the load, 0 to 1, and pictures are labelled "load 100 %".
+        progress: show a bar on stderr; None: when stderr is a terminal.
 
     Raises:
-        ModelError: a body is not supported, or an option is out of range.
+        ModelError: a body is not supported, gravity acts on a material without a density, or an option is out of range.
         ConvergenceError: a load step was not accepted after all halvings.
         ConstraintError: the same, and it is the constraints that can't be satisfied.
+        OutputError: an output can't be written.
+        KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """
-    if not (isinstance(load_steps, (int, np.integer)) and load_steps >= 1):
+    options: dict[str, Any] = {"load_steps": load_steps, "tol": tol, "solver": solver, "state": state}
+    sim = begin_static(model, constraint_tol=constraint_tol, **options)
+    return run_static(sim, outputs=outputs, progress=progress)
+
+
+def begin_static(
+    model: Model,
+    *,
+    load_steps: int = 10,
+    tol: float | None = None,
+    solver: NewtonPCG | None = None,
+    state: State | None = None,
+    constraint_tol: float | None = None,
+    on_compile: Callable[[int, int, str], None] | None = None,
+) -> Simulation:
+    """The loop of `solve_static` before its first load step; ModelError as there. `on_compile` as of Simulation."""
+    if isinstance(load_steps, bool) or not (isinstance(load_steps, (int, np.integer)) and load_steps >= 1):
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number")
     check_model(model)
+    if np.any(model.terms.dead.gravity_host):
+        require_density(model.bodies, "gravity")
     model.check_static_supports()
     if not isinstance(solver, (NewtonPCG, type(None))):
         raise ModelError(f"solve_static: solver = {solver!r} must be wf.NewtonPCG(...): an equilibrium is to be found")
@@ -109,8 +140,16 @@ def solve_static(
         options = replace(options, tol=tol)
     start = model.state() if state is None else state.like()
     start.time.zero_()
-    sim = Simulation._static(model, start, options, 1.0 / load_steps, constraint_tol)
-    sim.run(1.0, progress=progress)
+    return Simulation(
+        model, start, dt=1.0 / load_steps, integrator=INTEGRATORS["static"], solver=options, ledger=False,
+        on_failure="raise", constraint_tol=constraint_tol, on_compile=on_compile,
+    )  # fmt: skip
+
+
+def run_static(sim: Simulation, *, outputs: Sequence[Any] = (), progress: bool | None = False) -> StaticResult:
+    """Do the load steps of a simulation made by `begin_static`; see `solve_static`."""
+    sim.run(1.0, outputs=outputs, progress=progress)
     assert sim.last is not None
-    start.time.zero_()  # what starts from the equilibrium starts at t = 0
+    sim._load = sim.time  # what is drawn of it later is at this load
+    sim.state.time.zero_()  # what starts from the equilibrium starts at t = 0
     return StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"])

@@ -13,9 +13,10 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
-from ..kernels.step.step import LEDGER, LEDGER_ROWS, REPORT, step_kernels
+from ..kernels.step.step import LEDGER_ROWS, REPORT, step_kernels
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_loop
+from ..terms.term import At, Term
 from ..terms.workspace import Workspace
 from .integrators import Integrator
 from .predictor import Predictor
@@ -49,13 +50,10 @@ class Stepper:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
         self.ledger, self.on_compile = ledger, on_compile
         self.launch = Launcher(model.device)
+        self.terms = model.terms
+        self.launch.parts |= model.terms.parts
         self.kernels = step_kernels(
-            model.dtype,
-            integrator.coefficients,
-            integrator.static,
-            integrator.multistep,
-            model.loads.nonpotential,
-            model.constraints is not None,
+            model.dtype, integrator.coefficients, integrator.static, integrator.multistep, model.terms.traits
         )
         vec3 = model.types.vec3
         state.sealed = False
@@ -65,16 +63,17 @@ class Stepper:
             state.register("previous_step", wp.float64)
             state.register("previous_end", wp.float64)
         if ledger:
-            state.register("ledger", wp.float64, (len(LEDGER),))
+            state.register("ledger", wp.float64, (len(model.terms.ledger),))
             state.register("ledger_time", wp.float64)
         state.register("status", wp.int32)
-        if model.constraints:
-            state.register("constraint_force", wp.float64, (model.constraints.count,))
-            state.register("constraint_target", wp.float64, (model.constraints.count,), np.nan)
+        self.u_before = state.previous_displacement if integrator.multistep else state.displacement
+        self.v_before = state.previous_velocity if integrator.multistep else state.velocity
         self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger)
-        self.newton = make_loop(
-            model, self.work, self.launch, solver, inertia=not integrator.static, constraint_tol=constraint_tol
-        )
+        self.at = At(model, self.work, self.launch, state, self.u_before, inertia=not integrator.static)
+        for term in self.terms:
+            term.register(self.at)
+            term.allocate(self.work, self.at)
+        self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol)
         self.newton.register(state)
         self.predictor: Predictor | None = None
         # single roundings would grow from step to step, and so would what Jacobi's steps leave
@@ -88,8 +87,7 @@ class Stepper:
         state.sealed = True
         self.backup = state.like() if solver.max_halvings > 0 else None
         self._load_modules()
-        if model.constraints:
-            self.begin_constraints()
+        self.start_terms()
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -100,7 +98,7 @@ class Stepper:
         w, state = self.work, self.state
         w.step.time = state.time
         w.step.status = state.status
-        w.step.gravity = self.model.loads.gravity
+        w.step.gravity = self.terms.dead.gravity
         w.step.any_running = self.running
         w.step.max_halvings = self.solver.max_halvings
         if self.integrator.multistep:
@@ -108,23 +106,21 @@ class Stepper:
             w.step.previous_end = state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
-        self.u_before = state.previous_displacement if self.integrator.multistep else state.displacement
-        self.v_before = state.previous_velocity if self.integrator.multistep else state.velocity
+            self.booked = self.terms.booked(w)
 
-    def begin_constraints(self) -> None:
-        """Right sides at the state's time, where the state does not know them, and the violation at the start."""
+    def start_terms(self) -> None:
+        """The state was set: the terms follow it."""
+        following = [term for term in self.terms if type(term).start is not Term.start]
+        if not following:
+            return
         m, w, state = self.model, self.work, self.state
-        constraints = self.newton.constraints
-        assert constraints is not None
         active = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
         w.step.new_time.assign(state.time)
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
         self._laws(active)
         w.u.assign(state.displacement)
-        constraints.start(state.constraint_force, state.constraint_target, active)
-        constraints.evaluate(active)
-        known = state.constraint_target.numpy()
-        state.constraint_target.assign(np.where(np.isnan(known), w.multipliers.target.numpy(), known))
+        for term in following:
+            term.start(self.at, active)
 
     def begin_ledger(self, mask: np.ndarray) -> None:
         """Measure the ledger of the chosen worlds from the present state; what has added up stays."""
@@ -133,12 +129,16 @@ class Stepper:
         kernel = self.newton.residual.gather.mass_product
         Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
         u = self.state.displacement.numpy().astype(float)
-        fresh = np.zeros((m.worlds, len(LEDGER)))
+        columns = list(m.terms.ledger)
+        fresh = np.zeros((m.worlds, len(columns)))
         fresh[:, 0] = rows.numpy()[0].sum(axis=1)
         fresh[:, 1] = m.strain_energy(self.state)
-        fresh[:, 2] = -np.einsum("bc,s,bsc->b", m.loads.gravity_host, m.lumped_host, u)
+        fresh[:, 2] = -np.einsum("bc,s,bsc->b", m.terms.dead.gravity_host, m.lumped_host, u)
         ledger = self.state.ledger.numpy()
         ledger[mask, :3] = fresh[mask, :3]
+        for term in self.terms:
+            for name, values in term.measure(self.at).items():
+                ledger[mask, columns.index(name)] = values[mask]
         self.state.ledger.assign(ledger)
         self.state.ledger_time.assign(self.state.time)
 
@@ -158,18 +158,10 @@ class Stepper:
         from ..kernels.common.reduce import reduce_kernels
         from ..kernels.common.state import state_kernels
 
-        m = self.model
         out = {self.kernels.module, reduce_kernels().module}
-        out |= self.newton.modules()
-        out |= {kernel.module for kernel in m.loads.used_kernels()}
+        out |= self.newton.modules() | self.terms.modules(self.at)
         if self.backup is not None:
             out.add(state_kernels().module)
-        if not self.integrator.static:
-            out |= {b.kernels.viscous_force.module for b in m.blocks if b.key.damping == "explicit"}
-            out |= {b.kernels.strain_history.module for b in m.blocks if b.key.damping == "incremental"}
-        if m.constraints:
-            assert self.newton.constraints is not None
-            out |= {m.constraints.kernels.module, self.newton.constraints.deflation.module}
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
@@ -179,7 +171,7 @@ class Stepper:
         m = self.model
         modules = {module.name: module for module in self.modules()}
         if self.ledger:
-            extra = [b.kernels_for(m.dtype, None).module for b in m.blocks] + [gather_kernels(m.dtype, False).module]
+            extra = [b.kernels_for(m.dtype, None).module for b in m.blocks] + [gather_kernels(m.dtype).module]
             modules |= {module.name: module for module in extra}
         with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
             load = partial(wp.force_load, m.device, max_workers=0)
@@ -232,10 +224,8 @@ class Stepper:
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
             self._probe()
-        if m.constraints:
-            args = [m.constraints.data, w.multipliers, m.constraints.joint_data, self.state.displacement]
-            args += [self.state.constraint_force, len(REPORT) + 6 * len(m.probes), w.report]
-            launch(m.constraints.kernels.joint_report, (m.worlds, len(m.constraints.joints)), args)
+        for term in self.terms:
+            term.report(self.at)
 
     def _attempt(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
@@ -253,11 +243,10 @@ class Stepper:
         launch(self.kernels.predict, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
         if self.predictor:
             self.predictor.begin()
-        self._loads(running)
-        self._damping(running)
-        constraints = self.newton.constraints
-        if constraints:
-            constraints.start(state.constraint_force, state.constraint_target, running)
+        self._laws(running)
+        self.terms.supports.drive(self.at, running)
+        for term in self.terms:
+            term.begin(self.at, running)
         self.newton.run()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
         self.commit()
@@ -275,60 +264,15 @@ class Stepper:
             self.predictor.commit()
         args = [w.step, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
         launch(self.kernels.commit, self.dim, args)
-        if self.newton.constraints:
-            self.newton.constraints.commit(state.constraint_force, state.constraint_target, w.step.accepted)
+        for term in self.terms:
+            term.commit(self.at, w.step.accepted)
         self.newton.commit(w.step.accepted)
 
     @labelled("loads")
-    def _loads(self, active: wp.array) -> None:
-        self._laws(active)
-        m, w, launch, loads = self.model, self.work, self.launch, self.model.loads
-        k = loads.kernels
-        if loads.has_dead:
-            args = [loads.dead_start, loads.dead_law, loads.dead_weight, w.law_value, m.lumped, loads.gravity]
-            launch(k.dead_load, self.dim, [*args, w.step.ramp, active, w.dead, w.dead_magnitude])
-        if loads.moved:
-            d = loads.moved
-            args = [d.slot, d.law, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
-            launch(k.drive_displacement, (m.worlds, d.count), args)
-        if loads.turned:
-            d = loads.turned
-            args = [d.slot, d.law, d.components, d.arm, d.axis, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
-            launch(k.drive_rotation, (m.worlds, d.count), args)
-
     def _laws(self, active: wp.array) -> None:
         """Values of the time laws at the end of the attempt."""
-        m, w, launch, loads = self.model, self.work, self.launch, self.model.loads
-        k = loads.kernels
-        if loads.law_count:
-            launch(
-                k.evaluate_laws,
-                (m.worlds, loads.law_count),
-                [loads.laws, w.step.new_time, w.step.ramp, active, w.law_value],
-            )
-            for kernel, law in loads.function_laws:
-                launch(kernel, m.worlds, [law, w.step.new_time, active, w.law_value])
-
-    @labelled("loads")
-    def _damping(self, active: wp.array) -> None:
-        m, w, launch, state = self.model, self.work, self.launch, self.state
-        if self.integrator.static:
-            return
-        explicit = any(b.key.damping == "explicit" for b in m.blocks)
-        if explicit:
-            w.contribution.zero_()  # the gather below sums the entries of all blocks
-        for block in m.blocks:
-            dim = (m.worlds, block.count)
-            if block.key.damping == "incremental":
-                args = [block.data, state.displacement, self.u_before, w.step.a0, w.step.a1, active, w.history]
-                launch(block.kernels.strain_history, dim, args)
-            elif block.key.damping == "explicit":
-                args = [block.data, state.displacement, state.velocity, active, w.contribution, w.explicit_power]
-                launch(block.kernels.viscous_force, dim, args)
-        if explicit:
-            gather = self.newton.residual.gather.gather_force
-            launch(gather, self.dim, [m.topology, w.contribution, active, w.explicit])
-            launch(m.loads.kernels.add_explicit, self.dim, [w.explicit, active, w.dead])
+        w = self.work
+        self.terms.laws.evaluate(self.launch, w.step.new_time, w.step.ramp, active, w.law_value)
 
     def _book(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
@@ -338,14 +282,8 @@ class Stepper:
         args = [w.step, topo, w.balance, m.lumped, state.displacement, state.velocity]
         launch(self.kernels.ledger_rows, self.dim, args)
         reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
-        if any(b.key.damping == "explicit" for b in m.blocks):
-            args = [w.explicit, w.u, state.displacement, accepted, w.rows]
-            launch(m.loads.kernels.work_rows, self.dim, args)
-            reduce(w.rows, 1, accepted, w.explicit_work)
-        if self.newton.constraints:
-            self.newton.constraints.work_terms(state.displacement, state.constraint_target, accepted)
-            reduce(w.multipliers.rows, 2, accepted, w.constraint_work)
-        args = [w.step, w.newton, w.ledger_sums, w.explicit_work[0], w.constraint_work, state.ledger]
+        self.terms.book(self.at, reduce, accepted)
+        args = [w.step, w.newton, w.ledger_sums, self.booked, state.ledger]
         launch(self.kernels.ledger_update, m.worlds, args)
 
     def _upload_probes(self) -> list[wp.array]:

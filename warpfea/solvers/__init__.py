@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..base.errors import ModelError
+from ..terms.term import At
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
 
@@ -26,8 +27,8 @@ def get(solver: Any) -> NewtonPCG | Jacobi:
     raise ModelError(f"solver = {solver!r} is unknown; there are {names}, or options such as wf.NewtonPCG(...)")
 
 
-def make_loop(model: Any, work: Any, launch: Any, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
+def make_loop(at: At, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
     """The loop that the options describe."""
     if isinstance(options, Jacobi):
-        return JacobiLoop(model, work, launch, options, **more)
-    return NewtonLoop(model, work, launch, options, **more)
+        return JacobiLoop(at, options, **more)
+    return NewtonLoop(at, options, **more)

@@ -1,6 +1,6 @@
 """H as a matrix of 3x3 blocks: its pattern, and its assembly on the device in a fixed order.
 
-It is what preconditioners and direct solvers are made from, and the operator itself where a product with the matrix is
+Preconditioners and direct solvers are made from it, and it is the operator itself where a product with the matrix is
 cheaper than one with the elements (many quadrature points per slot).
 """
 
@@ -16,7 +16,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.common.structs import pattern_struct
 from ..kernels.elements.matrix import panels_of, rows_type
-from ..kernels.solvers.blocks import assembly_kernels, block_kernels, coupling_struct
+from ..kernels.solvers.blocks import assembly_kernels, block_kernels
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -27,7 +27,7 @@ __all__ = ["Assembled", "Pattern", "coupled_slots", "make_pattern", "shaped"]
 
 
 def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
-    """For each entry (i, j) of a symmetric pattern with sorted rows the entry (j, i)."""
+    """(entries,) place of the entry (j, i) for each entry (i, j) of a symmetric pattern with sorted rows."""
     rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
     return np.lexsort((rows, graph.indices)).argsort()
 
@@ -39,16 +39,24 @@ class Pattern:
     Attributes:
         graph: the pattern on the host, rows sorted.
         data: the device struct.
-        upper: (m, 4) entry, mirror, row, column of the diagonal and above.
+        upper: (m, 4) (entry, its transpose, row, column) of the blocks on the diagonal and above.
     """
 
     graph: sp.csr_matrix
     data: Any
     upper: np.ndarray
 
+    def find(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Indices into `upper` of entries (row, column) on or above the diagonal; -1 for others."""
+        n = np.int64(self.graph.shape[0])
+        key = self.upper[:, 2].astype(np.int64) * n + self.upper[:, 3]
+        wanted = np.asarray(rows).astype(np.int64) * n + columns
+        at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+        return np.where(key[at] == wanted, at, -1)
+
     @property
     def width(self) -> int:
-        """Mean entries of a row."""
+        """Mean number of blocks in a row."""
         return self.entries // max(self.graph.shape[0], 1)
 
     @property
@@ -58,7 +66,7 @@ class Pattern:
 
 
 def make_pattern(model: Model, graph: sp.csr_matrix, *, mirrored: bool = True) -> Pattern:
-    """Upload a pattern; without `mirrored` it is only read."""
+    """A pattern and its device struct; `mirrored=False` leaves out `upper`, which only assembly needs."""
     data = pattern_struct()()
     data.start = model.array("matrix pattern", graph.indptr, wp.int32)
     data.column = model.array("matrix pattern", graph.indices, wp.int32)
@@ -73,12 +81,11 @@ def make_pattern(model: Model, graph: sp.csr_matrix, *, mirrored: bool = True) -
 
 
 def coupled_slots(model: Model) -> sp.csr_matrix:
-    """Which slots share an element or a row of the constraints, rows sorted."""
+    """Which slots share an element or an item of a term, rows sorted."""
     if "coupled slots" not in model.cache:
-        graph, con = model.graph(), model.constraints
-        if con is not None:
-            row = con.term_host // 3
-            touched = sp.csr_matrix((np.ones(len(row), dtype=np.int8), (row, con.slot_host)), (con.count, model.slots))
+        graph = model.graph()
+        for item, slot, count in filter(None, (term.incidence() for term in model.terms)):
+            touched = sp.csr_matrix((np.ones(len(item), dtype=np.int8), (item, slot)), (count, model.slots))
             touched.data[:] = 1
             graph = graph + sp.csr_matrix(touched.T.astype(np.int32) @ touched.astype(np.int32)).astype(np.int8)
         graph = graph.tocsr()
@@ -88,12 +95,12 @@ def coupled_slots(model: Model) -> sp.csr_matrix:
 
 
 class Assembled:
-    """Assembly of the elements' part of H, c_M M + (dq/dv) K, and on request of the penalties of the constraints.
+    """Assembly of the elements' part of H, c_M M + (dq/dv) K; terms add their `blocks` to it.
 
     Prescribed components have rows and columns of zeros.
 
     Attributes:
-        whole: a thread does the matrix of a whole element, as on the CPU; else one of its columns.
+        whole: a thread computes the matrix of a whole element (CPU); else one column of it (GPU).
     """
 
     def __init__(
@@ -104,7 +111,7 @@ class Assembled:
         self.whole = not model.device.is_cuda if whole is None else whole
         if "matrix" not in model.cache:
             model.cache["matrix"] = self._make_tables()
-        self.pattern, self.mass, self.couplings, self.coupled = model.cache["matrix"]
+        self.pattern, self.mass = model.cache["matrix"]
         self.runs = self._runs()
         name = f"contributions to the matrix, {'whole elements' if self.whole else 'columns'}"
         if name not in model.cache:
@@ -116,20 +123,17 @@ class Assembled:
         self.lines = work.array("element gradients", (model.worlds, points), model.types.vec3)
         self.scratch = work.array("element matrices", (model.worlds, S), model.types.vec3)
 
-    def _make_tables(self) -> tuple[Pattern, wp.array, Any, int]:
-        """Pattern, masses of its upper entries, and what constraints add."""
+    def _make_tables(self) -> tuple[Pattern, wp.array]:
+        """Make the pattern and the masses of its upper entries."""
         model = self.model
         pattern = make_pattern(model, coupled_slots(model))
-        mass = model.array("matrix pattern", self._mass_of(pattern), model.types.T)
-        return pattern, mass, *(self._couple(pattern) if model.constraints else (None, 0))
+        return pattern, model.array("matrix pattern", self._mass_of(pattern), model.types.T)
 
     def modules(self) -> set[wp.Module]:
         """Modules that assembly launches."""
         out = {(k.element_rows if self.whole else k.element_matrix).module for k in self.element_kernels}
         out |= {self.assembly(block).module for block in self.model.blocks}
-        if self.model.constraints:
-            out.add(self.common.coupling_module)
-        return out
+        return out | {module for term in self.model.terms for module in term.block_modules()}
 
     def _runs(self) -> list[list[tuple[Any, Any]]]:
         """Blocks and their kernels; parts of one energy, which have the same elements, together."""
@@ -190,37 +194,8 @@ class Assembled:
         at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
         return np.where(key[at] == wanted, mass.data[at], 0.0)
 
-    def _couple(self, pattern: Pattern) -> tuple[Any, int]:
-        """Entries that constraints add to, with their pairs of vectors."""
-        model, con = self.model, self.model.constraints
-        assert con is not None
-        upper = pattern.upper
-        n = np.int64(model.slots)
-        key = upper[:, 2].astype(np.int64) * n + upper[:, 3]
-        items, term_a, term_b, weight = [], [], [], []
-        for row in range(con.count):
-            first, last = con.start_host[3 * row], con.start_host[3 * row + 3]
-            slot, term, w = con.slot_host[first:last], con.term_host[first:last], con.weight_host[first:last]
-            i, j = np.meshgrid(np.arange(len(slot)), np.arange(len(slot)), indexing="ij")
-            keep = slot[i] <= slot[j]
-            i, j = i[keep], j[keep]
-            items.append(np.searchsorted(key, slot[i].astype(np.int64) * n + slot[j]))
-            term_a.append(term[i])
-            term_b.append(term[j])
-            weight.append(w[i] * w[j])
-        item = np.concatenate(items)
-        order = np.argsort(item, kind="stable")
-        entry, count = np.unique(item, return_counts=True)
-        data = coupling_struct()()
-        data.entry = model.array("matrix pattern", entry, wp.int32)
-        data.start = model.array("matrix pattern", np.concatenate([[0], np.cumsum(count)]), wp.int32)
-        data.term_a = model.array("matrix pattern", np.concatenate(term_a)[order], wp.int32)
-        data.term_b = model.array("matrix pattern", np.concatenate(term_b)[order], wp.int32)
-        data.weight = model.array("matrix pattern", np.concatenate(weight)[order], wp.float64)
-        return data, len(entry)
-
     def values(self, name: str) -> wp.array:
-        """Room for the blocks, [world, entry]."""
+        """A new array for the blocks, [world, entry]."""
         return self.work.array(name, (self.model.worlds, self.pattern.entries), self.model.types.mat33)
 
     def assemble(
@@ -228,7 +203,7 @@ class Assembled:
     ) -> None:
         """out = c_M M + (dq/dv) K at u; `factors` are c_M and dq/dv per world.
 
-        `projected`: K without what can make it indefinite at a point, and a function of u and the factors alone.
+        `projected`: K is made positive semi-definite at each quadrature point, and depends on u and the factors alone.
         """
         m, w, launch = self.model, self.work, self.launch
         mass_factor, dq_dv = factors
@@ -254,13 +229,6 @@ class Assembled:
             args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]
             launch(self.assembly(block).add_elements, (m.worlds, len(self.pattern.upper)), args)
 
-    def add_constraints(
-        self, gradient: wp.array, stiffness: wp.array, dq_dv: wp.array, active: wp.array, out: wp.array
-    ) -> None:
-        """out += (dq/dv) J^T rho J."""
-        args = [self.model.topology, self.pattern.data, self.couplings, gradient, stiffness, dq_dv, active, out]
-        self.launch(self.common.add_constraints, (self.model.worlds, self.coupled), args)
-
     def matrix(self, values: wp.array, world: int = 0) -> sp.csr_matrix:
         """The blocks of one world as (3 slots, 3 slots) CSR on the host."""
         graph = self.pattern.graph
@@ -270,7 +238,7 @@ class Assembled:
 
 
 def shaped(array: wp.array, shape: tuple[int, ...], dtype: Any = None) -> wp.array:
-    """The beginning of an array under another shape, and type."""
+    """The beginning of an array seen with another shape and type."""
     out: Any = wp.array(ptr=array.ptr, dtype=dtype or array.dtype, shape=shape, device=array.device)
     out._owner = array
     return out

@@ -1,12 +1,12 @@
-"""A matrix of 3x3 blocks factored as a whole in a band, where one is narrow: chains of beams, strips, slender bars.
+"""Banded Cholesky factors of the whole matrix, for models with a narrow band: chains of beams, strips, slender bars.
 
-Measured on one core, ms per step, levels of tiles and this: bars of T10 with 1 x 1, 2 x 2 and 3 x 3 cells across
-(bandwidth 84, 208 and 392) 10.9 and 1.0, 38 and 4.4, 40 and 10.6; 100 links of E = 7e12 Pa on joints 43 and 5.2 (413
-with 3x3 blocks); a square plate of 16 x 16 shells (404) 17.4 and 11.5 in vibration, but 29 and 41 where it turns and
-bends so fast that factors last for few steps. Wider bands lose more than that.
+Measured on one core, ms per step with the two-level preconditioner and with the band: bars of T10 with 1 x 1, 2 x 2 and
+3 x 3 cells across (bandwidth 84, 208 and 392) 10.9 and 1.0, 38 and 4.4, 40 and 10.6; 100 links of E = 7e12 Pa on joints
+43 and 5.2 (413 with 3x3 blocks); a square plate of 16 x 16 shells (404) 17.4 and 11.5 in vibration, but 29 and 41 where
+it turns and bends so fast that factors last for few steps only. Wider bands do worse.
 
-A band that costs little beside its matrix is factored with every matrix that the operator takes, which leaves one
-iteration of PCG per solve; a wider one is kept by the rule of kernels/solvers/reuse.py.
+Where a factorisation costs little beside the matrix itself, every matrix of the operator is factored, which leaves one
+iteration of PCG per solve; wider bands are factored when the rule of kernels/solvers/reuse.py says so.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
 __all__ = ["Band", "BandFactor", "find_band"]
 
 WIDEST = 112
-"""Blocks beside the diagonal of a band, at most, where it is chosen: beyond, levels of tiles are cheaper."""
+"""Widest band that is chosen by itself, blocks beside the diagonal; beyond, the two-level preconditioner is cheaper."""
 WHOLE_SLOTS = 160
-"""A model of up to so many slots is treated as a whole: here in a band of any width, without one as a dense matrix."""
+"""A model of up to this many slots is factored as a whole: here in a band of any width, or else as a dense matrix."""
 LARGEST = 2**31
-"""Bytes of the factors of a world from which they are not addressed."""
+"""Bytes of the factors of a world from which on 32-bit indices can't address them."""
 ASSEMBLY, FACTORISATION = 1.0, 5.5e-5
-"""Times per unknown, us, on one core: making H of 3243 and T10 elements; a factorisation, per bandwidth squared."""
+"""us per unknown on one core: assembling H of 3243 and T10 elements; a factorisation, per square of the bandwidth."""
 PRODUCT, SOLUTION = 0.06, 5.4e-4
-"""H p; and a solution, per bandwidth."""
+"""us per unknown on one core: H p; forward and backward substitution, per bandwidth."""
 
 
 @dataclass(eq=False)
@@ -48,7 +48,8 @@ class Band:
 
     Attributes:
         slot_at, place_of: (slots,) on the device, the order and its inverse.
-        rows: blocks of the diagonal. width: blocks beside the diagonal.
+        rows: 4 x 4 blocks on the diagonal.
+        width: blocks beside the diagonal in a row.
     """
 
     slot_at: wp.array
@@ -58,18 +59,22 @@ class Band:
 
     @property
     def rebuild_cost(self) -> float:
-        """Making it, in iterations of PCG."""
+        """Cost of the matrix and its factors, in iterations of PCG."""
         b = BLOCK * self.width
         return (ASSEMBLY + FACTORISATION * b * b) / (PRODUCT + SOLUTION * b)
 
     @property
     def quick(self) -> bool:
-        """Whether a factorisation costs little beside the matrix."""
+        """Whether a factorisation costs little beside assembling the matrix."""
         return FACTORISATION * (BLOCK * self.width) ** 2 < 0.2 * ASSEMBLY
 
 
 def find_band(model: Model, *, any_width: bool = False) -> Band | None:
-    """The band in the order of reverse Cuthill and McKee, if it is narrow or the model small; or of `any_width`."""
+    """The band in the reverse Cuthill-McKee order if it is narrow or the model small, or with `any_width`; else None.
+
+    Raises:
+        ModelError: with `any_width`, factors too large to address.
+    """
     name = "band" if any_width else "narrow band"
     if name not in model.cache:
         model.cache[name] = _find_band(model, any_width)
@@ -80,7 +85,7 @@ def _find_band(model: Model, any_width: bool) -> Band | None:
     graph = coupled_slots(model)
     n = graph.shape[0]
     free = any_width or n <= WHOLE_SLOTS
-    # no order makes a band narrower than half of a row's neighbours
+    # in no order is a band narrower than half the number of a row's neighbours
     if not free and 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (WIDEST + 1):
         return None
     order = sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True)
@@ -104,7 +109,7 @@ def _find_band(model: Model, any_width: bool) -> Band | None:
 
 
 class BandFactor:
-    """Room for the factors, and the launches that make and apply them."""
+    """The banded factors of all worlds, and the launches that make and apply them."""
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, band: Band, pattern: Pattern) -> None:
         self.band, self.pattern, self.launch, self.worlds = band, pattern, launch, model.worlds
@@ -118,7 +123,10 @@ class BandFactor:
         self.again = work.array("band again", (1,), wp.int32)
 
     def make(self, value: wp.array, active: wp.array) -> None:
-        """Factor the blocks `value`, [world, entry]; a matrix that is not positive with some of its diagonal added."""
+        """Factor the blocks `value` [world, entry] of the active worlds.
+
+        Where the matrix is not positive definite, a multiple of its diagonal is added until it is.
+        """
         self.launch(self.kernels.begin, self.worlds, [active, self.doing, self.shift])
         self._factor(value)
         wp.capture_while(self.again, self._factor, value=value)
@@ -134,6 +142,6 @@ class BandFactor:
         launch(k.settle, self.worlds, [self.bad, self.doing, self.shift, self.again])
 
     def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:
-        """z = A^-1 r."""
+        """z = A^-1 r, [world, slot]."""
         b = self.band
         self.launch(self.kernels.solve, self.worlds, [b.width, self.factors, b.slot_at, r, active, self.y, z])

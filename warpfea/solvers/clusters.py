@@ -1,4 +1,4 @@
-"""Clusters of straight elements on the host: the tables of kernels/elements/cluster.py, and who sums what they give."""
+"""Host tables for products by clusters of straight elements, see kernels/elements/cluster.py."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ __all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_clusters", 
 
 @dataclass(eq=False)
 class ClusterTables:
-    """Clusters of elements with connectivity `conn`, see kernels/elements/cluster.py.
+    """Clusters of the elements of a block, as the device struct of kernels/elements/cluster.py has them.
 
-    Slots of a cluster come by falling number of elements, so that threads of a warp sum about as many.
+    The slots of a cluster are sorted by falling number of elements, so that the threads of a warp sum about as many
+    forces each.
     """
 
     start: np.ndarray
@@ -33,12 +34,15 @@ class ClusterTables:
 
 
 def cluster_tables(conn: np.ndarray, size: int) -> ClusterTables:
-    """Tables of runs of `size` elements; a run with more slots than a cluster holds is halved."""
+    """Tables of clusters of up to `size` consecutive elements with slots `conn` (E, S).
+
+    A run of elements that has more slots than a cluster holds is halved.
+    """
     count, slots = conn.shape
     start = np.append(np.arange(0, count, size), count)
     while True:
         cluster = np.repeat(np.arange(len(start) - 1), np.diff(start))
-        # pairs (cluster, slot)
+        # each distinct pair (cluster, slot) is one sum
         _, first, pair, times = np.unique(
             cluster[:, None] * (conn.max() + 1) + conn, return_index=True, return_inverse=True, return_counts=True
         )
@@ -57,7 +61,7 @@ def cluster_tables(conn: np.ndarray, size: int) -> ClusterTables:
     table = np.zeros((len(start) - 1, 2 * words), dtype=np.uint16)
     by_slot = np.argsort(pair.T.ravel(), kind="stable")
     local, elem = np.divmod(by_slot, count)
-    own = np.repeat(owner[order], times[order])  # of contributions
+    own = np.repeat(owner[order], times[order])  # cluster of each force
     table[own, np.arange(len(own)) - slots * start[own]] = local * size + within[elem]
     for k in range(slots):
         table[cluster, at_place + k * size + within] = pair[:, k] - slot_start[cluster]
@@ -72,8 +76,8 @@ class ModelClusters:
 
     Attributes:
         blocks: device struct and number of clusters of each block.
-        topology: who contributes to a slot, with the sums of clusters as contributions.
-        sums: their number.
+        topology: device struct of the gather of slots, with the sums of clusters as contributions.
+        sums: number of these sums.
     """
 
     blocks: list[tuple[Any, int]]
@@ -82,7 +86,7 @@ class ModelClusters:
 
 
 def make_clusters(model: Model) -> ModelClusters:
-    """Those of a model whose blocks are all with_mass."""
+    """The clusters of a model all of whose blocks are straight, with the mass in the same product."""
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
         tables = cluster_tables(block.connectivity, block.cluster)
@@ -104,7 +108,7 @@ def make_clusters(model: Model) -> ModelClusters:
 
 
 def make_pool(model: Model, work: Workspace) -> Any:
-    """What stands for the shared memory of a cluster on the CPU."""
+    """Device struct with the arrays that take the place of shared memory on the CPU; empty on CUDA."""
     pool, on_host = pool_struct(model.dtype)(), not model.device.is_cuda
     numbers = max(pool_size(b.cluster, b.slots, 3 if b.key.damping == "rate" else 2) for b in model.blocks)
     words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)

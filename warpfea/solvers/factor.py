@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["CuDSS", "Factors", "FreeMatrix", "Singular", "SuperLU", "make_factors"]
 
 PIVOT = 1e-3
-"""A diagonal pivot is taken where it is at least so large against its column, scaled to a unit diagonal."""
+"""A pivot on the diagonal is taken if it is at least this large against its column (matrix scaled to unit diagonal)."""
 
 
 class Singular(Exception):
@@ -29,13 +29,14 @@ class Singular(Exception):
 
 @dataclass(eq=False)
 class FreeMatrix:
-    """The free components of a symmetric matrix of 3x3 blocks, as CSR and CSC alike.
+    """The free components of a symmetric matrix of 3x3 blocks; being symmetric, the tables are CSR and CSC at once.
 
     Attributes:
         free: (n,) components, 3 slot + axis, in the order of rows.
-        start, index: of the rows.
-        take: (m,) where each entry is in the blocks, flattened.
-        row: (m,) row of each entry; diagonal: (n,) entries.
+        start, index: (n + 1,) and (m,), the rows.
+        take: (m,) place of each entry in the flattened blocks.
+        row: (m,) row of each entry.
+        diagonal: (n,) entries on the diagonal.
     """
 
     free: np.ndarray
@@ -47,7 +48,7 @@ class FreeMatrix:
 
     @classmethod
     def of(cls, graph: sp.csr_matrix, free: np.ndarray, *, ordered: bool) -> FreeMatrix:
-        """From the pattern of slots and the (slots, 3) mask of free components; `ordered`: by minimum degree."""
+        """From the pattern of slots and the (slots, 3) mask of free components; `ordered`: in minimum degree order."""
         count = len(graph.indices)
         place = np.arange(1.0, 9 * count + 1).reshape(count, 3, 3)
         n = 3 * graph.shape[0]
@@ -70,7 +71,7 @@ class FreeMatrix:
 
 
 def minimum_degree(pattern: sp.csr_matrix) -> np.ndarray:
-    """SuperLU's minimum degree order of a symmetric pattern, by way of an incomplete factorisation that drops all."""
+    """(n,) SuperLU's minimum degree order of a symmetric pattern, read off an incomplete LU that drops every entry."""
     n = pattern.shape[0]
     dominant = sp.csc_matrix((np.full(len(pattern.data), -1e-6), pattern.indices, pattern.indptr), pattern.shape)
     dominant = (dominant + sp.identity(n)).tocsc()
@@ -82,19 +83,19 @@ def minimum_degree(pattern: sp.csr_matrix) -> np.ndarray:
 
 
 class Factors(Protocol):
-    """Factors of the matrices of several worlds."""
+    """Sparse factors of the matrices of several worlds."""
 
     def factorise(self, values: wp.array, world: int) -> None:
-        """Factorise the blocks of a world, `values` being [world, entry]. Raises Singular."""
+        """Factorise the matrix of a world from the blocks `values` [world, entry]. Raises Singular."""
 
     def solve(self, r: wp.array, z: wp.array, world: int) -> float:
         """z = A^-1 r in a world, 0 on prescribed components; returns r.z, which may be nan."""
 
 
 class SuperLU:
-    """SuperLU by SciPy; matrix and vectors of a GPU are copied to the host and back.
+    """SuperLU of SciPy on the host; the matrix and vectors of a GPU are copied there and back.
 
-    The matrix is scaled to a unit diagonal. Its order is found once, from the pattern, so that a run that is resumed
+    The matrix is scaled to a unit diagonal. Its order is found once and from the pattern alone, so that a resumed run
     does the same arithmetic.
     """
 
@@ -137,7 +138,7 @@ class SuperLU:
 
 
 class CuDSS:
-    """cuDSS by nvmath-python, matrix and vectors staying on the device as CuPy arrays. It has not been run yet."""
+    """cuDSS of nvmath-python; matrix and vectors stay on the GPU as CuPy arrays. Not tested yet."""
 
     def __init__(self, model: Model, graph: sp.csr_matrix) -> None:
         import cupy
@@ -149,7 +150,7 @@ class CuDSS:
         self.solvers: dict[int, Any] = {}
 
     def _make(self, data: Any) -> Any:
-        """A solver that keeps `data` as the values of its matrix, and a right side."""
+        """A planned solver, its matrix with the values `data`, and its right side."""
         import cupyx.scipy.sparse as csp
         from nvmath.sparse.advanced import DirectSolver, DirectSolverMatrixType, DirectSolverOptions
 
@@ -190,7 +191,11 @@ class CuDSS:
 
 
 def make_factors(model: Model, graph: sp.csr_matrix) -> Factors:
-    """cuDSS on a GPU where it is installed, else SuperLU, with a warning on a GPU."""
+    """cuDSS on a GPU where it is installed, else SuperLU; on a GPU that gives a warning.
+
+    Raises:
+        ModelError: a model without free components.
+    """
     if not model.free_host.any():
         raise ModelError("linear='direct': every component of the model is prescribed, there is nothing to solve for")
     if not model.device.is_cuda:

@@ -1,26 +1,26 @@
-"""Tiled block-Jacobi descent with acceleration, a fixed number of iterations per step: options, and its loop.
+"""Tiled block-Jacobi descent with acceleration, at a fixed number of iterations per step: options and loop.
 
-An iteration is one evaluation of the residual and one application of B, the tile inverses of H of the preconditioner,
-with its coarse space or without: v += p, p from z = B r, r = -g, and from the moves before. B is kept while it serves,
-by the rule of kernels/solvers/reuse.py. Accelerations:
+An iteration evaluates the residual once and applies B once, the two-level preconditioner of H with or without its
+coarse space: v += p, where p is made of z = B r, r = -g, and of the moves before. B is reused by the rule of
+kernels/solvers/reuse.py. Accelerations:
 
-- "secants": with S the last moves and Y what they did to r, p = S c + 0.7 z, where S c is the Galerkin solution on the
-  moves, (S^T Y) c = S^T r, z = B (r - Y c), and p is made conjugate to the moves. That is a block BFGS update of B
-  (Schnabel 1983), as L-BFGS serves Liu, Bouaziz, Kavan 2017, "Quasi-Newton methods for real-time simulation of
-  hyperelastic materials", and the type I form of Anderson's method (Fang and Saad 2009) made symmetric. With H constant
-  these are conjugate gradients whose step lengths come one iteration late.
+- "secants": with S the last moves and Y the changes of r that they caused, p = S c + 0.7 z, where S c is the Galerkin
+  solution on the moves, (S^T Y) c = S^T r, and z = B (r - Y c), and p is made conjugate to the moves. That is a block
+  BFGS update of B (Schnabel 1983), as L-BFGS serves Liu, Bouaziz, Kavan 2017, "Quasi-Newton methods for real-time
+  simulation of hyperelastic materials", and the type I form of Anderson's method (Fang and Saad 2009) made symmetric.
+  With H constant these are conjugate gradients whose step lengths come one iteration late.
 - "anderson": the same without the conjugation, one reduction less: Anderson's method of type I.
 - "chebyshev": the semi-iteration as in Wang 2015, "A Chebyshev semi-iterative approach for accelerating projective and
   position-based dynamics", for eigenvalues of B H between LARGEST / max(4, iterations^2 / 4) and LARGEST.
 - "none": p = 0.5 z.
 
-Measured by tests/jacobi_report.py: "secants" needs the fewest iterations on solids and joints, by more the more there
-are; "anderson" is about as good up to 8 and better on a slender beam, by a factor of two; "chebyshev" serves stiff
-bodies at about 8 iterations as well, stalls at what its interval leaves out, and fails with joints. Tried and left:
-Anderson of type II in the D^-1 norm (like type I), B r in full or by half in place of 0.7 (no clear difference),
-multipliers changed in every iteration (diverges).
+Measured (warpfea/studies/reports/jacobi.py): "secants" needs the fewest iterations on solids and joints, with a lead
+that grows with their number; "anderson" is about as good up to 8, and better by a factor of two on a slender
+beam; "chebyshev" serves stiff bodies at about 8 iterations as well, stalls at eigenvalues outside its interval, and
+fails with joints. Tried and dropped: Anderson of type II in the D^-1 norm (like type I), B r in full or by half in
+place of 0.7 (no clear difference), multipliers changed in every iteration (diverges).
 
-Constraints: the multipliers stand still through a step and are changed once, by rho c, when it is accepted.
+Constraints: the multipliers stay fixed during a step and are changed once, by rho c, when it is accepted.
 """
 
 from __future__ import annotations
@@ -38,46 +38,45 @@ from .newton import NewtonLoop, NewtonPCG
 from .twolevel import TwoLevel
 
 if TYPE_CHECKING:
-    from ..base.launch import Launcher
-    from ..model.model import Model
-    from ..terms.workspace import Workspace
+    from ..terms.term import At
 
 __all__ = ["Jacobi", "JacobiLoop"]
 
 ACCELERATIONS = ("secants", "anderson", "chebyshev", "none")
 GROWTH = 10.0
-"""Residual over that at the start of a step beyond which the step is refused."""
+"""A step is rejected if its residual ends above this multiple of that at its start."""
 GAP = 1e-3
-"""So is one that leaves a constraint open by more than this share of the model's size."""
+"""A step is rejected if it leaves a constraint violated by more than this share of the model's size."""
 REBUILD_COST = 10.0
-"""Iterations that making B anew is worth: less than for Newton's method, since an old B costs accuracy here, not time
-(5, 10, 20, 40 were tried on soft bars that swing far: with 40 the error is up to 70 times as large, and a tenth of
-the time is saved)."""
+"""Extra iterations at which B is made anew: fewer than for Newton's method, since an old B costs accuracy here, not
+time. Of 5, 10, 20 and 40, tried on soft bars that swing far, 40 saves a tenth of the time, with an error up to 70 times
+as large."""
 STEP = {"secants": 0.7, "anderson": 0.7, "chebyshev": 1.0, "none": 0.5}
+"""Factor of z = B r in the move, by acceleration."""
 LARGEST = 3.5
 """Assumed largest eigenvalue of B H, as for the coarse levels of the preconditioner."""
 
 
 @dataclass(frozen=True)
 class Jacobi:
-    """Descent with dense inverses of tiles of 48 unknowns, at a fixed cost per step: an approximation that says so.
+    """Descent with dense inverses of tiles of 48 unknowns, at a fixed cost per step: approximate, and reported as such.
 
-    A step is accepted after `iterations`, whatever is left of the residual. `StepReport.residual` and `residual_force`
-    tell what is; `StepReport.converged` is False where that is beyond the tolerance. Refused and halved, as with
-    Newton's method, are steps that end with ten times the residual of their start or a constraint open by a thousandth
-    of the model's size, or meet a force that is not finite or a J <= 0 that a law does not take. For soft bodies and
-    small steps: see the table of the README.
+    A step is accepted after `iterations`, whatever residual is left: `StepReport.residual` and `residual_force` tell
+    it, and `StepReport.converged` is False where it is beyond the tolerance. As with Newton's method a step is rejected
+    and retried with half the step if it ends with ten times the residual of its start, leaves a constraint violated by
+    a thousandth of the model's size, or meets a force that is not finite or, with laws that need J > 0, a J <= 0.
+    Meant for soft bodies and small steps.
 
     Args:
-        iterations: most per step, each one residual and one application of the tile inverses.
+        iterations: most iterations per step, each one residual and one application of the tile inverses.
         coarse: add the affine motions of groups of tiles. Without them an iteration is cheaper, and stiff or long
             bodies move as if much softer or fall apart from their loads.
         acceleration: "secants", "anderson", "chebyshev", or "none".
-        tol: a step ends early, and is converged, within this tolerance; as of NewtonPCG, with its defaults.
+        tol: a step within this tolerance ends early and counts as converged; as of NewtonPCG, with the same defaults.
         force_tol: as of NewtonPCG, N.
-        max_halvings: how often a refused step may be halved.
-        penalty: of a constraint over the stiffness of what it ties. Low, joints give; high, everything else converges
-            slowly.
+        max_halvings: how often a rejected step may be halved.
+        penalty: stiffness of a constraint over that of what it ties. A low one lets joints give, with a high one
+            everything else converges slowly.
 
     Raises:
         ModelError: a value out of range.
@@ -110,7 +109,7 @@ class Jacobi:
 
     @property
     def newton(self) -> NewtonPCG:
-        """What of Newton's loop it uses."""
+        """The options of Newton's loop that this loop inherits."""
         return NewtonPCG(
             tol=self.tol,
             force_tol=self.force_tol,
@@ -125,11 +124,11 @@ class Jacobi:
 
     @property
     def max_newton(self) -> int:
-        """Iterations before a step ends."""
+        """Most iterations per step."""
         return self.iterations
 
     def tolerance(self, dtype: str) -> float:
-        """The tolerance in one precision."""
+        """The relative tolerance in one precision, "float64" or "float32"."""
         return self.newton.tolerance(dtype)
 
 
@@ -138,24 +137,22 @@ class JacobiLoop(NewtonLoop):
 
     def __init__(
         self,
-        model: Model,
-        work: Workspace,
-        launch: Launcher,
+        at: At,
         options: Jacobi,
         *,
-        inertia: bool,
         constraint_tol: float,
     ) -> None:
-        super().__init__(model, work, launch, options.newton, inertia=inertia, constraint_tol=constraint_tol)
+        super().__init__(at, options.newton, constraint_tol=constraint_tol)
+        model, work = at.model, at.work
         self.methods = {"solver": "jacobi"}
-        # the multipliers are changed once, when the step is accepted: no outer loop, and constraints count
+        # multipliers are changed once, when the step is accepted: no outer loop, and convergence looks at violations
         self.classical = False
         work.newton.constraint_tol = constraint_tol
         assert isinstance(self.preconditioner, TwoLevel)
         self.preconditioner.rebuild_cost = REBUILD_COST
         self.acceleration = options.acceleration
         self.paired = options.acceleration in ("secants", "anderson")
-        self.own = jacobi_kernels(model.dtype, model.constraints is not None, options.acceleration)
+        self.own = jacobi_kernels(model.dtype, model.terms.traits, options.acceleration)
         B, m = model.worlds, PAIRS
         shape = (m, B, model.slots) if self.paired else (1, 1, 1)
         self.moves = work.array("jacobi moves", shape, model.types.vec3)
@@ -175,11 +172,11 @@ class JacobiLoop(NewtonLoop):
         self.control.centre, self.control.half = 0.5 * (LARGEST + least), 0.5 * (LARGEST - least)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that the loop launches, but those of the reductions and of the constraints."""
+        """Modules that the loop launches, except those of the reductions and of the constraints."""
         return super().modules() | {self.own.module}
 
     def _solve(self) -> None:
-        """The iterations from the residual at hand, and what the preconditioner's rule is to know of them."""
+        """Iterate from the residual at hand, and tell the rule of the preconditioner what that cost and gained."""
         w = self.work
         self.launch(self.own.begin, self.model.worlds, [w.newton, self.control])
         self._any(w.newton.active, self.iterating)
@@ -199,7 +196,7 @@ class JacobiLoop(NewtonLoop):
 
     @labelled("vectors")
     def _find_move(self, active: wp.array) -> None:
-        """Put the move into work.direction."""
+        """Put the next move p into work.direction."""
         m, w, k, launch, ctl = self.model, self.work, self.own, self.launch, self.control
         args = [w.newton, w.gradient, m.topology.free, w.direction, w.p, w.r, self.moves, self.changes, w.rows]
         launch(k.remember, self.dim, args)
@@ -215,7 +212,7 @@ class JacobiLoop(NewtonLoop):
             self.residual.reduce(w.rows, PAIRS, active, ctl.sums)
             launch(k.conjugate, m.worlds, [w.newton, ctl])
         launch(k.combine, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
-        if self.pcg.deflate:  # a loose step must not leak the momentum of free bodies
+        if self.pcg.deflate:  # so that a loose tolerance conserves the momentum of free bodies
             args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
             launch(k.momentum_left, self.dim, args)
             self.pcg.translate(active)

@@ -1,4 +1,4 @@
-"""The levels of the two-level preconditioner on the host: tiles, groups with affine functions, Galerkin tables."""
+"""Host tables of the two-level preconditioner: tiles, groups with affine functions, Galerkin products, by levels."""
 
 from __future__ import annotations
 
@@ -20,27 +20,28 @@ if TYPE_CHECKING:
 __all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
-"""Slots of a group whose affine motions are the coarse space: 16 unknowns of a level to one of the next."""
+"""Most slots of a group. Its affine motions are 4 slots of the next level, which has about a 16th of the unknowns."""
 SMALL_GROUPS = (16, 32)
 SMALL_COARSE = 48
-"""Groups of fewer slots where that gives a coarse level of up to so many: a small slender body has too few groups of 64
-to bend (a cantilever of 180 slots takes half of the iterations)."""
+"""Smaller groups are taken where the coarse level still has at most SMALL_COARSE slots: a small slender body has too
+few groups of 64 slots to bend (a cantilever of 180 slots takes half the iterations)."""
 BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
-"""A coarse level of up to so many slots is inverted as one dense matrix; on CUDA that costs less than the launches of
-more levels would."""
+"""A coarse level of up to this many slots is inverted as one dense matrix, by device; on CUDA that costs less than the
+launches of further levels."""
 MAX_LEVELS = 12
 
 
 @dataclass(eq=False)
 class Level:
-    """One level.
+    """One level of the preconditioner.
 
     Attributes:
-        pattern: of its matrix.
-        dense: it is the bottom, inverted as a whole; it has no tiles and no groups then.
-        band: it is the only one, factored as a whole; neither.
+        pattern: pattern of its matrix.
+        slots: their number.
+        dense: the level is the bottom and inverted as a whole; it has no tiles and no groups.
+        band: the level is the only one and factored as a whole; it has no tiles and no groups either.
         data: device struct of tiles and groups.
-        tiles, groups: their numbers; groups 0: nothing below.
+        tiles, groups: their numbers; with 0 groups there is no level below.
         galerkin: device tables of the product that makes the next level's matrix.
     """
 
@@ -55,19 +56,19 @@ class Level:
 
     @property
     def whole(self) -> bool:
-        """Whether it is treated as a whole: nothing comes below."""
+        """Whether the level is inverted or factored as a whole, so that there is none below."""
         return self.dense or self.band is not None
 
 
 @dataclass(eq=False)
 class Points:
-    """What a level's slots stand for: values of affine functions.
+    """The reference configuration of a level's slots, from which affine functions get their values there.
 
     Attributes:
-        value: (slots, 3) place of a position slot, derivative of a gradient slot.
-        position: (slots,) whether it is one of position.
-        node: (slots,) slots of one node stay together.
-        label: (slots,) what must not share a tile or group.
+        value: (slots, 3) the reference value of a slot: a place (m) or a gradient.
+        position: (slots,) whether it is a place.
+        node: (slots,) slots of one node stay together in a tile and a group.
+        label: (slots,) slots of different labels share neither.
     """
 
     value: np.ndarray
@@ -77,7 +78,7 @@ class Points:
 
 
 def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[Level]:
-    """The levels of a model, finest first; `pattern` is that of H. Without `coarse` the tiles of the first alone."""
+    """The levels of a model, finest first; `pattern` is that of H. Without `coarse`, only the tiles of the first."""
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
     place = model.reference + origin * position[:, None]
@@ -97,7 +98,7 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[
         capacity = next((c for c in SMALL_GROUPS if 4.05 * n / c <= SMALL_COARSE), capacity)
         level, points, pattern = _make_level(model, pattern, points, capacity)
         levels.append(level)
-        # joints tie what elements don't; further down anything near may share a group
+        # below the first level groups may span bodies that joints connect and, where they hardly shrink, any bodies
         points.label = points.label if depth else model.component[_first_members(level)]
         if level.groups * 4 > n // 2:
             points.label = np.zeros_like(points.label)
@@ -105,7 +106,7 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[
 
 
 def _first_members(level: Level) -> np.ndarray:
-    """A slot of the group that each slot of the next level belongs to."""
+    """For each slot of the next level, one slot of the group that it belongs to."""
     start, slot = level.data.group_start.numpy(), level.data.group_slot.numpy()
     return np.repeat(slot[start[:-1]], 4)
 
@@ -152,7 +153,10 @@ def _make_level(model: Model, pattern: Pattern, points: Points, capacity: int) -
 
 
 def _affine(points: Points, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values (slots, 4) of 1, x, y, z of each slot's group, about its centre (groups, 3) over its size (groups,)."""
+    """Values (slots, 4) of the affine functions 1, x, y, z of each slot's group, and the groups' origins and scales.
+
+    x, y, z are measured from the centre (groups, 3), m, and divided by the size (groups,), m.
+    """
     at = np.flatnonzero(points.position)
     count = np.maximum(np.bincount(group[at], minlength=groups), 1)
     centre = np.stack([np.bincount(group[at], points.value[at, k], groups) / count for k in range(3)], axis=1)
@@ -166,7 +170,7 @@ def _affine(points: Points, group: np.ndarray, groups: int) -> tuple[np.ndarray,
 def _galerkin(
     model: Model, pattern: Pattern, group: np.ndarray, groups: int
 ) -> tuple[Pattern, tuple[wp.array, wp.array, wp.array]]:
-    """Pattern of the next level's matrix and the tables of kernels.blocks.galerkin."""
+    """Pattern of the next level's matrix P^T A P, and the tables of `galerkin` in kernels/solvers/blocks.py."""
     graph = pattern.graph
     rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
     key = group[rows].astype(np.int64) * groups + group[graph.indices]

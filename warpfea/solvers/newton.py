@@ -1,4 +1,4 @@
-"""Newton's method with PCG: options, and the loop as it runs on the device."""
+"""Newton's method with PCG: its options, and its loop, which runs on the device."""
 
 from __future__ import annotations
 
@@ -11,17 +11,14 @@ import warp as wp
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..kernels.solvers.newton import newton_kernels
-from ..terms.multipliers import ConstraintSolver
 from .direct import Direct
 from .pcg import PCG
 from .preconditioner import NAMES, choose, make
 from .residual import Residual
 
 if TYPE_CHECKING:
-    from ..base.launch import Launcher
-    from ..model.model import Model
     from ..model.state import State
-    from ..terms.workspace import Workspace
+    from ..terms.term import At
 
 __all__ = ["NewtonLoop", "NewtonPCG"]
 
@@ -36,12 +33,12 @@ class NewtonPCG:
         tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
             for each connected part of the model apart. A thousandth of the reactions counts with f_int, so that a held,
             stressed body without loads has a scale. None: 1e-8 in float64, 1e-4 in float32.
-        force_tol: a step is accepted also when |g|, the plain norm over the free components, is at most so many newtons
+        force_tol: a step is also accepted when |g|, the plain norm over the free components, is at most this, N
             (gradient slots count in N m); 0: never.
         forcing: relative residual of the linear solves; None: Eisenstat and Walker's, no further than needed.
-        max_newton: iterations before a step is refused.
+        max_newton: iterations before a step is rejected.
         max_pcg: iterations per linear solve.
-        max_halvings: how often a refused step may be halved.
+        max_halvings: how often a rejected step may be halved.
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
             serves), "banded" (Cholesky factors of the whole, kept as well; on the CPU, for chains, strips and slender
             or small bodies), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
@@ -111,50 +108,49 @@ class NewtonPCG:
             raise ModelError(f"NewtonPCG: max_halvings = {self.max_halvings!r} must be a whole number from 0 to 20")
 
     def tolerance(self, dtype: str) -> float:
-        """The tolerance in one precision."""
+        """The relative tolerance in one precision, "float64" or "float32"."""
         return self.tol if self.tol is not None else {"float64": 1e-8, "float32": 1e-4}[dtype]
+
+
+@dataclass(frozen=True)
+class TermOptions:
+    """What terms must know of the solver.
+
+    Attributes:
+        classical: multipliers change in an outer loop.
+        kappa: penalty of a constraint over the stiffness of what it ties.
+        deflate: the preconditioner does not hold penalties; terms correct it.
+    """
+
+    classical: bool
+    kappa: float
+    deflate: bool
 
 
 class NewtonLoop:
     """The iteration of all worlds: conditional loops on the device, one code path with and without capture."""
 
-    def __init__(
-        self,
-        model: Model,
-        work: Workspace,
-        launch: Launcher,
-        options: NewtonPCG,
-        *,
-        inertia: bool,
-        constraint_tol: float,
-    ) -> None:
-        self.model, self.work, self.launch = model, work, launch
+    def __init__(self, at: At, options: NewtonPCG, *, constraint_tol: float) -> None:
+        model, work, launch, inertia = at.model, at.work, at.launch, at.inertia
+        self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
         self.constraint_tol = constraint_tol
-        constrained = model.constraints is not None
-        self.kernels = newton_kernels(model.dtype, constrained)
-        self.classical = constrained and options.multipliers == "outer"
+        traits = model.terms.traits
+        self.kernels = newton_kernels(model.dtype, traits)
+        self.limited = traits.limited
+        self.classical = traits.gated and options.multipliers == "outer"
         self.max_outer = options.max_outer
-        self.constraints: ConstraintSolver | None = None
         direct = options.linear == "direct"
         kind = "direct" if direct else choose(options.preconditioner, options.preconditioner_dtype, model)
-        if constrained:
-            deflate = kind not in ("block-jacobi", "banded") and not direct  # factors hold the penalties
-            self.constraints = ConstraintSolver(
-                model, work, launch, classical=self.classical, kappa=options.penalty, deflate=deflate
-            )
+        # factors hold the penalties
+        deflate = kind not in ("block-jacobi", "banded") and not direct
+        at.options = TermOptions(classical=self.classical, kappa=options.penalty, deflate=deflate)
+        for term in self.terms:
+            term.configure(at)
         operator = options.operator
         if direct and operator == "auto":  # factors are kept as long as the matrix, where nothing is added to it
-            operator = "elements" if constrained or model.loads.followers else "matrix"
-        self.residual = Residual(
-            model,
-            work,
-            launch,
-            self.constraints,
-            viscous=inertia,
-            operator=operator,
-            assembled=kind not in ("deflated", "block-jacobi"),
-        )
-        self.direct = Direct(model, work, launch, self.residual) if direct else None
+            operator = "elements" if model.terms.products else "matrix"
+        self.residual = Residual(at, operator=operator, assembled=kind not in ("deflated", "block-jacobi"))
+        self.direct = Direct(at, self.residual) if direct else None
         self.preconditioner = self.direct or make(
             kind, options.preconditioner_dtype, model, work, launch, self.residual
         )
@@ -174,7 +170,7 @@ class NewtonLoop:
         # a good preconditioner makes a decade of PCG cheaper than another Newton iteration
         # (in statics the first iterates are far off, and what they are solved to is lost)
         ctl.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") or not inertia else 0.001
-        if constrained:  # constraints are stiff: a loose first solve costs more iterations than it saves
+        if traits.gated:  # constraints are stiff: a loose first solve costs more iterations than it saves
             ctl.first_forcing = min(ctl.first_forcing, 0.01)
         ctl.fixed_forcing = int(options.forcing is not None)
         if options.forcing is not None:
@@ -184,7 +180,7 @@ class NewtonLoop:
         ctl.eps = EPS[model.dtype]
         ctl.max_iterations = options.max_newton
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
-        ctl.nonpotential = int(model.loads.nonpotential or rate)
+        ctl.nonpotential = int(traits.nonpotential or rate)
         ctl.classical = int(self.classical)
         ctl.slack = 1.0 / math.sqrt(1.0 + options.penalty)
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves are for g alone
@@ -192,7 +188,7 @@ class NewtonLoop:
         self.searching = work.any_flag[1:2]
 
     def register(self, state: State) -> None:
-        """Put into the state what solvers remember from step to step."""
+        """Make what the solvers keep from step to step part of the state."""
         self.preconditioner.register(state)
         self.residual.register(state)
 
@@ -207,7 +203,7 @@ class NewtonLoop:
         self.residual.commit(accepted)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that the loop launches, but those of the reductions and of the constraints."""
+        """Modules that the loop launches, except those of the reductions and of the terms."""
         out = {self.kernels.module, self.pcg.kernels.module}
         return out | self.preconditioner.modules() | self.residual.modules()
 
@@ -218,11 +214,9 @@ class NewtonLoop:
         self._clear_direction(active)
         # D is needed to judge the first iterate, so the blocks come first
         self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
-        if self.constraints:
-            self.constraints.evaluate(active)  # J, for rho
+        self._each("prepare", active)
         self.preconditioner.start(active)
-        if self.constraints:
-            self.constraints.build(active, penalty=True)
+        self._each("scale", active)
         self.residual.evaluate(active, hold=True)
         self._solve()
         if self.classical:
@@ -244,9 +238,8 @@ class NewtonLoop:
 
     def _update_multipliers(self) -> None:
         """lambda += rho c where a constraint is violated, and the inner solve again, from the velocity at hand."""
-        assert self.constraints is not None
         w = self.work
-        self.constraints.adopt(w.newton.stepped)
+        self.terms.constraints.update(self.at, w.newton.stepped)
         self.residual.evaluate(w.newton.active, hold=True)
         self._solve()
         self._judge_outer()
@@ -258,8 +251,9 @@ class NewtonLoop:
         self.pcg.solve(active)
         self.residual.hold_nonpotential(active)
         self.residual.follower_curvature(active)
-        if self.constraints:
-            self.constraints.predict(active)
+        if self.limited:
+            launch(k.free_step, self.model.worlds, [w.newton])
+        self._each("aim", active)
         launch(k.copy_active, self.dim, [w.v, active, w.base])
         launch(k.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
@@ -267,8 +261,7 @@ class NewtonLoop:
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self.preconditioner.follow(active)
-        if self.constraints:
-            self.constraints.build(active)
+        self._each("follow", active)
         self._any(active, self.iterating)
 
     def _search(self) -> None:
@@ -276,9 +269,14 @@ class NewtonLoop:
         launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.judge_trial, self.model.worlds, [w.newton])
-        if self.constraints and not self.classical:
-            self.constraints.adopt(w.newton.stepped)
+        if self.terms.traits.stored:
+            self._each("adopt", w.newton.stepped)
         self._any(w.newton.searching, self.searching)
+
+    def _each(self, what: str, flags: wp.array) -> None:
+        """Call a method of all terms."""
+        for term in self.terms:
+            getattr(term, what)(self.at, flags)
 
     def _any(self, flags: wp.array, out: wp.array) -> None:
         out.zero_()

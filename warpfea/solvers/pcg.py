@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on the matrix-free operator, per world, on the device."""
+"""Preconditioned conjugate gradients on the operator H, per world, on the device."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ __all__ = ["PCG"]
 class PCG:
     """Solves H p = -g for the active worlds.
 
-    It starts from the Galerkin solution on the translations of the free groups and ends with the same correction, so
-    that a loose tolerance does not leak momentum. A direction of no positive curvature ends a solve with what it has.
+    A solve starts from the Galerkin solution for the translations of free groups of bodies and ends with the same
+    correction, so that linear momentum is conserved however loose the tolerance is. A direction without positive
+    curvature ends a solve early.
     """
 
     def __init__(
@@ -32,14 +33,14 @@ class PCG:
         self.model, self.work, self.launch = model, work, launch
         self.residual = residual
         self.preconditioner = preconditioner
-        self.kernels = pcg_kernels(model.dtype, model.constraints is not None)
+        self.kernels = pcg_kernels(model.dtype, model.terms.traits.gated)
         self.dim = (model.worlds, model.slots)
         self.deflate = deflate and model.group_count > 0
         work.pcg.max_iterations = max_iterations
 
     @labelled("vectors")
     def solve(self, active: wp.array) -> None:
-        """Put the direction into work.direction."""
+        """Put the solution p into work.direction."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         launch(k.start, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
         if m.component_count > 1:
@@ -69,7 +70,7 @@ class PCG:
         self.residual.reduce(w.warp_rows, 2, active, w.pcg.sums)
 
     def translate(self, active: wp.array) -> None:
-        """x += Z (Z^T H Z)^-1 Z^T r."""
+        """Galerkin correction for the translations Z of free groups: x += Z (Z^T H Z)^-1 Z^T r, r updated."""
         if not self.deflate:
             return
         m, w, k, launch = self.model, self.work, self.kernels, self.launch

@@ -1,4 +1,4 @@
-"""Preconditioners behind one seam."""
+"""The interface of preconditioners, block Jacobi, and the choice among them."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ __all__ = ["NAMES", "BlockJacobi", "Preconditioner", "choose", "make"]
 
 
 class Preconditioner(Protocol):
-    """What the solvers ask of a preconditioner."""
+    """What the solvers require of a preconditioner B, an approximation of H^-1."""
 
     def register(self, state: State) -> None:
-        """Put what it remembers from step to step into the state."""
+        """Make what is kept from step to step part of the state."""
 
     def forget(self, flags: wp.array) -> None:
         """The state of flagged worlds was set from elsewhere."""
@@ -35,19 +35,19 @@ class Preconditioner(Protocol):
         """Modules that it launches."""
 
     def start(self, active: wp.array) -> None:
-        """An attempt begins: work.diagonal and work.inverse are wanted at its first iterate."""
+        """At the first iterate of an attempt: compute work.diagonal and work.inverse."""
 
     def follow(self, active: wp.array) -> None:
-        """There is a new iterate."""
+        """At every further iterate: follow it as far as needed."""
 
     def commit(self, accepted: wp.array) -> None:
         """The attempt was accepted."""
 
     def prepare(self, active: wp.array) -> None:
-        """A solve begins."""
+        """Before a linear solve: make what `apply` needs."""
 
     def judge(self, active: wp.array) -> None:
-        """A solve has ended."""
+        """After a linear solve: learn from what it cost."""
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = B r; per slot r.z in rows[0] and r.D^-1 r in rows[1]."""
@@ -58,7 +58,7 @@ class BlockJacobi:
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.work, self.launch, self.residual = work, launch, residual
-        self.kernels = pcg_kernels(model.dtype, model.constraints is not None)
+        self.kernels = pcg_kernels(model.dtype, model.terms.traits.gated)
         self.dim = (model.worlds, launch.padded(model.slots))
 
     def register(self, state: State) -> None:
@@ -68,7 +68,7 @@ class BlockJacobi:
         """It remembers nothing."""
 
     def modules(self) -> set[wp.Module]:
-        """That of the conjugate gradients."""
+        """The module of the conjugate gradients, whose kernel it launches."""
         return {self.kernels.module}
 
     @labelled("build")
@@ -82,19 +82,20 @@ class BlockJacobi:
         """Nothing to keep."""
 
     def prepare(self, active: wp.array) -> None:
-        """The blocks are there."""
+        """Nothing to do: the blocks of the iterate are at hand."""
 
     def judge(self, active: wp.array) -> None:
-        """It does not learn."""
+        """Nothing to learn."""
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
         w = self.work
         self.launch(self.kernels.block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp, z, w.warp_rows])
-        constraints = self.residual.constraints
-        if constraints is not None and constraints.deflate:
-            constraints.precondition(r, z, active)
+        at = self.residual.at
+        for term in self.residual.terms:
+            if term.preconditions(at):
+                term.precondition(at, r, z, active)
 
 
 NAMES = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
@@ -123,7 +124,7 @@ def choose(name: str, storage: str | None, model: Model) -> str:
     if banded and find_band(model) is not None:
         return "banded"
     small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
-    return "deflated" if model.constraints and small and model.slots > WHOLE_SLOTS else "two-level"
+    return "deflated" if model.terms.traits.gated and small and model.slots > WHOLE_SLOTS else "two-level"
 
 
 def make(

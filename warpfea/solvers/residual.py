@@ -10,18 +10,18 @@ import warp as wp
 from ..base.launch import labelled
 from ..kernels.common.reduce import CHUNK, reduce_kernels
 from ..kernels.common.structs import additions_struct
-from ..kernels.solvers.newton import COMPONENT_ROWS, LANES, newton_kernels
-from ..kernels.step.gather import RESIDUAL_ROWS
-from ..kernels.terms.constraints import SUM_ROWS, constraint_struct
+from ..kernels.solvers.newton import COMPONENT_ROWS, LANES, TERM_ROWS, newton_kernels
+from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
+from ..kernels.terms.constraints import constraint_struct
+from ..terms.elements import Elements
 from .assembled import Assembled, shaped
 from .clusters import ModelClusters, make_clusters, make_pool
 from .reuse import Reuse
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
-    from ..model.model import Model
     from ..model.state import State
-    from ..terms.multipliers import ConstraintSolver
+    from ..terms.term import At
     from ..terms.workspace import Workspace
 
 __all__ = ["Reducer", "Residual"]
@@ -32,8 +32,6 @@ MATRIX_COST = {False: 2.0, True: 0.5}
 """Iterations of Newton's method that the matrix costs, on the CPU and on CUDA."""
 SMALL_SLOTS = 16384
 """Slots up to which a GPU makes a matrix faster than it solves with one."""
-MANY_POINTS = 8
-"""Points of an element from which lanes share them."""
 
 
 class Reducer:
@@ -62,24 +60,19 @@ class Residual:
     """Launches that evaluate g(v), Phi(v), the norms, and H p.
 
     Attributes:
-        by_matrix: H p goes by the assembled matrix.
-        on_matrix: called with that matrix and flags of the worlds, where it was made anew.
+        by_matrix: H p is a product with the assembled matrix.
+        on_matrix: called with that matrix and the flags of the worlds for which it was made anew.
     """
 
-    def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, constraints: ConstraintSolver | None, *, viscous: bool,
-        operator: str, assembled: bool,
-    ) -> None:  # fmt: skip
-        self.model = model
-        self.constraints = constraints
-        self.work = work
-        self.launch = launch
-        # statics has no rates: the kernels without damping serve there
-        self.block_kernels = [b.kernels if viscous else b.kernels_for(model.dtype, None) for b in model.blocks]
+    def __init__(self, at: At, *, operator: str, assembled: bool) -> None:
+        model, work, launch = at.model, at.work, at.launch
+        self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
+        self.elements: Elements = model.terms.find(Elements)
         self.reduce = Reducer(launch, work, model.worlds)
-        self.gather = model.loads.gather_kernels()
-        self.newton = newton_kernels(model.dtype, constraints is not None)
-        self.con = model.constraints.data if model.constraints else constraint_struct()()
+        traits = model.terms.traits
+        self.gather = gather_kernels(model.dtype, traits)
+        self.newton = newton_kernels(model.dtype, traits)
+        self.con = model.constraints.data if traits.ties else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
         self.with_mass = all(block.with_mass for block in model.blocks)
@@ -96,13 +89,13 @@ class Residual:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
             self.pool = make_pool(model, work)
-            forms = [block.key.damping if viscous else None for block in model.blocks]
+            forms = [block.key.damping if at.inertia else None for block in model.blocks]
             self.products = [block.with_mass_product(model.dtype, form) for block, form in zip(model.blocks, forms)]
         self.keep, self.lasting = 0, False
         self.on_matrix: Callable[[wp.array, wp.array], None] | None = None
         self.assembled: Assembled | None = None
         if assembled or self.by_matrix:
-            self.assembled = Assembled(model, work, launch, self.block_kernels)
+            self.assembled = Assembled(model, work, launch, self.elements.kernels(at))
         if self.by_matrix:
             assert self.assembled is not None
             self.matrix = self.assembled.values("operator matrix")
@@ -111,25 +104,33 @@ class Residual:
             # a small matrix in no time
             damped = any(block.key.damping in ("incremental", "rate") for block in model.blocks)
             small = model.device.is_cuda and model.slots <= SMALL_SLOTS
-            self.keep = 2 if viscous and not damped else 0 if small else 1
-            if constraints:
+            self.keep = 2 if at.inertia and not damped else 0 if small else 1
+            if traits.gated:
                 self.keep = 0
             self.lasting = self.keep == 2
             if self.keep:
                 self.reuse = Reuse(model, work, launch, "operator", MATRIX_COST[model.device.is_cuda])
 
     def _additions(self) -> Any:
-        """What products need besides the elements' part."""
+        """What a product H p needs besides the elements' part."""
         m, w = self.model, self.work
         out = additions_struct(m.dtype)()
-        of = m.loads.nonpotential_topology if m.loads.followers else m.topology
+        of = m.terms.side_topology if m.terms.traits.tangent else m.topology
         out.start, out.entry, out.contribution = of.start, of.entry, w.nonpotential_tangent
+        out.pool = w.pool_product
+        if m.terms.traits.pooled:
+            out.pool_start, out.pool_entry = m.topology.pool_start, m.topology.pool_entry
         out.mass_factor, out.dq_dv, out.warp = w.step.mass_factor, w.step.dq_dv, w.warp
         return out
 
+    @property
+    def block_kernels(self) -> list[Any]:
+        """Kernels of the blocks of elements."""
+        return self.elements.kernels(self.at)
+
     def modules(self) -> set[wp.Module]:
-        """Modules of the elements, the gather, and the matrix where there is one."""
-        out = {k.module for k in self.block_kernels} | {self.gather.module}
+        """Modules of the gather, and of the matrix where there is one; those of the terms are theirs."""
+        out = {self.gather.module}
         if self.by_matrix:
             assert self.assembled is not None
             out |= {self.gather.matrix_module} | self.assembled.modules()
@@ -139,7 +140,7 @@ class Residual:
         return out
 
     def register(self, state: State) -> None:
-        """Put into the state what a run that goes on from it must know of the operator's matrix."""
+        """Make what a resumed run must know of the operator's matrix part of the state."""
         if self.lasting:
             self.reuse.register(state)
 
@@ -158,7 +159,7 @@ class Residual:
 
     @labelled("assembly")
     def linearise(self, active: wp.array) -> None:
-        """Make the operator's matrix at the iterate, where it is to be made anew."""
+        """Make the operator's matrix at the iterate where the rule of its reuse asks for it."""
         if not self.by_matrix:
             return
         if self.keep == 0:
@@ -183,7 +184,7 @@ class Residual:
         self.reuse.made()
 
     def take(self, active: wp.array) -> None:
-        """Set the operator to the iterate, whatever the matrix's rule says."""
+        """Make the operator's matrix at the iterate whatever the rule of its reuse says."""
         w = self.work
         if self.by_matrix:
             assert self.assembled is not None
@@ -198,17 +199,15 @@ class Residual:
         m, w, launch = self.model, self.work, self.launch
         launch(self.newton.reset_min_J, m.worlds, [w.newton, active])
         launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
-        for block, kernels in zip(m.blocks, self.block_kernels):
-            lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1
-            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, lanes, w.contribution, w.energy_rows]
-            dim = (m.worlds, launch.padded(block.count * lanes))
-            launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
-        self.nonpotential(active)
+        for term in self.terms:
+            term.force(self.at, active)
+        if self.terms.traits.nonpotential:
+            args = [self.terms.side_topology, w.nonpotential_contribution, active, w.nonpotential]
+            launch(self.gather.gather_force, self.dim, args)
         if hold:
             self.hold_nonpotential(active)
-        if self.constraints:
-            self.constraints.evaluate(active)
-            self.reduce(w.multipliers.rows, SUM_ROWS, active, w.newton.constraint_sums)
+        if self.terms.traits.stored:
+            self.reduce(w.term_rows, TERM_ROWS, active, w.newton.term_sums)
         args = [m.topology, w.contribution, w.balance, active, self.con, w.multipliers]
         launch(self.gather.residual, self.dim, args)
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
@@ -219,29 +218,10 @@ class Residual:
             sums = (COMPONENT_ROWS, m.worlds, m.component_count)
             launch(self.newton.component_sum, sums, [w.component_partial, active, w.newton.component_sums])
 
-    def nonpotential(self, active: wp.array) -> None:
-        """Forces without a potential at the iterate: fields b(r, t) and follower pressure."""
-        m, w, launch = self.model, self.work, self.launch
-        loads = m.loads
-        if not loads.nonpotential:
-            return
-        for part in loads.followers:
-            args = [part.data, w.u, w.law_value, active, w.nonpotential_contribution]
-            launch(part.force, (m.worlds, part.count), args)
-        for field in loads.fields:
-            args = [field.block.data, field.members, m.reference_device, field.origin, w.u, w.step.new_time]
-            args += [w.step.ramp, active, field.offset, w.nonpotential_contribution]
-            launch(field.kernel, (m.worlds, field.count), args)
-        launch(
-            self.gather.gather_force,
-            self.dim,
-            [loads.nonpotential_topology, w.nonpotential_contribution, active, w.nonpotential],
-        )
-
     @labelled("loads")
     def hold_nonpotential(self, active: wp.array) -> None:
         """From here on Phi holds the non-potential forces of this iterate."""
-        if self.model.loads.nonpotential:
+        if self.terms.traits.nonpotential:
             args = [self.work.nonpotential, active, self.work.nonpotential_held]
             self.launch(self.newton.copy_active, self.dim, args)
 
@@ -249,10 +229,10 @@ class Residual:
     def blocks(self, active: wp.array) -> None:
         """Diagonal blocks of H at the iterate: D for the norms, inverses for the preconditioner."""
         m, w, launch = self.model, self.work, self.launch
-        for block, kernels in zip(m.blocks, self.block_kernels):
-            args = [block.data, w.u, w.step.dq_dv, active, w.block_contribution]
-            launch(kernels.diagonal_blocks, (m.worlds, block.count), args)
-        args = [m.topology, w.block_contribution, w.step.mass_factor, w.step.dq_dv, active, w.diagonal, w.inverse]
+        for term in self.terms:
+            term.diagonal(self.at, active)
+        args = [m.topology, w.block_contribution, w.pool_block, w.step.mass_factor, w.step.dq_dv, active]
+        args += [w.diagonal, w.inverse]
         launch(self.gather.gather_blocks, self.dim, args)
 
     @labelled("product")
@@ -266,13 +246,9 @@ class Residual:
                 args += [lanes, self.pool, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
         elif not self.by_matrix:
-            for block, kernels in zip(m.blocks, self.block_kernels):
-                args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
-                launch(kernels.tangent_product, (m.worlds, block.count), args)
-        if m.loads.followers:
-            self._follower_product(p, active)
-        if self.constraints:
-            self.constraints.product(p, active)
+            self.elements.tangent(self.at, p, active)
+        for term in self.terms:
+            term.product(self.at, p, active)
         rest = [self.additions, p, active, self.con, w.multipliers]
         if self.by_matrix:
             assert self.assembled is not None
@@ -289,21 +265,16 @@ class Residual:
             args = [topology, w.contribution, *rest, out, w.warp_rows]
             launch(total, (m.worlds, launch.padded(m.slots)), args)
 
-    def _follower_product(self, p: wp.array, active: wp.array) -> None:
-        """Contributions of the follower loads' symmetric tangent times p."""
-        m, w, launch = self.model, self.work, self.launch
-        for part in m.loads.followers:
-            args = [part.data, w.u, w.law_value, active, p, w.nonpotential_tangent]
-            launch(part.product, (m.worlds, part.count), args)
-
     @labelled("loads")
     def follower_curvature(self, active: wp.array) -> None:
         """p.K p of the follower loads along the direction p, into the Newton control."""
-        m, w, launch = self.model, self.work, self.launch
-        if not m.loads.followers:
+        w, launch = self.work, self.launch
+        if not self.terms.traits.tangent:
             return
-        self._follower_product(w.direction, active)
-        args = [m.loads.nonpotential_topology, w.nonpotential_tangent, active, w.Hp]
+        for term in self.terms:
+            if not term.potential:
+                term.product(self.at, w.direction, active)
+        args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather.gather_force, self.dim, args)
         launch(self.newton.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
         self.reduce(w.rows, 1, active, w.newton.follower_sum)

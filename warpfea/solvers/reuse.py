@@ -1,4 +1,4 @@
-"""What is made at one iterate and kept for later ones: when it is made anew, and what a resumed run must know of it."""
+"""Reuse of a preconditioner or matrix made at an earlier iterate: its rule, its place, and their part of the state."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["Reuse"]
 
 
 class Reuse:
-    """The rule of kernels/solvers/reuse.py for one thing, and where it was made.
+    """The rule of kernels/solvers/reuse.py for one object (a preconditioner or a matrix), and the place of the object.
 
     Attributes:
-        control: the rule's counts on the device; `build` flags the worlds that make theirs.
-        place: displacements that it is made at, (world, slot).
+        control: the rule's counts on the device; `build` flags the worlds that make the object before a solve.
+        place: displacements that it is made at, [world, slot], m.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, name: str, limit: float) -> None:
@@ -39,37 +39,37 @@ class Reuse:
         self.control.stale.fill_(1)
         self.control.mass_factor.fill_(-1.0)
         self.place = work.array(f"{name} place", self.dim, model.types.vec3)
-        # without a state that remembers it
+        # until `register`, no state keeps it
         self.control.kept, self.kept = wp.zeros((0, 0), dtype=wp.float64, device=model.device), self.place
 
     def register(self, state: State) -> None:
-        """Put into the state where it was made, and the rule's counts."""
+        """Make the place and the rule's counts part of the state, so that a resumed run takes the same decisions."""
         self.control.kept = state.register(self.name, wp.float64, (6,), (0.0, -1.0, -1.0, 0.0, 0.0, 0.0))
         self.kept = state.register(f"{self.name}_displacement", self.model.types.vec3, (self.model.slots,))
 
     def forget(self, flags: wp.array) -> None:
-        """The state of flagged worlds was set from elsewhere."""
+        """Note that the state of the flagged worlds was set from elsewhere: the object is made again from its place."""
         self.launch(self.kernels.mark, self.model.worlds, [flags, self.control])
 
     def decide(self, active: wp.array) -> None:
-        """Flag the worlds that make theirs before this solve."""
+        """Flag the worlds that make the object before this solve, in `control.build`."""
         w = self.work
         self.control.any_build.zero_()
         args = [self.control, w.newton, w.step.mass_factor, w.step.dq_dv, active]
         self.launch(self.kernels.decide, self.model.worlds, args)
 
     def carry(self, accepted: wp.array | None = None) -> None:
-        """Take the place: the iterate's or, where the state was set from elsewhere, the state's.
+        """Before a solve: set the place to the iterate where the object is made anew, to the state's where restored.
 
-        `accepted`: of a step; the state takes it then.
+        `accepted`: flags of a step; given them, the state of accepted worlds takes the place instead.
         """
         args = [self.control, self.none if accepted is None else accepted, self.work.u, self.kept, self.place]
         self.launch(self.kernels.carry_places, self.dim, args)
 
     def made(self) -> None:
-        """It was made where it was flagged."""
+        """Note that the flagged worlds have made the object."""
         self.launch(self.kernels.made, self.model.worlds, [self.control])
 
     def commit(self, accepted: wp.array) -> None:
-        """The step was accepted: tell the state, after the places."""
+        """Store the rule's counts in the state of accepted worlds, after `carry` has stored the place."""
         self.launch(self.kernels.commit, self.model.worlds, [self.control, accepted])

@@ -1,23 +1,22 @@
-"""The two-level preconditioner: tiles of 48 unknowns and the affine motions of groups of tiles, added.
+"""The two-level preconditioner: inverses of tiles of 48 unknowns plus a coarse space, the affine motions of groups.
 
-z = T r + P C P^T r: T holds dense inverses of the diagonal blocks of H, P the four affine functions per axis of each
-group of 64 slots (a position slot moves by a + B (X - Xc), a gradient slot along E by B E), and C stands for the
-inverse of P^T H P. C is dense when that is small; else it is CHEBYSHEV_STEPS steps of the Chebyshev iteration
-preconditioned by the same construction one level down. Adding all levels up instead (each treated once) is cheaper per
-iteration, but then iterations grow with the mesh.
+z = T r + P C P^T r. T holds dense inverses of the diagonal blocks of H for the tiles, P the four affine functions per
+axis of each group of 64 slots (a position slot moves by a + B (X - Xc), a gradient slot along E by B E), and C
+approximates the inverse of P^T H P. C is a dense inverse where that matrix is small, else CHEBYSHEV_STEPS steps of the
+Chebyshev iteration, preconditioned by the same construction one level down. Adding the corrections of all levels
+instead, each once, is cheaper per iteration, but then iterations grow with the mesh.
 
-What was measured and costs more time than it saves: tiles that overlap (16 of 64 slots their own: 93 iterations in
+Measured, and slower than without: tiles that overlap (16 of 64 slots their own: 93 iterations in
 place of 172 with nu = 0.49, but inverses 16 times as large), and the ten quadratic functions of groups for shells (in
 statics 42 iterations in place of 105; 50k unknowns in dynamics on the CPU 32 for 48, but 8.6 ms for 3.0 each, 593 ms
 per step for 478; in groups of 160 slots, where they cost the same, statics gain a third and dynamics nothing).
 
-In a model whose unknowns have an order in which H is a narrow band the one level is that, factored as a whole
-(band.py).
+Where the unknowns have an order in which H is a narrow band, H itself is the only level, factored as a band (band.py).
 
 An odd number of Chebyshev steps keeps C positive whatever the largest eigenvalue is.
 
-Directions of constraints: tiles and coarse matrices hold the penalties, and (D + (dq/dv) J^T rho J)^-1 by Woodbury's
-identity is added on the slots that constraints touch, because a constraint may tie slots of several tiles.
+With constraints, tiles and coarse matrices contain their penalties. As a constraint may couple slots of several tiles,
+(D + (dq/dv) J^T rho J)^-1 by Woodbury's identity is added on the slots that constraints touch.
 """
 
 from __future__ import annotations
@@ -33,6 +32,8 @@ from ..kernels.solvers.blocks import block_kernels
 from ..kernels.solvers.levels import LANES, TILE, TILE_SLOTS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
+from ..model.state import words_of
+from ..terms.term import Kept
 from .band import BandFactor, find_band
 from .levels import GROUP_SLOTS, Level, make_levels
 from .reuse import Reuse
@@ -50,9 +51,9 @@ CHEBYSHEV_STEPS = 3
 LARGEST = 3.5
 """Assumed largest eigenvalue of a preconditioned coarse matrix (2.7 to 3.5 were measured)."""
 RATIO = 8.0
-"""The largest over the smallest eigenvalue that the Chebyshev steps are made for."""
+"""Ratio of the largest to the smallest eigenvalue that the Chebyshev steps are designed for."""
 REBUILD_COST = 40.0
-"""Iterations that making the preconditioner costs."""
+"""Cost of making the preconditioner, in PCG iterations."""
 
 
 class LevelArrays:
@@ -93,7 +94,7 @@ class LevelArrays:
 
 
 class TwoLevel:
-    """See the module; it is made anew when the rule of kernels/solvers/reuse.py says so."""
+    """See the module. It is made anew when the rule of kernels/solvers/reuse.py says so."""
 
     def __init__(
         self,
@@ -112,22 +113,26 @@ class TwoLevel:
         self.kernels = level_kernels(model.dtype, self.storage)
         self.making = build_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
-        self.jacobi = pcg_kernels(model.dtype, model.constraints is not None).block_jacobi
+        self.jacobi = pcg_kernels(model.dtype, model.terms.traits.gated).block_jacobi
         self.dim = (model.worlds, model.slots)
         self.levels = self._levels(kind)
         self.arrays = [LevelArrays(model, work, level, k, self.storage) for k, level in enumerate(self.levels)]
-        constraints = residual.constraints
+        self.at, self.terms = residual.at, model.terms
+        for term in self.terms:
+            term.reserve(self.at, self.assembled, projected=True)
+        self.adding = model.terms.traits.pooled or model.terms.traits.ties  # terms add to the matrix
         band, pattern = self.levels[0].band, self.assembled.pattern
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         # the factors of the operator's own matrix where they cost little (the matrix made here serves for D alone
         # then); wider ones are kept for longer than that
-        self.follows = band is not None and band.quick and residual.by_matrix and constraints is None
+        self.follows = band is not None and band.quick and residual.by_matrix and not self.adding
         if self.follows:
             residual.on_matrix = self._factor
         self.value = self.assembled.values("preconditioner matrix")
         self.lanes = LANES if model.device.is_cuda else 1
         self.by_row = 0 if model.device.is_cuda else 1
-        self.tied = constraints is not None and not self.levels[0].whole
+        self.corrected = not self.levels[0].whole and any(term.preconditions(self.at) for term in self.terms)
+        self.kept: dict[str, Kept] = {}
         self.rebuild_cost = band.rebuild_cost if band is not None and not self.follows else REBUILD_COST
         # another name: iterations with factors and with levels have nothing to do with each other
         name = "preconditioner" if band is None else "preconditioner_banded"
@@ -136,7 +141,7 @@ class TwoLevel:
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
     def _levels(self, kind: str) -> list[Level]:
-        """Those of a kind: "two-level", "tiles" (without a coarse part) or "banded"."""
+        """The levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
         model, pattern = self.model, self.assembled.pattern
         if kind == "banded":
             band = find_band(model) or find_band(model, any_width=True)
@@ -147,29 +152,27 @@ class TwoLevel:
 
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
-        m = self.model
         self.reuse.control.limit = self.rebuild_cost
         self.reuse.register(state)
-        if m.constraints:
-            rows = m.constraints.count
-            self.place_rows = (
-                self.work.array("preconditioner gradient", (m.worlds, 3 * rows), wp.vec3d),
-                self.work.array("preconditioner stiffness", (m.worlds, rows), wp.float64),
-            )
-            self.kept_rows = (
-                state.register("preconditioner_gradient", wp.vec3d, (3 * rows,)),
-                state.register("preconditioner_stiffness", wp.float64, (rows,)),
-            )
+        for term in self.terms:
+            kept = Kept([], [], [])
+            for name, array in term.keep(self.at):
+                kept.live.append(array)
+                kept.place.append(self.work.array(f"preconditioner {name}", array.shape, array.dtype))
+                kept.state.append(state.register(f"preconditioner_{name}", array.dtype, array.shape[1:]))
+            if kept.live:
+                self.kept[term.name] = kept
 
     def _carry(self, accepted: wp.array | None = None) -> None:
-        m, reuse = self.model, self.reuse
+        reuse = self.reuse
         reuse.carry(accepted)
-        if m.constraints:
-            mul = self.work.multipliers
-            args = [reuse.control, reuse.none if accepted is None else accepted, mul.gradient, mul.stiffness]
-            self.launch(
-                reuse.kernels.carry_rows, (m.worlds, m.constraints.count), [*args, *self.kept_rows, *self.place_rows]
-            )
+        flags = reuse.none if accepted is None else accepted
+        for term in self.terms:
+            kept = self.kept.get(term.name)
+            if kept is not None and not term.carry(self.at, kept, reuse.control, flags):
+                for arrays in zip(kept.live, kept.state, kept.place):
+                    words = [words_of(array) for array in arrays]
+                    self.launch(reuse.kernels.carry_words, words[0].shape, [reuse.control, flags, *words])
 
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
@@ -180,7 +183,7 @@ class TwoLevel:
     # the seam
 
     def follow(self, active: wp.array) -> None:
-        """Nothing: it lags behind the iterate."""
+        """Nothing to do: it is reused at later iterates."""
 
     @labelled("build")
     def forget(self, flags: wp.array) -> None:
@@ -226,11 +229,12 @@ class TwoLevel:
         args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
         launch(k.add_coarse, dim, args)
-        if self.tied:
-            assert self.residual.constraints is not None
+        if self.corrected:
             args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
             launch(self.jacobi, dim, args)
-            self.residual.constraints.precondition(r, w.Hp, active, into=z)
+            for term in self.terms:
+                if term.preconditions(self.at):
+                    term.precondition(self.at, r, w.Hp, active, into=z)
 
     # application
 
@@ -243,7 +247,7 @@ class TwoLevel:
         self.launch(self.kernels.apply_dense, (B, self.launch.padded(3 * n * lanes)), args)
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
-        """z = tiles times r; returns what is to be prolonged."""
+        """z = T r on a level; returns the coarse correction C P^T r, which is still to be interpolated by P."""
         level, arrays = self.levels[depth], self.arrays[depth]
         last = depth + 1 == len(self.levels)  # tiles alone
         coarse = z if last else self.arrays[depth + 1].vectors["r"]
@@ -263,7 +267,7 @@ class TwoLevel:
         return below["x"]
 
     def _chebyshev(self, depth: int, active: wp.array) -> None:
-        """x = C r of a level between, r is used up."""
+        """x = C r on an intermediate level by Chebyshev steps; r is overwritten."""
         level, arrays = self.levels[depth], self.arrays[depth]
         v = arrays.vectors
         dim = (self.model.worlds, level.slots)
@@ -296,15 +300,17 @@ class TwoLevel:
         # the rows follow once the penalties are known
         self.reuse.carry()
         self.assembled.assemble(self.reuse.place, factors, flags, self.value, projected=True)
+        if self.adding and m.terms.traits.pooled:
+            self._carry()
+            self._add(penalties=False)
         args = [m.topology, self.assembled.pattern.data, self.value, flags, w.diagonal, w.inverse]
         launch(self.blocks.take_diagonal, self.dim, args)
-        if m.constraints:
-            constraints = self.residual.constraints
-            assert constraints is not None
+        if m.terms.traits.gated:
             if penalty:
-                constraints.build(flags, penalty=True)
+                for term in self.terms:
+                    term.scale(self.at, flags)
             self._carry()
-            self.assembled.add_constraints(*self.place_rows, reuse.dq_dv, flags, self.value)
+            self._add(penalties=True)
         self.reuse.made()
         if self.band:
             if not self.follows:
@@ -322,6 +328,14 @@ class TwoLevel:
             free = self.all_free if depth else m.topology.free
             args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
             launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+
+    def _add(self, *, penalties: bool) -> None:
+        """Add the terms' blocks to the matrix: those that D is taken from, or the penalties, which follow from D."""
+        reuse = self.reuse.control
+        for term in self.terms:
+            if term.penalty == penalties:
+                kept = self.kept[term.name].place if term.name in self.kept else []
+                term.blocks(self.at, self.assembled, kept, reuse.dq_dv, reuse.build, self.value, projected=True)
 
     @labelled("build")
     def _factor(self, value: wp.array, flags: wp.array) -> None:
@@ -342,7 +356,7 @@ class TwoLevel:
         self.launch(self.making.invert_tiles, self.model.worlds * tiles * self.lanes, args, block_dim=LANES)
 
     def _invert_dense(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array) -> None:
-        """Gauss-Jordan by blocks of a tile's size."""
+        """Dense inverse by block Gauss-Jordan, with blocks of the size of a tile."""
         B, N, k, launch = self.model.worlds, arrays.size, self.making, self.launch
         keep = level is self.levels[0]
         args = [level.pattern.data, value, level.slots, flags, arrays.scale, arrays.matrix]

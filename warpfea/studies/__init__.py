@@ -1,1 +1,1 @@
-"""Commands that measure: benchmarks, profiles, comparisons."""
+"""Commands that measure: benchmarks, profiles, studies. They print tables and write the files of tests/results."""

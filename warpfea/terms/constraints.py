@@ -1,370 +1,340 @@
-"""Constraints as data: vectors linear in the slots, scalar rows made of them, and the rows' tables on the device."""
+"""Constraints by an augmented Lagrangian: their values, forces, part of H, and multipliers.
+
+The classical method solves g(v; lambda) = 0 at fixed lambda, then adds rho c, and so on until |c| <= tol. Here lambda
+is updated with every Newton step by rho (c + (dq/dv) J p), which is what the constraint linearised at the iterate makes
+of the same formula: Newton's method on the pair (v, lambda), with 1/rho on the diagonal that keeps redundant rows
+solvable. The outer loop costs nothing then, and the curvature sum lambda d2c/dq2 is free of rho c. The classical update
+is `NewtonPCG(multipliers="outer")`.
+"""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..base.errors import ModelError
-from ..kernels.terms.constraints import (
-    DISTANCE,
-    DOT,
-    TURN,
-    constraint_kernels,
-    constraint_struct,
-    joint_struct,
-)
-from ..model.joints import Joint, Vector
+from ..base.launch import Launcher
+from ..kernels.common.traits import Traits
+from ..kernels.solvers.deflation import deflation_kernels
+from ..kernels.solvers.newton import TERM_ROWS
+from ..kernels.solvers.reuse import reuse_kernels
+from ..kernels.terms.constraint_blocks import constraint_block_kernels
+from ..kernels.terms.constraints import JOINT_COLUMNS, multiplier_struct
+from .constraint_tables import ConstraintTables
+from .term import NUMERICAL, WORK, At, Column, Kept, Term, part
+from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
     from ..model.model import Model
+    from ..model.state import State
+    from .workspace import Workspace
 
 __all__ = ["Constraints"]
 
-DENSE = 64
-"""Most coupled rows of several joints whose matrix is inverted as one; beyond, joints are swept colour by colour."""
+THREAD_LIMIT = 16
+"""Rows of a cluster up to which one thread inverts its matrix; larger ones take a launch per pivot."""
 
 
-class Constraints:
-    """Rows of a model on the device, ordered by connected component and by cluster of rows that share slots.
+class Constraints(Term):
+    """The joints, welds and single constraints of a model.
 
     Attributes:
-        joints: in the order they were added.
-        count: number of rows.
-        rows_of: for each joint the indices of its rows.
-        data: the device tables.
+        tables: their rows on the device.
     """
 
-    def __init__(self, model: Model, joints: Sequence[Joint]) -> None:
-        self.model = model
-        self.joints = list(joints)
-        self.kernels = constraint_kernels(model.dtype)
-        self.data: Any = None
-        self.joint_data: Any = None
-        self.cluster_sizes = self.colour_sizes = np.zeros(0, dtype=np.int64)
-        self.colour_host = self.cluster_host = np.zeros(0, dtype=np.int64)
-        self.rows = [row for joint in self.joints for row in joint.rows]
-        self.count = len(self.rows)
+    name = "constraints"
+    columns = (Column("work_joints", WORK), Column("", NUMERICAL))
+    parts = {"constraints": "values, multipliers and work of joints"}
+    penalty = True
 
-    # connectivity, before the model knows its components
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.traits = Traits(ties=True, stored=True, gated=True)
+        self.tables = ConstraintTables(model, model.description.joints)
+        self.kernels = self.tables.kernels
+        self.rows = self.tables.count
+        self.report_columns = JOINT_COLUMNS * len(self.tables.joints)
+        self.dim = (model.worlds, self.tables.count)
 
-    def slot_groups(self) -> list[np.ndarray]:
-        """For each joint the model slots that its rows tie."""
-        return [
-            np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.terms]))
-            for joint in self.joints
-        ]
+    @classmethod
+    def of(cls, model: Model) -> Constraints | None:
+        return cls(model) if model.description.joints else None
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {"constraints": bool(model.description.joints)}
+
+    def ties(self) -> list[np.ndarray]:
+        return self.tables.slot_groups()
+
+    def build(self, laws: TimeLaws) -> None:
+        self.tables.build(self.model.component, laws)
 
     def hold(self, free: np.ndarray) -> None:
-        """Clear the directions (components, 3) in which a component is tied to the ground."""
-        position = self.model.slot_kind == 0
-        for k, row in enumerate(self.rows):
-            felt = False
-            for side in range(3):
-                slots, weights, _ = self._entries[3 * k + side]
-                size = np.abs(weights).sum()
-                felt |= bool(abs(weights[position[slots]].sum()) > 1e-9 * size) if len(slots) else False
-            if felt:
-                axis = row.b.value if row.kind == DOT and not row.b.parts else np.ones(3)
-                free[self.component_host[k], np.abs(axis) > 1e-12] = 0.0
+        self.tables.hold(free)
 
-    # the device tables
-
-    def build(self, component: np.ndarray, add_law: Any) -> None:
-        """Upload; `component` of each slot, `add_law` numbers a time law."""
-        self._order(component)
-        self._fill_terms(add_law)
-        self._fill_pairs()
-        self._fill_joints()
-
-    def _order(self, component: np.ndarray) -> None:
-        """Sort the joints by component and cluster."""
-        groups = self.slot_groups()
-        free = np.any(self.model.free_host > 0.0, axis=1)
-        joint_of = np.concatenate([np.full(len(g), k) for k, g in enumerate(groups)])
-        slot = np.concatenate(groups)
-        keep = free[slot]
-        shared = sp.csr_matrix(
-            (np.ones(keep.sum()), (joint_of[keep], slot[keep])), shape=(len(groups), self.model.slots)
-        )
-        cluster = sp.csgraph.connected_components(shared @ shared.T, directed=False)[1]
-        own = np.array([component[g[0]] for g in groups])
-        order = np.lexsort((np.arange(len(groups)), cluster, own))
-        first, rows, self.rows_of = 0, [], [np.zeros(0, dtype=np.int64)] * len(groups)
-        clusters, components = [], []
-        for k in order:
-            n = len(self.joints[k].rows)
-            self.rows_of[k] = np.arange(first, first + n)
-            first += n
-            rows += self.joints[k].rows
-            clusters += [cluster[k]] * n
-            components += [own[k]] * n
-        self.rows = rows
-        # renumber in order of appearance, so that clusters are runs of rows
-        seen: dict[int, int] = {}
-        self.cluster_host = np.array([seen.setdefault(int(c), len(seen)) for c in clusters])
-        self.component_host = np.array(components)
-
-    def _fill_terms(self, add_law: Any) -> None:
-        m, rows = self.model, self.rows
-        entries = [vector.entries() for row in rows for vector in row.terms]
-        start = np.concatenate([[0], np.cumsum([len(e[0]) for e in entries])])
-        slot = np.concatenate([e[0] for e in entries])
-        weight = np.concatenate([e[1] for e in entries])
-        self.child_host = np.concatenate([e[2] for e in entries])
-        term = np.repeat(np.arange(len(entries)), np.diff(start))
-        self.term_host, self.slot_host, self.weight_host, self.start_host = term, slot, weight, start
-        numbers: dict[int, int] = {}
-        law = np.full(len(rows), -1)
-        for k, row in enumerate(rows):
-            if row.law is not None:
-                if id(row.law) not in numbers:
-                    numbers[id(row.law)] = add_law(row.law)
-                law[k] = numbers[id(row.law)]
-        data = constraint_struct()()
-        self.scale_host = np.array([r.scale * (m.size if r.angular else 1.0) for r in rows])
-        order = np.argsort(slot, kind="stable")
-        slot_start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
-        self.reference_host = np.array([vector.value for row in rows for vector in row.terms])
-        tables: dict[str, tuple[Any, Any]] = {
-            "kind": ([r.kind for r in rows], wp.int32),
-            "scale": (self.scale_host, wp.float64),
-            "constant": ([r.constant for r in rows], wp.float64),
-            "fixed": ([r.fixed for r in rows], wp.float64),
-            "law": (law, wp.int32),
-            "law_component": ([r.component for r in rows], wp.int32),
-            "component": (self.component_host, wp.int32),
-            "start": (start, wp.int32),
-            "slot": (slot, wp.int32),
-            "weight": (weight, wp.float64),
-            "reference": (self.reference_host, wp.vec3d),
-            "slot_start": (slot_start, wp.int32),
-            "slot_term": (term[order], wp.int32),
-            "slot_weight": (weight[order], wp.float64),
-        }
-        for name, (values, dtype) in tables.items():
-            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
-        self.data = data
-        self._entries = entries
-
-    def _fill_pairs(self) -> None:
-        """For each pair of rows that share slots the pairs of vectors that do: dense in clusters, else couplings."""
-        first = self._cluster_rows()
-        shared = self._shared_vectors()
-        n = np.diff(first)
-        pair_start, pair_side, pair_block = [0], [], []
-        couple_start, couple_column = [0], []
-        couple_pairs: list[list[tuple[tuple[int, int], int]]] = []
-        for i in range(self.count):
-            c = self.cluster_host[i]
-            columns = shared[i]
-            for j in range(first[c], first[c + 1]):
-                for side, block in columns.get(j, ()):
-                    pair_side.append(side)
-                    pair_block.append(block)
-                pair_start.append(len(pair_block))
-            for j in sorted(columns):
-                if self.cluster_host[j] != c:
-                    couple_column.append(j)
-                    couple_pairs.append(columns[j])
-            couple_start.append(len(couple_column))
-        couple_pair = [len(pair_block)]
-        for pairs in couple_pairs:
-            pair_side += [side for side, _ in pairs]
-            pair_block += [block for _, block in pairs]
-            couple_pair.append(len(pair_block))
-        self.couple_count = len(couple_column)
-        self.matrix_entries = int((n**2).sum())
-        self.cluster_sizes = n
-        couple_row = np.repeat(np.arange(self.count), np.diff(couple_start))
-        self._colour_clusters(couple_row, np.array(couple_column, dtype=np.int64))
-        tables: dict[str, tuple[Any, Any]] = {
-            "cluster": (self.cluster_host, wp.int32),
-            "cluster_start": (first, wp.int32),
-            "matrix_start": (np.concatenate([[0], np.cumsum(n**2)[:-1]]), wp.int32),
-            "pair": (pair_start, wp.int32),
-            "pair_side": (np.reshape(pair_side or [(0, 0)], (-1, 2)), wp.vec2i),
-            "pair_block": (pair_block or [0], wp.int32),
-            "couple_start": (couple_start, wp.int32),
-            "couple_row": (couple_row if len(couple_row) else [0], wp.int32),
-            "couple_column": (couple_column or [0], wp.int32),
-            "couple_pair": (couple_pair, wp.int32),
-            "colour": (self.colour_host, wp.int32),
-            "colour_cluster": (np.argsort(self.colour_host, kind="stable"), wp.int32),
-        }
-        for name, (values, dtype) in tables.items():
-            setattr(self.data, name, self.model.array("constraints", np.asarray(values), dtype))
-
-    def _cluster_rows(self) -> np.ndarray:
-        """Split runs of coupled rows that are too large for a dense inverse into their joints; first row of each."""
-        sizes = np.bincount(self.cluster_host)
-        joint = np.zeros(self.count, dtype=np.int64)
-        for k, rows in enumerate(self.rows_of):
-            joint[rows] = k
-        split = (sizes > DENSE)[self.cluster_host]
-        label = np.where(split, self.count + joint, self.cluster_host)
-        starts = np.flatnonzero(np.concatenate([[True], label[1:] != label[:-1]]))
-        self.cluster_host = np.cumsum(np.concatenate([[0], (label[1:] != label[:-1]).astype(int)]))
-        return np.concatenate([starts, [self.count]])
-
-    def _shared_vectors(self) -> list[dict[int, list[tuple[tuple[int, int], int]]]]:
-        """For each row the rows that it shares slots with: pairs of sides and the block of both vectors.
-
-        Blocks sum w w' D^-1 over the slots; rows share vectors (a pin's three rows are of one), so blocks are few.
-        """
-        free = np.any(self.model.free_host > 0.0, axis=1)
-        number: dict[int, int] = {}
-        weights: list[dict[int, float]] = []
-        rows_of_vector: list[list[tuple[int, int]]] = []
-        sides: list[list[tuple[int, int]]] = []
-        for k, row in enumerate(self.rows):
-            own = []
-            for side, vector in enumerate((row.a, row.b, row.a2)):
-                if vector is None or not vector.parts:
-                    continue
-                if id(vector) not in number:
-                    slots, w, _ = self._entries[3 * k + side]
-                    merged: dict[int, float] = {}
-                    for s, x in zip(slots.tolist(), w.tolist()):
-                        if free[s]:
-                            merged[s] = merged.get(s, 0.0) + x
-                    number[id(vector)] = len(weights)
-                    weights.append(merged)
-                    rows_of_vector.append([])
-                own.append((side, number[id(vector)]))
-                rows_of_vector[own[-1][1]].append((k, side))
-            sides.append(own)
-        of_slot: dict[int, list[int]] = {}
-        for v, merged in enumerate(weights):
-            for s in merged:
-                of_slot.setdefault(s, []).append(v)
-        blocks: dict[tuple[int, int], int] = {}
-        near: list[list[tuple[int, int]]] = []
-        block_start, block_slot, block_weight = [0], [], []
-        for u, merged in enumerate(weights):
-            own_blocks = []
-            for v in sorted({v for s in merged for v in of_slot[s]}):
-                key = (min(u, v), max(u, v))
-                if key not in blocks:
-                    common = [(s, x * weights[v][s]) for s, x in merged.items() if s in weights[v]]
-                    blocks[key] = len(block_start) - 1
-                    block_slot += [s for s, _ in common]
-                    block_weight += [x for _, x in common]
-                    block_start.append(len(block_slot))
-                own_blocks.append((v, blocks[key]))
-            near.append(own_blocks)
-        out: list[dict[int, list[tuple[tuple[int, int], int]]]] = []
-        for own in sides:
-            columns: dict[int, list[tuple[tuple[int, int], int]]] = {}
-            for side, u in own:
-                for v, block in near[u]:
-                    for other, other_side in rows_of_vector[v]:
-                        columns.setdefault(other, []).append(((side, other_side), block))
-            out.append(columns)
-        self.block_count = len(block_start) - 1
-        m = self.model
-        self.data.block_start = m.array("constraints", np.asarray(block_start), wp.int32)
-        self.data.block_slot = m.array("constraints", np.asarray(block_slot or [0]), wp.int32)
-        self.data.block_weight = m.array("constraints", np.asarray(block_weight or [0.0]), wp.float64)
-        return out
-
-    def _colour_clusters(self, row: np.ndarray, column: np.ndarray) -> None:
-        """Greedy colouring of coupled clusters; `colour_sizes` counts those of each colour."""
-        n = len(self.cluster_sizes)
-        near: list[set[int]] = [set() for _ in range(n)]
-        for a, b in zip(self.cluster_host[row].tolist(), self.cluster_host[column].tolist()):
-            near[a].add(b)
-        colour = np.full(n, -1)
-        for k in range(n):
-            taken = {int(colour[j]) for j in near[k]}
-            colour[k] = next(c for c in itertools.count() if c not in taken)
-        self.colour_host = colour
-        self.colour_sizes = np.bincount(colour)
-
-    def _fill_joints(self) -> None:
-        m = self.model
-        position = m.slot_kind == 0
-        origin = np.concatenate([np.tile(b.origin, (b.slot_count, 1)) for b in m.bodies])
-        place = m.reference + position[:, None] * origin
-        anchors = [joint.anchor.entries() for joint in self.joints]
-        data = joint_struct()()
-        side = np.where(self.child_host, 1, 0)
-        for rows in self.rows_of:
-            own = slice(self.start_host[3 * rows[0]], self.start_host[3 * rows[-1] + 3])
-            if not self.child_host[own].any():  # the child is in space: it feels what the parent does, reversed
-                side[own] = -1
-        tables: dict[str, tuple[Any, Any]] = {
-            "first": ([rows[0] for rows in self.rows_of], wp.int32),
-            "last": ([rows[-1] + 1 for rows in self.rows_of], wp.int32),
-            "anchor": ([joint.anchor.value for joint in self.joints], wp.vec3d),
-            "anchor_start": (np.concatenate([[0], np.cumsum([len(a[0]) for a in anchors])]), wp.int32),
-            "anchor_slot": (np.concatenate([a[0] for a in anchors] + [np.zeros(1)]), wp.int32),
-            "anchor_weight": (np.concatenate([a[1] for a in anchors] + [np.zeros(1)]), wp.float64),
-            "role": (side * (1 + position[self.slot_host]), wp.int32),
-            "place": (place[self.slot_host], wp.vec3d),
-        }
-        for name, (values, dtype) in tables.items():
-            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
-        self.joint_data = data
-        for k, joint in enumerate(self.joints):
-            joint.index = k
-
-    # on the host, for supports, tests and users
-
-    def expand(self, G: np.ndarray) -> sp.csr_matrix:
-        """Rows of the Jacobian from the gradients of the vectors (rows, 3, 3)."""
-        data = self.weight_host[:, None] * G.reshape(-1, 3)[self.term_host]
-        rows = np.repeat(self.term_host // 3, 3)
-        columns = (3 * self.slot_host[:, None] + np.arange(3)).ravel()
-        return sp.csr_matrix((data.ravel(), (rows, columns)), shape=(self.count, 3 * self.model.slots))
-
-    def measure(self, joint: Joint, what: str | None, state: Any) -> np.ndarray:
-        """ "angle" (rad), "travel" or "length" (m) of a joint, (worlds,); ModelError where it has none."""
-        length = joint.rows[0].a if joint.rows[0].kind == DISTANCE else None
-        has = {"angle": joint.angle, "travel": joint.travel, "length": length}
-        known = [name for name, vectors in has.items() if vectors]
-        what = what or next(iter(known), None)
-        if what not in known:
-            raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no {what or 'angle, travel or length'}")
-        target = self.targets(state)
-        out = []
-        for world, u in enumerate(state.displacement.numpy().astype(float)):
-            if what == "length":
-                assert length is not None
-                out.append(np.linalg.norm(self._present(length, u)))
-            elif what == "travel":
-                gap, axis = (self._present(v, u) for v in joint.travel or ())
-                out.append(gap @ axis)
-            else:
-                a, a2, b = (self._present(v, u) for v in joint.angle or ())
-                angle = np.arctan2(b @ a2, b @ a)
-                driven = [k for k in self.rows_of[joint.index] if self.rows[k].kind == TURN]
-                if driven:
-                    angle += 2.0 * np.pi * np.round((target[world, driven[0]] - angle) / (2.0 * np.pi))
-                out.append(angle)
-        return np.array(out)
-
-    def targets(self, state: Any) -> np.ndarray:
-        """Right sides (worlds, rows) that the state was brought to; of a state that never stepped those of its time."""
-        at_time = self.model.evaluation.constraints(state)[2]
-        if "constraint_target" not in state.names:
-            return at_time
-        reached = state.constraint_target.numpy()
-        return np.where(np.isnan(reached), at_time, reached)
-
-    @staticmethod
-    def _present(vector: Vector, u: np.ndarray) -> np.ndarray:
-        slots, weights, _ = vector.entries()
-        return vector.value + weights @ u[slots]
+    def incidence(self) -> tuple[np.ndarray, np.ndarray, int]:
+        return self.tables.term_host // 3, self.tables.slot_host, self.tables.count
 
     def hash(self, h: Any) -> None:
-        """Feed what defines the rows into a hash."""
-        for row in self.rows:
-            h.update(f"{row.kind} {row.scale!r} {row.constant!r} {row.fixed!r} {row.component}".encode())
-        for values in (self.slot_host, self.weight_host, self.start_host, self.reference_host):
-            h.update(np.ascontiguousarray(values).tobytes())
+        self.tables.hash(h)
+
+    # for one simulation
+
+    def allocate(self, work: Workspace, at: At) -> None:
+        """Multipliers and matrices, work.multipliers."""
+        model, con = self.model, self.tables
+        mul = multiplier_struct()()
+        B, M = model.worlds, con.count
+        shapes: dict[str, tuple[tuple[int, ...], Any]] = {
+            "gradient": ((B, 3 * M), wp.vec3d),
+            "product": ((B, 3 * M), wp.vec3d),
+            "violation": ((B, model.component_count), wp.float64),
+            "block": ((B, max(con.block_count, 1)), wp.mat33d),
+            "matrix": ((B, con.matrix_entries), wp.float64),
+            "coupling": ((B, max(con.couple_count, 1)), wp.float64),
+        }
+        for name, var in multiplier_struct().vars.items():
+            if isinstance(var.type, wp.array) and name != "rows":
+                shape, dtype = shapes.get(name, ((B, M), wp.float64))
+                setattr(mul, name, work.array(f"Multipliers.{name}", shape, dtype))
+        mul.rows = work.rows_of(self)
+        work.multipliers = mul
+
+    def register(self, at: At) -> None:
+        at.state.register("constraint_force", wp.float64, (self.tables.count,))
+        at.state.register("constraint_target", wp.float64, (self.tables.count,), np.nan)
+
+    def configure(self, at: At) -> None:
+        """Take the solver's options: classical updates or not, kappa, and whether directions are deflated."""
+        at.work.newton.violation = at.work.multipliers.violation
+        mul, options = at.work.multipliers, at.options
+        mul.classical, mul.kappa = int(options.classical), options.kappa
+        deflate = bool(options.deflate)
+        sizes = self.tables.cluster_sizes
+        large = np.flatnonzero(sizes > THREAD_LIMIT)
+        largest = int(sizes[large].max()) if len(large) and deflate else 0
+        table = self.model.array("constraints", large, wp.int32) if largest else None
+        at.scratch[self.name] = Deflation(deflate, largest, table, len(large))
+
+    def modules(self, at: At) -> Iterable[wp.Module]:
+        return {self.kernels.module, deflation_kernels(self.model.dtype).module}
+
+    def start(self, at: At, active: wp.array) -> None:
+        """Right sides at the state's time, where the state does not know them, and the violation at the start."""
+        state, mul = at.state, at.work.multipliers
+        self.begin(at, active)
+        self.prepare(at, active)
+        known = state.constraint_target.numpy()
+        state.constraint_target.assign(np.where(np.isnan(known), mul.target.numpy(), known))
+
+    # in a step
+
+    @part("constraints")
+    def begin(self, at: At, active: wp.array) -> None:
+        """Warm start of an attempt from the state's multipliers and right sides; rho is not known yet."""
+        args = [at.state.constraint_force, at.state.constraint_target, active, at.work.multipliers]
+        at.launch(self.kernels.load_multipliers, self.dim, args)
+
+    @part("constraints")
+    def force(self, at: At, active: wp.array) -> None:
+        """c, J and the augmented potential's rows at work.u."""
+        m, w, k = self.model, at.work, self.kernels
+        at.launch(k.reset_violation, (m.worlds, m.component_count), [active, w.multipliers])
+        args = [self.tables.data, w.u, w.law_value, w.newton.alpha, active, w.multipliers]
+        at.launch(k.evaluate, self.dim, args)
+
+    prepare = force  # J, for rho
+
+    def scale(self, at: At, active: wp.array) -> None:
+        self.invert(at, active, penalty=True)
+
+    def follow(self, at: At, active: wp.array) -> None:
+        self.invert(at, active)
+
+    @part("build")
+    def invert(self, at: At, active: wp.array, *, penalty: bool = False) -> None:
+        """Matrices of the clusters from the inverse diagonal blocks; `penalty`: set rho from them."""
+        deflation: Deflation = at.scratch[self.name]
+        if not (deflation.on or penalty):
+            return
+        m, w, con, k, launch = self.model, at.work, self.tables, deflation_kernels(self.model.dtype), at.launch
+        data, mul = con.data, w.multipliers
+        launch(k.pair_blocks, (m.worlds, con.block_count), [data, w.inverse, active, mul])
+        launch(k.assemble_matrix, self.dim, [data, active, mul])
+        launch(k.assemble_coupling, (m.worlds, con.couple_count), [data, active, mul])
+        if penalty:
+            launch(k.penalty, self.dim, [data, w.step.dq_dv, active, mul])
+        if not deflation.on:
+            return
+        clusters = len(con.cluster_sizes)
+        launch(k.invert_clusters, (m.worlds, clusters), [data, w.step.dq_dv, THREAD_LIMIT, active, mul])
+        for pivot in range(deflation.largest):
+            dim = (m.worlds, deflation.count, deflation.largest)
+            launch(k.eliminate, dim, [data, deflation.large, pivot, active, mul])
+            launch(k.scale_row, dim[:2], [data, deflation.large, pivot, active, mul])
+
+    def product(self, at: At, p: wp.array, active: wp.array) -> None:
+        """Terms of the constraints' part of H p, for the gather."""
+        w = at.work
+        args = [self.tables.data, w.multipliers, p, w.step.dq_dv, active]
+        at.launch(self.kernels.product_terms, self.dim, args)
+
+    @part("constraints")
+    def aim(self, at: At, active: wp.array) -> None:
+        """The multipliers' part of the Newton step in work.direction."""
+        w = at.work
+        args = [self.tables.data, w.multipliers, w.direction, w.newton.quiet, w.step.dq_dv, active]
+        at.launch(self.kernels.predict_change, self.dim, args)
+
+    def adopt(self, at: At, flags: wp.array) -> None:
+        """With every Newton step; the classical method does it in its outer loop."""
+        if not at.options.classical:
+            self.update(at, flags)
+
+    @part("constraints")
+    def update(self, at: At, flags: wp.array) -> None:
+        """Take over the multipliers of the trial."""
+        at.launch(self.kernels.adopt, self.dim, [flags, at.work.multipliers])
+
+    @part("constraints")
+    def book(self, at: At, accepted: wp.array) -> wp.array:
+        """Work of drives and what the chord takes from constraints at rest, along an accepted substep."""
+        w, state = at.work, at.state
+        args = [self.tables.data, w.multipliers, w.u, state.displacement, state.constraint_target, accepted]
+        at.launch(self.kernels.work_terms, self.dim, args)
+        return w.multipliers.rows
+
+    @part("constraints")
+    def commit(self, at: At, accepted: wp.array) -> None:
+        """Keep multipliers and right sides of an accepted substep."""
+        args = [accepted, at.work.multipliers, at.state.constraint_force, at.state.constraint_target]
+        at.launch(self.kernels.commit_multipliers, self.dim, args)
+
+    def report(self, at: At) -> None:
+        """Force and moment on the child, and violation, of each joint."""
+        w, con, state = at.work, self.tables, at.state
+        args = [con.data, w.multipliers, con.joint_data, state.displacement, state.constraint_force]
+        dim = (self.model.worlds, len(con.joints))
+        at.launch(self.kernels.joint_report, dim, [*args, self.report_offset, w.report])
+
+    # in a linear solve
+
+    def keep(self, at: At) -> list[tuple[str, wp.array]]:
+        mul = at.work.multipliers
+        return [("gradient", mul.gradient), ("stiffness", mul.stiffness)]
+
+    def carry(self, at: At, kept: Kept, reuse: Any, accepted: wp.array) -> bool:
+        args = [reuse, accepted, *kept.live, *kept.state, *kept.place]
+        at.launch(reuse_kernels(self.model.dtype).carry_rows, self.dim, args)
+        return True
+
+    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
+        if "couplings" not in self.model.cache:
+            self.model.cache["couplings"] = self.tables.couplings(matrix.pattern)
+
+    def blocks(
+        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        *, projected: bool,
+    ) -> None:  # fmt: skip
+        """J^T rho J and, unless projected, sum lambda d2c/dq2."""
+        k = constraint_block_kernels(self.model.dtype)
+        pairs, count = self.model.cache["couplings"]
+        args = [self.model.topology, matrix.pattern.data, pairs]
+        kernel, more = k.add_penalties, kept
+        if not projected:
+            kernel, more = k.add_tangent, [self.tables.data, at.work.multipliers]
+        at.launch(kernel, (self.model.worlds, count), [*args, *more, dq_dv, active, out])
+
+    def block_modules(self) -> set[wp.Module]:
+        return {constraint_block_kernels(self.model.dtype).module}
+
+    def preconditions(self, at: At) -> bool:
+        return at.scratch[self.name].on
+
+    @part("preconditioner")
+    def precondition(self, at: At, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None) -> None:
+        """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z on the slots of constraints, z = D^-1 r; and r.z.
+
+        With `into` the result is added there instead.
+        """
+        m, w, k, launch = self.model, at.work, deflation_kernels(self.model.dtype), at.launch
+        data, mul = self.tables.data, w.multipliers
+        launch(k.restrict, self.dim, [data, mul, z, active])
+        sizes = self.tables.colour_sizes
+        if len(sizes) == 1:
+            launch(k.solve_clusters, self.dim, [data, mul, active])
+        else:
+            first = np.concatenate([[0], np.cumsum(sizes)])
+            for c in range(len(sizes)):
+                launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 1, active])
+            for c in range(len(sizes) - 2, -1, -1):
+                launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
+        args = [data, mul, w.inverse, r, z, int(into is not None), active, w.warp]
+        launch(k.project, (m.worlds, launch.padded(m.slots)), [*args, z if into is None else into, w.warp_rows])
+
+    # at a state, for checks and results
+
+    def evaluate(self, state: State, multipliers: np.ndarray | None = None) -> Any:
+        """Multiplier struct with the rows evaluated at a state, with given multipliers (rows,) and no penalty."""
+        m, con, B = self.model, self.tables, self.model.worlds
+        launch, laws = Launcher(m.device), m.terms.laws
+
+        def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=m.device)
+
+        every = wp.ones(B, dtype=wp.int32, device=m.device)
+        value = zeros((B, max(laws.count, 1)), wp.vec3d)
+        laws.evaluate(launch, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+        mul = multiplier_struct()()
+        for name in ("value", "target", "last", "scale", "force", "change", "trial", "merit", "excess", "stiffness"):
+            setattr(mul, name, zeros((B, con.count), wp.float64))
+        for name in ("gradient", "product"):
+            setattr(mul, name, zeros((B, 3 * con.count), wp.vec3d))
+        mul.rows = zeros((TERM_ROWS, B, con.count), wp.float64)
+        mul.violation = zeros((B, m.component_count), wp.float64)
+        if multipliers is not None:
+            mul.force.assign(np.tile(multipliers, (B, 1)))
+        mul.last.fill_(np.nan)  # any turn is as good as another
+        args = [con.data, state.displacement, value, zeros((B,), wp.float64), every, mul]
+        launch(self.kernels.evaluate, self.dim, args)
+        return mul
+
+    def values(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values [world, row], gradients [world, 3 row + side, 3] and right sides [world, row] at a state."""
+        mul = self.evaluate(state)
+        return mul.value.numpy(), mul.gradient.numpy(), mul.target.numpy()
+
+    def jacobian(self, state: State, world: int) -> sp.csr_matrix:
+        """dc/dq of one world, (rows, 3 slots) CSR."""
+        return self.tables.expand(self.values(state)[1][world].reshape(-1, 3, 3))
+
+    def curvature(self, state: State, multipliers: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """sum_i multipliers_i d2c_i/dq2 direction, [world, slot, 3]; multipliers (rows,), direction (slots, 3)."""
+        m, con = self.model, self.tables
+        mul = self.evaluate(state, multipliers)
+        host = np.tile(direction, (m.worlds, 1, 1))
+        p = wp.array(host.astype(np.dtype(m.dtype)), dtype=m.types.vec3, device=m.device)
+        one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
+        every = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
+        Launcher(m.device)(self.kernels.product_terms, self.dim, [con.data, mul, p, one, every])
+        out = np.zeros((m.worlds, m.slots, 3))
+        terms = mul.product.numpy()
+        for world in range(m.worlds):
+            np.add.at(out[world], con.slot_host, con.weight_host[:, None] * terms[world, con.term_host])
+        return out
+
+
+class Deflation:
+    """How directions of constraints are treated apart in a preconditioner.
+
+    Attributes:
+        on: they are; else the preconditioner holds the penalties itself.
+        largest, large, count: rows of the largest cluster above THREAD_LIMIT, and those clusters.
+    """
+
+    def __init__(self, on: bool, largest: int, large: wp.array | None, count: int) -> None:
+        self.on, self.largest, self.large, self.count = on, largest, large, count

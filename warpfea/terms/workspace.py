@@ -11,13 +11,12 @@ from ..base.errors import ModelError
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
-from ..kernels.solvers.newton import COMPONENT_ROWS, LANES, control_struct
+from ..kernels.solvers.newton import COMPONENT_ROWS, LANES, TERM_ROWS, control_struct
 from ..kernels.solvers.pcg import LANES as GROUP_LANES
 from ..kernels.solvers.pcg import pcg_struct
 from ..kernels.step.gather import RESIDUAL_ROWS
-from ..kernels.step.step import LEDGER_ROWS, REPORT, step_struct
-from ..kernels.terms.constraints import JOINT_COLUMNS, SUM_ROWS
-from .multipliers import allocate
+from ..kernels.step.step import LEDGER_ROWS, step_struct
+from ..kernels.terms.constraints import multiplier_struct
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -43,73 +42,76 @@ class Workspace:
         self.direction, self.r, self.z, self.p, self.Hp = (field(k) for k in ("direction", "r", "z", "p", "Hp"))
         # the parts of the residual, and the diagonal of H
         self.g, self.inertia, self.internal = field("g"), field("inertia"), field("internal")
+        terms, traits = model.terms, model.terms.traits
         # with constraints PCG solves for the gradient of the augmented potential
-        self.gradient = field("gradient") if model.constraints else self.g
+        self.gradient = field("gradient") if traits.ties else self.g
         self.dead, self.dead_magnitude = field("dead"), field("dead_magnitude")
         self.diagonal = field("diagonal")
-        loads = model.loads
         self.inverse = self.array("inverse", (B, n), model.types.mat33)
         self.contribution = self.array("contribution", (B, model.contributions), vec3)
         self.block_contribution = self.array("block_contribution", (B, model.contributions), model.types.sym)
         none = self.array("none", (1, 1), vec3)
-        nonpotential = loads.nonpotential
-        self.nonpotential = field("nonpotential") if nonpotential else none
-        self.nonpotential_held = field("nonpotential_held") if nonpotential else none
+        side = (B, terms.side_entries)
+        self.nonpotential = field("nonpotential") if traits.nonpotential else none
+        self.nonpotential_held = field("nonpotential_held") if traits.nonpotential else none
         self.nonpotential_contribution = (
-            self.array("nonpotential_contribution", (B, loads.nonpotential_entries), vec3) if nonpotential else none
+            self.array("nonpotential_contribution", side, vec3) if traits.nonpotential else none
         )
-        turning = bool(loads.followers)
         self.nonpotential_tangent = (
-            self.array("nonpotential_tangent", (B, loads.nonpotential_entries), vec3)
-            if turning
-            else self.nonpotential_contribution
+            self.array("nonpotential_tangent", side, vec3) if traits.tangent else self.nonpotential_contribution
         )
-        forms = {b.key.damping for b in model.blocks}
+        pool = (B, terms.pool_entries) if traits.pooled else (1, 1)
+        self.pool = self.pool_force = self.array("pool_force", pool, vec3) if traits.pooled else none
+        self.pool_product = self.array("pool_product", pool, vec3) if traits.pooled else none
+        self.pool_block = self.array("pool_block", pool, model.types.sym) if traits.pooled else self.block_contribution
+        rows = (TERM_ROWS, B, terms.rows) if traits.stored else (1, 1, 1)
+        self.term_rows = self.array("term_rows", rows, wp.float64) if traits.stored else None
+        booked = sum(len(term.columns) for term in terms)
+        self.booked = self.array("booked", (max(booked, 1), B), wp.float64)
         self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
-        self.explicit = field("explicit") if "explicit" in forms else none
-        self.explicit_power = self.array(
-            "explicit_power", (B, model.element_count) if "explicit" in forms else (1, 1), wp.float64
-        )
-        self.explicit_work = self.array("explicit_work", (1, B), wp.float64)
         # scratch for kernels whose sums are not wanted
-        self.spare_rows = self.array("spare_rows", (2, B, n) if model.constraints else (1, 1, 1), wp.float64)
+        self.spare_rows = self.array("spare_rows", (2, B, n) if traits.ties else (1, 1, 1), wp.float64)
         # sums of the conjugate gradients come per warp
         self.warp = WARP if model.device.is_cuda else 1
         self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
-        longest = max(n, model.element_count, model.constraints.count if model.constraints else 0)
+        longest = max(n, model.element_count, terms.rows)
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
         self.partial = self.array("partial", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, chunks), wp.float64)
-        self.law_value = self.array("law_value", (B, max(loads.law_count, 1)), wp.vec3d)
+        self.law_value = self.array("law_value", (B, max(terms.laws.count, 1)), wp.vec3d)
         self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
         self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
-        joints = len(model.constraints.joints) if model.constraints else 0
-        self.report = self.array(
-            "report", (B, len(REPORT) + 6 * len(model.probes) + JOINT_COLUMNS * joints), wp.float64
-        )
+        self.report = self.array("report", (B, terms.report_width), wp.float64)
         self.any_flag = self.array("any_flag", (5,), wp.int32)
         C = model.component_count
         sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
         self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
-        self.multipliers: Any = allocate(model, self)
-        self.constraint_work = self.array("constraint_work", (2, B) if model.constraints else (1, 1), wp.float64)
-        optional = () if model.constraints else ("constraint_sums", "stepped", "outer", "open")
+        skip = ("violation",)
+        skip += () if traits.gated else ("outer", "open")
+        skip += () if traits.stored else ("term_sums", "stepped")
+        skip += () if traits.limited else ("limit",)
         self.newton = self.struct(
-            control_struct(), B, skip=("violation", *optional),
+            control_struct(), B, skip=skip,
             history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
-            constraint_sums=(SUM_ROWS, B),
+            term_sums=(TERM_ROWS, B),
         )  # fmt: skip
         self.newton.components = C
-        if model.constraints:
-            self.newton.violation = self.multipliers.violation
+        self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.step = self.struct(step_struct(), B)
         self.balance = balance_struct(model.dtype)()
         for name in balance_struct(model.dtype).vars:
             of_step = name in ("mass_factor", "dq_dv")
             setattr(self.balance, name, getattr(self.step if of_step else self, name))
+
+    def rows_of(self, term: Any) -> wp.array:
+        """The rows of a term's potential, [TERM_ROWS, world, row]."""
+        assert self.term_rows is not None
+        first, last = term.row_offset, term.row_offset + term.rows
+        whole = last - first == self.term_rows.shape[2]
+        return self.term_rows if whole else self.term_rows[:, :, first:last]
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Zeroed array; its bytes are counted. ModelError where it is too large to be addressed."""

@@ -6,9 +6,9 @@ import math
 import pathlib
 from typing import Any
 
-from ...base.errors import OutputError
+from ..plots import require_matplotlib
 
-__all__ = ["draw", "require_matplotlib"]
+__all__ = ["draw"]
 
 STYLES = {  # a colour-blind-safe set (Okabe and Ito)
     "T4": ("#000000", "o"),
@@ -23,15 +23,6 @@ TITLES = {
     "large": "large: soft bar, static",
     "sudden": "sudden: soft bar in motion",
 }
-
-
-def require_matplotlib() -> Any:
-    """matplotlib's Figure class. OutputError where it is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise OutputError(f"the plot needs matplotlib: pip install 'warpfea[plots]' ({error})") from error
-    return Figure
 
 
 def draw(study: Any, path: pathlib.Path) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import itertools
 import pathlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
+from ...base.console import plain, write_json
+from ...base.provenance import origin
 from ...base.writer import check_folder, write_whole
 
 __all__ = ["Row", "Study"]
@@ -100,36 +103,31 @@ class Study:
             parts.append("\n".join([f"{problem}: {reference['about']}", *lines]))
         return "\n\n".join(parts)
 
-    def content(self, command: str, device: Any) -> dict[str, Any]:
+    def content(self, words: Sequence[str], device: Any) -> dict[str, Any]:
         """What the JSON file holds."""
-        from ...base.console import plain
-        from ...base.provenance import commit, machine, versions
-
         return {
             "schema": SCHEMA,
-            "command": command,
-            "commit": commit(),
-            "machine": machine(device),
-            "versions": versions(),
+            **origin(words, device),
             "settings": plain(self.settings),
             "references": plain(self.references),
             "rows": [plain(asdict(row)) for row in self.rows],
         }
 
     def write(
-        self, folder: str | pathlib.Path, *, command: str = "warpfea.studies.ancf_tets.ancf_tets", device: Any = None
+        self, folder: str | pathlib.Path, *, words: Sequence[str] = ("study", "ancf-tets"), device: Any = None
     ) -> list[pathlib.Path]:
         """Write NAME.json, NAME.csv and NAME.png into the folder, made if its parent is there.
+
+        words: of the command line, without "warpfea".
 
         Raises:
             OutputError: the folder can't be made or written, or matplotlib is missing.
         """
-        from ...base.console import write_json
         from .plots import draw
 
         out = prepare(folder)
         paths = [out / f"{self.name}.{suffix}" for suffix in ("json", "csv", "png")]
-        write_json(str(paths[0]), self.content(command, device))
+        write_json(str(paths[0]), self.content(words, device))
         write_whole(paths[1], self._write_csv)
         write_whole(paths[2], lambda path: draw(self, path))
         return paths

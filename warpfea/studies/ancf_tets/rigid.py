@@ -33,8 +33,8 @@ def exact_tip(times: np.ndarray) -> np.ndarray:
 def stepped_tip(dt: float, steps: int) -> np.ndarray:
     """(steps, 3) tip, m, of the same body in steps of BDF2, the first of backward Euler.
 
-    Each step is that of the flexible bar (warpfea.integrators) restricted to rotations: with the affine guess
-    A = q~ + beta h v~ it minimises the mean over the body of |R X - A X|^2 / 2 + (beta h)^2 g (R X)_z.
+    Each step is that of the flexible bar (simulation/integrators.py) restricted to rotations: with the affine
+    predictor A = q~ + beta h v~ it minimises the mean over the body of |R X - A X|^2 / 2 + (beta h)^2 g (R X)_z.
     """
     Q = Q_before = np.eye(2)
     V = V_before = np.zeros((2, 2))
@@ -43,8 +43,8 @@ def stepped_tip(dt: float, steps: int) -> np.ndarray:
     for k in range(steps):
         a0, a1, beta = (4 / 3, 1 / 3, 2 / 3) if k else (1.0, 0.0, 1.0)
         h = beta * dt
-        Q_guess = a0 * Q - a1 * Q_before
-        B = (Q_guess + h * (a0 * V - a1 * V_before)) @ MOMENTS
+        Q_tilde = a0 * Q - a1 * Q_before
+        B = (Q_tilde + h * (a0 * V - a1 * V_before)) @ MOMENTS
         for _ in range(50):
             R, dR = _turn(phi), _turn(phi, slope=True)
             slope = h * h * GRAVITY * (dR @ CENTER)[1] - np.sum(dR * B)
@@ -54,7 +54,7 @@ def stepped_tip(dt: float, steps: int) -> np.ndarray:
                 break
         R = _turn(phi)
         Q_before, V_before = Q, V
-        Q, V = R, (R - Q_guess) / h
+        Q, V = R, (R - Q_tilde) / h
         out.append(_place(R))
     return np.array(out)
 

@@ -1,1 +1,1 @@
-"""Benchmarks of the solver."""
+"""Benchmarks of the solver: `warpfea bench` and its kinds of measurement, one file each."""

@@ -1,7 +1,7 @@
 """`warpfea bench --cpu`: ms per step on this CPU of three linear solvers, in one process on the same meshes.
 
 default: warpfea as it comes. block-jacobi: PCG with 3x3 blocks. direct: the same Newton with scipy's SuperLU. Each
-row steps a problem of `bench_problems` from rest in float64, h = 1 ms, with the Newton iterations that
+row steps a problem of problems.py from rest in float64, h = 1 ms, with the Newton iterations that
 |g|_2 < 5e-4 N takes; the mean of all steps counts, the first and what solvers make in it included, as the default and
 the direct solver keep their matrices for several steps. A run ends with the step that brings it beyond --limit. The
 direct solver is left out where one step is predicted to take that long, from the next smaller row of its problem and a
@@ -17,9 +17,10 @@ import argparse
 from dataclasses import dataclass
 from typing import Any
 
+from ...base.errors import UsageError
 from ...model.model import Model
-from .measure import figures, run_once, solver, write
-from .peer import DT, FORCE_TOL, by_label
+from .measure import by_label, figures, run_once, solver, write
+from .peer import DT, FORCE_TOL
 from .problems import PROBLEMS
 
 __all__ = ["CASES", "SOLVERS", "CpuCase", "CpuRow", "cpu"]
@@ -130,17 +131,17 @@ def too_long(rows: list[CpuRow], problem: str, unknowns: int, limit: float) -> s
         if row.solver == "direct" and row.problem == problem and row.unknowns < unknowns:
             if row.ms_per_step is None:
                 return row.note
-            guess = 1e-3 * row.ms_per_step * (unknowns / row.unknowns) ** 2
-            if guess > limit:
-                return f"{1e-3 * row.ms_per_step:.1f} s per step with {row.unknowns} unknowns, about {guess:.0f} s here"
+            expected = 1e-3 * row.ms_per_step * (unknowns / row.unknowns) ** 2
+            if expected > limit:
+                return (
+                    f"{1e-3 * row.ms_per_step:.1f} s per step with {row.unknowns} unknowns, about {expected:.0f} s here"
+                )
             return None
     return None
 
 
 def cpu(options: argparse.Namespace) -> None:
     """Do `warpfea bench --cpu`: a line per row, and the file after each."""
-    from ...base.errors import UsageError
-
     if options.device not in (None, "cpu"):
         raise UsageError(f"--device {options.device} does not go with --cpu")
     options.device = "cpu"

@@ -1,7 +1,7 @@
 """`warpfea bench --growth`: how PCG iterations grow with the mesh, over stiffness, step and Poisson's ratio.
 
 The first linear solve of a step from rest, to 1e-8 of its right side in the D^-1 norm, of the problems of
-`bench_problems`, undamped, under 1e-10 E over the loaded area so that strains are small and the same for all E. Growth
+problems.py, undamped, under 1e-10 E over the loaded area so that strains are small and the same for all E. Growth
 is that of the iterations from the first size to the last. A solve that does not get there is shown as failed.
 """
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import itertools
 import math
-import shlex
 import statistics
 import time as clock
 from collections.abc import Sequence
@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ...base.console import write_json
 from ...base.errors import UsageError
-from ...base.provenance import commit, machine, versions
+from ...base.provenance import origin
 from ...model.model import Model
 from ...simulation.simulation import Simulation
 from ...solvers import NewtonPCG
@@ -27,6 +28,7 @@ __all__ = [
     "WARM_UP",
     "Row",
     "Run",
+    "by_label",
     "check_sizes",
     "figures",
     "measure",
@@ -36,12 +38,10 @@ __all__ = [
 ]
 
 SCHEMA = 1
-
-
 WARM_UP = 2
-
-
+"""First steps whose time does not count."""
 TIGHTER = 100.0
+"""By how much the tolerance of a reference is smaller."""
 
 
 @dataclass(frozen=True)
@@ -170,23 +170,26 @@ def measure(
 
 def check_sizes(problems: list[Problem], sizes: list[int]) -> None:
     """Refuse sizes that a problem does not have. UsageError."""
-
     for problem in problems:
         if sizes and min(sizes) < problem.smallest:
             raise UsageError(f"--unknowns {min(sizes)}: the smallest {problem.name} has {problem.smallest}")
 
 
+def by_label(rows: str, every: Sequence[Any]) -> list[Any]:
+    """Cases whose labels fit one of the words with commas, in their order. UsageError for a word that fits none."""
+    words = [word.strip() for word in rows.split(",")]
+    for word in words:
+        if not any(fnmatch.fnmatchcase(case.label, word) for case in every):
+            raise UsageError(f"--rows: no row {word!r}; there are {', '.join(case.label for case in every)}")
+    return [case for case in every if any(fnmatch.fnmatchcase(case.label, word) for word in words)]
+
+
 def write(options: argparse.Namespace, settings: dict[str, Any], rows: list[Any], **more: Any) -> None:
     """Write rows (dataclasses) with where they come from to --out, if given. OutputError."""
-    from ...base.console import write_json
-
     if options.out is not None:
         content = {
             "schema": SCHEMA,
-            "command": shlex.join(["warpfea", *(options.words or ["bench"])]),
-            "commit": commit(),
-            "machine": machine(options.device),
-            "versions": versions(),
+            **origin(options.words or ["bench"], options.device),
             "settings": settings,
             **more,
             "rows": [asdict(row) for row in rows],

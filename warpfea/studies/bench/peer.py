@@ -1,34 +1,33 @@
 """`warpfea bench --peer`: warpfea beside a peer, the CUDA code of the authors of the papers (Newton + cuDSS, H200).
 
-Each row steps a problem of `bench_problems` from rest with h = 1 ms. ms per step is the median over steps 20 to 120,
+Each row steps a problem of problems.py from rest with h = 1 ms. ms per step is the median over steps 20 to 120,
 with the Newton iterations that |g|_2 < 5e-4 N takes; set-up and compilation are told apart. The tip after 0.1 s is
 compared with a solve ten times tighter in float64. The peer spreads the bar's 5000 N evenly over the nodes of x = 3,
 here it is a uniform traction of the same total. Its unstructured meshes are not published: those here have nearly as
-many elements and nodes (`tests/bench_meshes.py`).
+many elements and nodes (`warpfea study peer-meshes`).
 """
 
 from __future__ import annotations
 
 import argparse
-import fnmatch
 import pathlib
 import statistics
 import time as clock
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ...base.errors import UsageError
 from ...mesh import Mesh, check
 from ...solvers import NewtonPCG
-from .measure import Run, figures, run_once, solver, write
+from ..checkout import DATA
+from .measure import Run, by_label, figures, run_once, solver, write
 from .problems import PROBLEMS
 
-__all__ = ["DT", "FORCE_TOL", "LARGE", "PEER", "Case", "PeerRow", "by_label", "peer", "required"]
+__all__ = ["DT", "FORCE_TOL", "LARGE", "PEER", "Case", "PeerRow", "peer", "required"]
 
 SOURCE = "the authors' own CUDA code (Newton + cuDSS, fixed sparsity), H200, two Newton iterations per step"
-MESHES = pathlib.Path(__file__).resolve().parent.parent / "tests" / "data"
 DT = 1e-3
 STEPS = 120
 FIRST = 20
@@ -175,23 +174,10 @@ def chosen(rows: str | None, large: bool) -> list[Case]:
     return [case for case in every if case in out or (large and case is LARGE)]
 
 
-def by_label(rows: str, every: Sequence[Any]) -> list[Any]:
-    """Cases whose labels fit one of the words with commas, in their order. UsageError for a word that fits none."""
-    from ...base.errors import UsageError
-
-    words = [word.strip() for word in rows.split(",")]
-    for word in words:
-        if not any(fnmatch.fnmatchcase(case.label, word) for case in every):
-            raise UsageError(f"--rows: no row {word!r}; there are {', '.join(case.label for case in every)}")
-    return [case for case in every if any(fnmatch.fnmatchcase(case.label, word) for word in words)]
-
-
 def peer(options: argparse.Namespace) -> None:
     """Do `warpfea bench --peer`: a line per row, and the file after each."""
-    from ...base.errors import UsageError
-
     cases = chosen(options.rows, options.large)
-    folder = pathlib.Path(options.meshes or MESHES)
+    folder = pathlib.Path(options.meshes or DATA)
     if options.meshes and not folder.is_dir():
         raise UsageError(f"--meshes {options.meshes}: no such folder")
     steps, dtypes = options.steps or STEPS, options.dtype or ["float64"]

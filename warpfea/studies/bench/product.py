@@ -5,7 +5,7 @@ A product is `Residual.product` with backward Euler's factors for h = 1 ms at a 
 "matrix": the 3x3 blocks assembled at the state. `chosen` marks the one that the solver takes by itself. On CUDA the
 products are recorded as one graph and replayed, on the CPU they run in a loop; the median of several counts.
 
-Bytes and operations are counted in `bench_cost`: the share of the bandwidth is of what a copy of a large array reaches
+Bytes and operations are counted in cost.py: the share of the bandwidth is of what a copy of a large array reaches
 here, the share of arithmetic of the device's peak, where it is known. The larger of both is the limit that binds.
 """
 
@@ -50,7 +50,7 @@ class ProductRow:
         operator: "elements" or "matrix". chosen: whether the solver takes it by itself.
         unknowns: free ones; all figures per unknown are per free unknown.
         ms: of a product.
-        bytes_per_unknown, flops_per_unknown: least traffic, and operations, see `bench_cost`.
+        bytes_per_unknown, flops_per_unknown: least traffic, and operations, see cost.py.
         GBps, Gflops: 1e9 of them per second.
         limit: "bandwidth" or "arithmetic", the larger share; limit_share: that share.
         memory_per_unknown: bytes of the whole simulation with the default solver and this operator.

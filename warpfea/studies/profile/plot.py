@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pathlib
 
-from ...base.launch import PARTS
-from ..ancf_tets.plots import require_matplotlib
+from ..plots import require_matplotlib
 from .profiling import Profile
 
 __all__ = ["BETWEEN", "draw"]
@@ -24,7 +23,8 @@ COLORS = {  # a colour-blind-safe set (Okabe and Ito), greys for what is no arit
     "commit": "#999999",
     BETWEEN: "#cccccc",
 }
-assert set(COLORS) == {*PARTS, BETWEEN}
+OTHER = "#882255"
+"""Parts of terms that are not listed."""
 
 
 def draw(found: Profile, title: str, path: pathlib.Path) -> None:
@@ -37,7 +37,7 @@ def draw(found: Profile, title: str, path: pathlib.Path) -> None:
     figure = require_matplotlib()(figsize=(11.0, 1.9 + 0.36 * len(times)), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     figure.suptitle(title, fontsize=11)
-    colors = [COLORS[name] for name in (*names, BETWEEN)]
+    colors = [COLORS.get(name, OTHER) for name in (*names, BETWEEN)]
     rows = range(len(times))
     bars = left.barh(rows, times, color=colors)
     left.bar_label(bars, [_time(t, found.total_ms) for t in times], padding=4, fontsize=9)

@@ -29,7 +29,7 @@ from ...base.launch import PARTS, kernel_name
 from ...kernels.common.probe import probe_kernels
 from ...simulation.simulation import Simulation
 
-__all__ = ["KernelTime", "Profile", "Recorder", "copy_bandwidth", "launch_bytes", "profile"]
+__all__ = ["KernelTime", "Profile", "Recorder", "Replay", "copy_bandwidth", "launch_bytes", "profile", "replay"]
 
 WARM_UP = 2
 EMPTY_LAUNCHES = 200
@@ -79,9 +79,9 @@ class Profile:
 
     @property
     def parts(self) -> dict[str, KernelTime]:
-        """Sums over the kernels of each part, in the order of `PARTS`; parts without launches are left out."""
+        """Sums over the kernels of each part that launches: those of `PARTS` in their order, then those of terms."""
         out = {}
-        for name in PARTS:
+        for name in dict.fromkeys([*PARTS, *(k.part for k in self.kernels)]):
             rows = [k for k in self.kernels if k.part == name]
             if rows:
                 sums = {key: sum(getattr(k, key) for k in rows) for key in ("launches", "ms", "bytes")}
@@ -243,6 +243,22 @@ def _members(kernel: wp.Kernel) -> set[str] | None:
     return names
 
 
+@dataclass(frozen=True)
+class Replay:
+    """Steps that were done as graphs, and again launch by launch.
+
+    Attributes:
+        step_ms: of each step as a graph, ms.
+        newton, pcg: iterations per step.
+        recorder: has booked the launches.
+    """
+
+    step_ms: tuple[float, ...]
+    newton: float
+    pcg: float
+    recorder: Recorder
+
+
 def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] | None = None) -> Profile:
     """Profile the `steps` steps that follow a warm-up of two; the simulation is at their end then, as after `step`.
 
@@ -254,6 +270,24 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
     Raises:
         ModelError: steps out of range, or a simulation whose steps are not recorded.
         ConvergenceError, ConstraintError: a step failed.
+    """
+    done = replay(sim, steps, on_step)
+    empty = _empty_launch(sim.model.device)
+    return Profile(
+        step_ms=done.step_ms,
+        kernels=done.recorder.kernels(steps, empty),
+        newton=done.newton,
+        pcg=done.pcg,
+        copy_GBps=copy_bandwidth(sim.model.device),
+        empty_launch_us=1e6 * empty,
+    )
+
+
+def replay(sim: Simulation, steps: int, on_step: Callable[[], object] | None = None) -> Replay:
+    """Warm up, do the steps, and do them again from the same state launch by launch; arguments as of `profile`.
+
+    Raises:
+        ModelError, ConvergenceError, ConstraintError: as `profile`.
     """
     if not (is_count(steps) and steps >= 1):
         raise ModelError(f"profile: steps = {steps!r} must be a whole number, at least 1")
@@ -287,15 +321,7 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
         do(steps, lambda: recorder.measure(stepper.sequence))
     finally:
         stepper.launch.recorder = None
-    empty = _empty_launch(sim.model.device)
-    return Profile(
-        step_ms=tuple(step_ms),
-        kernels=recorder.kernels(steps, empty),
-        newton=per_step["newton"],
-        pcg=per_step["pcg"],
-        copy_GBps=copy_bandwidth(sim.model.device),
-        empty_launch_us=1e6 * empty,
-    )
+    return Replay(tuple(step_ms), per_step["newton"], per_step["pcg"], recorder)
 
 
 def _empty_launch(device: Any) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,13 +16,14 @@ from ..elements import Rule
 from ..kernels.common.types import precision
 from ..kernels.elements.materials import ANY_J
 from ..kernels.step.gather import gather_kernels
-from ..kernels.terms.constraints import SUM_ROWS, multiplier_struct
-from . import assembly
-from .assembly import chunks, geometry, gradients
-from .state import State
+from ..model import assembly
+from ..model.assembly import chunks, geometry, gradients
+from ..model.state import State
+from .elements import Elements
+from .term import At
 
 if TYPE_CHECKING:
-    from .model import Model
+    from ..model.model import Model
 
 __all__ = ["Evaluation"]
 
@@ -32,6 +34,7 @@ class Evaluation:
     def __init__(self, model: Model) -> None:
         self.model = model
         self.launch = Launcher(model.device)
+        self.elements = Elements(model)
 
     def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.model.device)
@@ -39,39 +42,34 @@ class Evaluation:
     def _gather(self, contribution: wp.array) -> np.ndarray:
         m = self.model
         out = self._zeros((m.worlds, m.slots), m.types.vec3)
-        kernel = gather_kernels(m.dtype, False).gather_force
+        kernel = gather_kernels(m.dtype).gather_force
         self.launch(kernel, (m.worlds, m.slots), [m.topology, contribution, self._all(), out])
         return out.numpy()
 
     def _all(self) -> wp.array:
         return wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
 
+    def _at(self, u: wp.array) -> At:
+        """What the elements' term takes for its work and writes: the elastic part at displacements u (worlds, slots)."""
+        m, B = self.model, u.shape[0]
+        least = [wp.full(B, 1e30, dtype=wp.float64, device=m.device) for _ in range(2)]
+        work: Any = SimpleNamespace(
+            u=u,
+            v=u,
+            history=self._zeros((1, 1), m.types.sym),
+            step=SimpleNamespace(dq_dv=wp.ones(B, dtype=wp.float64, device=m.device)),
+            contribution=self._zeros((B, m.contributions), m.types.vec3),
+            energy_rows=self._zeros((2, B, m.element_count), wp.float64),
+            newton=SimpleNamespace(min_J=least[0], domain_J=least[1]),
+        )
+        return At(m, work, self.launch, state=None, u_before=None, inertia=False)
+
     def internal_force(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Elastic force [world, slot, 3], strain energy [world], smallest J [world]."""
-        m = self.model
-        contribution = self._zeros((m.worlds, m.contributions), m.types.vec3)
-        energy = self._zeros((2, m.worlds, m.element_count), wp.float64)
-        low = wp.full(m.worlds, 1e30, dtype=wp.float64, device=m.device)
-        domain = wp.full(m.worlds, 1e30, dtype=wp.float64, device=m.device)
-        one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
-        history = self._zeros((1, 1), m.types.sym)
-        for block in m.blocks:
-            kernel = block.kernels_for(m.dtype, None).internal_force
-            args = [
-                block.data,
-                state.displacement,
-                state.velocity,
-                history,
-                one,
-                self._all(),
-                1,
-                contribution,
-                energy,
-                low,
-                domain,
-            ]
-            self.launch(kernel, (m.worlds, block.count), args)
-        return self._gather(contribution), energy.numpy()[0].sum(axis=1), low.numpy()
+        at = self._at(state.displacement)
+        w = at.work
+        self.elements.force(at, self._all())
+        return self._gather(w.contribution), w.energy_rows.numpy()[0].sum(axis=1), w.newton.min_J.numpy()
 
     def viscous_force(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Viscous force [world, slot, 3] and dissipation rate [world]."""
@@ -85,72 +83,34 @@ class Evaluation:
         return self._gather(contribution), power.numpy().sum(axis=1)
 
     def constraints(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Constraints at a state: values [world, row], gradients [world, 3 row + side, 3], right sides [world, row]."""
-        mul = self._multipliers(state)
-        return mul.value.numpy(), mul.gradient.numpy(), mul.target.numpy()
+        """Constraints at a state: values [world, row], gradients [world, 3 row + side, 3], right sides [world, row].
 
-    def _multipliers(self, state: State, multipliers: np.ndarray | None = None) -> Any:
-        """Evaluated constraints with given multipliers (rows,) and no penalty."""
-        m = self.model
-        con = m.constraints
-        if con is None:
-            raise ModelError("the model has no constraints")
-        loads, B = m.loads, m.worlds
-        value = self._zeros((B, max(loads.law_count, 1)), wp.vec3d)
-        one = wp.ones(B, dtype=wp.float64, device=m.device)
-        if loads.law_count:
-            args = [loads.laws, state.time, one, self._all(), value]
-            self.launch(loads.kernels.evaluate_laws, (B, loads.law_count), args)
-            for kernel, law in loads.function_laws:
-                self.launch(kernel, B, [law, state.time, self._all(), value])
-        mul = multiplier_struct()()
-        for name in ("value", "target", "last", "scale", "force", "change", "trial", "merit", "excess", "stiffness"):
-            setattr(mul, name, self._zeros((B, con.count), wp.float64))
-        for name in ("gradient", "product"):
-            setattr(mul, name, self._zeros((B, 3 * con.count), wp.vec3d))
-        mul.rows = self._zeros((SUM_ROWS, B, con.count), wp.float64)
-        mul.violation = self._zeros((B, m.component_count), wp.float64)
-        if multipliers is not None:
-            mul.force.assign(np.tile(multipliers, (B, 1)))
-        mul.last.fill_(np.nan)  # any turn is as good as another
-        alpha = self._zeros((B,), wp.float64)
-        args = [con.data, state.displacement, value, alpha, self._all(), mul]
-        self.launch(con.kernels.evaluate, (B, con.count), args)
-        return mul
+        Raises:
+            ModelError: the model has none.
+        """
+        return self._constraints().values(state)
 
     def constraint_jacobian(self, state: State, world: int) -> sp.csr_matrix:
         """dc/dq of one world, (rows, 3 slots) CSR."""
-        _, gradient, _ = self.constraints(state)
-        con = self.model.constraints
-        assert con is not None
-        return con.expand(gradient[world].reshape(-1, 3, 3))
+        return self._constraints().jacobian(state, world)
 
     def constraint_curvature(self, state: State, multipliers: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """sum_i multipliers_i d2c_i/dq2 direction, [world, slot, 3]; multipliers (rows,), direction (slots, 3)."""
-        m, con = self.model, self.model.constraints
-        mul = self._multipliers(state, multipliers)
-        assert con is not None
-        p = self._zeros((m.worlds, m.slots), m.types.vec3)
-        p.assign(np.tile(direction, (m.worlds, 1, 1)).astype(p.numpy().dtype))
-        one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
-        self.launch(con.kernels.product_terms, (m.worlds, con.count), [con.data, mul, p, one, self._all()])
-        out = np.zeros((m.worlds, m.slots, 3))
-        terms = mul.product.numpy()
-        for world in range(m.worlds):
-            np.add.at(out[world], con.slot_host, con.weight_host[:, None] * terms[world, con.term_host])
-        return out
+        return self._constraints().curvature(state, multipliers, direction)
+
+    def _constraints(self) -> Any:
+        term = self.model.terms.constraints
+        if term is None:
+            raise ModelError("the model has no constraints")
+        return term
 
     def tangent_matrix(self, state: State, world: int) -> sp.csr_matrix:
         """df_int/dq as CSR. No element holds two slots of one colour: one product per colour and axis."""
         m = self.model
-        one_world = State(1, m.device)
         row = state.displacement.numpy()[world : world + 1]
-        u = one_world.register("displacement", m.types.vec3, (m.slots,), row)
-        contribution = self._zeros((1, m.contributions), m.types.vec3)
+        at = self._at(wp.array(row, dtype=m.types.vec3, device=m.device))
         direction = self._zeros((1, m.slots), m.types.vec3)
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
-        dq = wp.ones(1, dtype=wp.float64, device=m.device)
-        history = self._zeros((1, 1), m.types.sym)
         conns = [b.connectivity for b in m.blocks]
         colour = _colours(m.graph())
         rows, cols, values = [], [], []
@@ -159,11 +119,8 @@ class Evaluation:
                 host = np.zeros((1, m.slots, 3), dtype=precision(m.dtype).T._type_)
                 host[0, colour == c, axis] = 1.0
                 direction.assign(host)
-                for block in m.blocks:
-                    kernel = block.kernels_for(m.dtype, None).tangent_product
-                    args = [block.data, u, u, history, dq, flag, direction, contribution]
-                    self.launch(kernel, (1, block.count), args)
-                out = contribution.numpy()[0]
+                self.elements.tangent(at, direction, flag)
+                out = at.work.contribution.numpy()[0]
                 for block, conn in zip(m.blocks, conns):
                     part = out[block.contribution_offset :][: block.count * block.slots]
                     part = part.reshape(block.slots, block.count, 3)

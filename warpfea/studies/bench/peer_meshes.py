@@ -1,4 +1,4 @@
-"""The unstructured meshes of `warpfea bench --peer`: `python tests/bench_meshes.py` writes tests/data/bar_*.npz.
+"""`warpfea study peer-meshes`: the unstructured meshes of `warpfea bench --peer`, tests/data/bar_*.npz.
 
 A box of 3 x 2 x 1 m in tetrahedra of second order with straight edges, by Gmsh (4.15.2 for the committed files; not one
 of the project's requirements). The peer's meshes are not published; their counts (4567 elements, 9050 nodes; 20 829 and
@@ -11,19 +11,25 @@ cells   (elements, 10) int32: in the order of mesh.Mesh
 
 from __future__ import annotations
 
+import argparse
 import pathlib
+from typing import Any
 
-import gmsh
 import numpy as np
 
-DATA = pathlib.Path(__file__).resolve().parent / "data"
+from ...base.errors import UsageError
+from ...base.writer import check_folder
+from ..checkout import DATA
+
+__all__ = ["run", "second_order", "tetrahedra"]
+
 SIZES = {"bar_4752": (0.14476, 3.0), "bar_20822": (0.0678, 0.39)}
 """Name of the file: size of the surface's triangles and largest size inside, m."""
 EDGES = ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))
 
 
-def tetrahedra(surface: float, inside: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (n, 3), m, and cells (elements, 4) of the box."""
+def tetrahedra(gmsh: Any, surface: float, inside: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (n, 3), m, and cells (elements, 4) of the box, by the module `gmsh`; largest sizes in m."""
     option = gmsh.option.setNumber
     gmsh.clear()
     gmsh.model.occ.addBox(0, 0, 0, 3, 2, 1)
@@ -52,16 +58,21 @@ def second_order(corners: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np
     return points, np.concatenate([cells, len(corners) + numbers.reshape(-1, len(EDGES))], axis=1)
 
 
-def main() -> None:
+def run(options: argparse.Namespace) -> None:
+    """Do `warpfea study peer-meshes`."""
+    try:
+        import gmsh
+    except ImportError as error:
+        raise UsageError(f"peer-meshes makes its meshes with Gmsh: pip install gmsh ({error})") from error
+    folder = pathlib.Path(options.out or DATA)
+    check_folder(folder, folder)
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     for name, sizes in SIZES.items():
-        points, cells = second_order(*tetrahedra(*sizes))
+        points, cells = second_order(*tetrahedra(gmsh, *sizes))
         stored = points.astype(np.float32)
         assert np.array_equal(stored, points)
-        np.savez_compressed(DATA / f"{name}.npz", points=stored, cells=cells.astype(np.int32))
-        print(f"{name}: {len(cells)} elements, {len(points)} nodes, {(DATA / f'{name}.npz').stat().st_size} bytes")
-
-
-if __name__ == "__main__":
-    main()
+        target = folder / f"{name}.npz"
+        np.savez_compressed(target, points=stored, cells=cells.astype(np.int32))
+        print(f"{name}: {len(cells)} elements, {len(points)} nodes, {target.stat().st_size} bytes")
+    gmsh.finalize()

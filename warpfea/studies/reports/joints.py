@@ -1,4 +1,4 @@
-"""Cost and stability of constraints: `python tests/joint_report.py --out tests/results/joints_cpu.json`.
+"""`warpfea study joints`: cost and stability of constraints.
 
 cost        a chain of m links and m revolute joints that hangs and swings to the side, m = 10, 100, 1000: ms per step
             and iterations (outer: multiplier updates), for the default (multipliers with every Newton step,
@@ -7,26 +7,26 @@ cost        a chain of m links and m revolute joints that hangs and swings to th
 stability   mass ratios to 1e4, E from 1e4 to 1e12 Pa, steps from 1e-5 to 1e-2 s; a door on four hinges; a parallelogram
             linkage driven through its dead points. A case passes when every step is accepted and the violation stays
             within 1e-8 of the model's size, or when a named error of warpfea ends it.
+
+tests/results/joints_cpu.json and joints_h200.json are the committed results.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import pathlib
-import shlex
 import statistics
-import sys
 import time as clock
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 import warpfea as wf
-from warpfea.base.provenance import commit, machine, versions
 
-wp.config.log_level = 30
+from .parts import Part, run_tables
+
+__all__ = ["PARTS", "cost", "run", "stability"]
 
 METHODS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -94,7 +94,7 @@ def parallelogram(E: float, turns: float = 0.625, seconds: float = 0.05) -> wf.M
     return b
 
 
-def run(
+def simulate(
     builder: wf.ModelBuilder,
     *,
     dt: float,
@@ -107,7 +107,8 @@ def run(
 ) -> dict[str, Any]:
     """Step, and tell what it took; a named error is an outcome."""
     model = builder.finalize(device=device, dtype=dtype, worlds=worlds)
-    row: dict[str, Any] = {"unknowns": int(model.free_slots.sum()), "rows": model.constraints.count, "dt": dt}
+    equations = sum(joint["rows"] for joint in model.info()["joints"])
+    row: dict[str, Any] = {"unknowns": int(model.free_slots.sum()), "rows": equations, "dt": dt}
     outcome, halvings, outer, done = "converged", 0, 0, 0
     times = []
     try:
@@ -141,84 +142,55 @@ def run(
     return row
 
 
-def cost(device: Any, sizes: list[int], steps: int) -> list[dict[str, Any]]:
+def cost(device: Any, joints: Sequence[int], steps: int) -> Iterator[dict[str, Any]]:
     """Rows of the cost part; the tips of the methods are compared with the default's."""
-    out = []
-    for m, E in [(m, 7e8) for m in sizes] + [(min(sizes), 7e10), (min(sizes), 7e12)]:
+    for m, E in [(m, 7e8) for m in joints] + [(min(joints), 7e10), (min(joints), 7e12)]:
         tip = None
         for name, solver in METHODS.items():
             for dtype in ("float64", "float32") if name == "default" and E == 7e8 else ("float64",):
-                row = {"joints": m, "E": E, "method": name, "dtype": dtype}
-                row |= run(chain(m, E=E), dt=1e-3, steps=steps, device=device, dtype=dtype, **solver)
+                row: dict[str, Any] = {"joints": m, "E": E, "method": name, "dtype": dtype}
+                row |= simulate(chain(m, E=E), dt=1e-3, steps=steps, device=device, dtype=dtype, **solver)
                 if "tip" in row:
                     tip = tip or row["tip"]
                     row["tip_difference"] = float(np.abs(np.subtract(row.pop("tip"), tip)).max())
-                out.append(row)
-                show(row)
+                yield row
     if wp.get_device(device).is_cuda:
         for worlds in (100, 1000):
-            row = {"joints": min(sizes), "E": 7e8, "method": "default", "dtype": "float64", "worlds": worlds}
-            row |= run(chain(min(sizes)), dt=1e-3, steps=steps, device=device, worlds=worlds)
-            row.pop("tip")
-            out.append(row)
-            show(row)
-    return out
+            row = {"joints": min(joints), "E": 7e8, "method": "default", "dtype": "float64", "worlds": worlds}
+            row |= simulate(chain(min(joints)), dt=1e-3, steps=steps, device=device, worlds=worlds)
+            row.pop("tip", None)
+            yield row
 
 
-def stability(device: Any, steps: int) -> list[dict[str, Any]]:
+def stability(device: Any, joints: Sequence[int], steps: int) -> Iterator[dict[str, Any]]:
     """Rows of the stability part."""
-    out = []
 
-    def add(problem: str, builder: wf.ModelBuilder, dt: float, count: int, **labels: Any) -> None:
-        row = {"problem": problem, **labels} | run(builder, dt=dt, steps=count, device=device)
+    def case(problem: str, builder: wf.ModelBuilder, dt: float, count: int, **labels: Any) -> dict[str, Any]:
+        row = {"problem": problem, **labels} | simulate(builder, dt=dt, steps=count, device=device)
         row.pop("tip", None)
         row.pop("ms_per_step")
-        out.append(row)
-        show(row)
+        return row
 
     for ratio in RATIOS:
         for E in MODULI:
             for dt in STEPS:
-                add("two links", chain(2, E=E, ratio=ratio), dt, steps, E=E, ratio=ratio)
+                yield case("two links", chain(2, E=E, ratio=ratio), dt, steps, E=E, ratio=ratio)
     for dt in STEPS:
-        add("ten links", chain(10, E=1e10, ratio=1e4), dt, steps, E=1e10, ratio=1e4)
+        yield case("ten links", chain(10, E=1e10, ratio=1e4), dt, steps, E=1e10, ratio=1e4)
     for E in (1e6, 1e9, 1e12):
         for dt in STEPS:
-            add("door on four hinges", door(E), dt, steps, E=E, ratio=1.0)
+            yield case("door on four hinges", door(E), dt, steps, E=E, ratio=1.0)
     for E in (1e8, 1e10, 1e12):
         for count in (100, 1000):
-            add("parallelogram through its dead points", parallelogram(E), 0.05 / count, count, E=E, ratio=1.0)
-    return out
+            yield case("parallelogram through its dead points", parallelogram(E), 0.05 / count, count, E=E, ratio=1.0)
 
 
-def show(row: dict[str, Any]) -> None:
-    words = [f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()]
-    print("  ".join(words), flush=True)
+PARTS: dict[str, Part] = {f.__name__: f for f in (cost, stability)}
 
 
-def main(arguments: list[str]) -> int:
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--out", required=True, help="result file, .json")
-    p.add_argument("--device", default=None)
-    p.add_argument("--joints", type=int, nargs="*", default=[10, 100, 1000])
-    p.add_argument("--steps", type=int, default=40, help="steps of each case")
-    p.add_argument("--only", choices=("cost", "stability"), default=None)
-    o = p.parse_args(arguments)
-    content: dict[str, Any] = {
-        "schema": 1,
-        "command": shlex.join(["python", "tests/joint_report.py", *arguments]),
-        "commit": commit(),
-        "machine": machine(o.device),
-        "versions": versions(),
-        "settings": {"steps": o.steps, "integrator": "bdf2", "constraint_tol": 1e-8, "cost_dt": 1e-3},
-    }
-    if o.only != "stability":
-        content["cost"] = cost(o.device, o.joints, o.steps)
-    if o.only != "cost":
-        content["stability"] = stability(o.device, o.steps)
-    pathlib.Path(o.out).write_text(json.dumps(content, indent=1) + "\n")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+def run(options: argparse.Namespace) -> None:
+    """Do `warpfea study joints`."""
+    steps = options.steps or 40
+    settings = {"steps": steps, "integrator": "bdf2", "constraint_tol": 1e-8, "cost_dt": 1e-3}
+    joints = options.joints or (10, 100, 1000)
+    run_tables(options, PARTS, settings, device=options.device, joints=joints, steps=steps)

@@ -1,33 +1,30 @@
-"""Error and cost of wf.Jacobi: `python tests/jacobi_report.py --out tests/results/jacobi_cpu.json`.
+"""`warpfea study jacobi`: error and cost of wf.Jacobi.
 
 Four scenes from rest under gravity: a soft and a stiff T10 bar and a slender 3243 beam, each clamped at one end, and
 the double pendulum with its joints. For 2 to 32 iterations, with and without the coarse space, and each acceleration:
 the largest error of the tip in any step, over the way that it goes, against Newton's method with tol = 1e-10; ms per
 step; the relative residual that the steps say is left; the share of steps within the default tolerance. Newton's method
-itself stands beside it, also with loose tolerances.
+itself stands beside it, also with loose tolerances. tests/results/jacobi_cpu.json is the committed result.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import pathlib
-import shlex
+import itertools
 import statistics
-import sys
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 import warpfea as wf
-from warpfea.base.provenance import commit, machine, versions
 from warpfea.builder.scene import find
 from warpfea.solvers.jacobi import ACCELERATIONS
 
-wp.config.log_level = 30
+from .parts import run_tables
+
+__all__ = ["rows", "run"]
 
 ITERATIONS = (2, 4, 8, 16, 32)
 TOLERANCES = (1e-8, 1e-4, 1e-2)
@@ -68,7 +65,7 @@ SCENES: dict[str, tuple[Callable[[], wf.ModelBuilder], float]] = {
 }
 
 
-def run(model: Any, dt: float, steps: int, solver: Any) -> tuple[dict[str, Any], np.ndarray]:
+def simulate(model: Any, dt: float, steps: int, solver: Any) -> tuple[dict[str, Any], np.ndarray]:
     """Step; what it took, and the way of the first probe (steps, 3). A named error is an outcome."""
     sim = wf.Simulation(model, dt=dt, solver=solver, ledger=False)
     times, residuals, halvings, outcome = [], [], 0, "done"
@@ -94,54 +91,27 @@ def run(model: Any, dt: float, steps: int, solver: Any) -> tuple[dict[str, Any],
     return row, sim.probe(model.probes[0].name).displacement[0]
 
 
-def measure(device: Any, steps: int) -> list[dict[str, Any]]:
-    """All rows."""
-    out: list[dict[str, Any]] = []
+def rows(device: Any, steps: int) -> Iterator[dict[str, Any]]:
+    """A row per scene and solver."""
+    solvers: list[tuple[dict[str, Any], Any]] = [
+        ({"solver": "newton-pcg", "tol": tol}, wf.NewtonPCG(tol=tol, max_pcg=20000)) for tol in TOLERANCES
+    ]
+    for coarse, acceleration, iterations in itertools.product((True, False), ACCELERATIONS, ITERATIONS):
+        how: dict[str, Any] = {"iterations": iterations, "coarse": coarse, "acceleration": acceleration}
+        solvers.append(({"solver": "jacobi", **how}, wf.Jacobi(**how)))
     for name, (make, dt) in SCENES.items():
         model = make().finalize(device=device)
-        _, reference = run(model, dt, steps, wf.NewtonPCG(tol=1e-10, max_pcg=20000))
+        _, reference = simulate(model, dt, steps, wf.NewtonPCG(tol=1e-10, max_pcg=20000))
         travel = float(np.abs(reference).max())
-
-        def add(label: dict[str, Any], solver: Any) -> None:
-            row, way = run(model, dt, steps, solver)  # noqa: B023
-            error = float(np.abs(way - reference).max() / travel) if row["outcome"] == "done" else None  # noqa: B023
-            out.append({"scene": name, "unknowns": int(model.free_slots.sum()), **label, "tip_error": error, **row})  # noqa: B023
-            show(out[-1])
-
-        for tol in TOLERANCES:
-            add({"solver": "newton-pcg", "tol": tol}, wf.NewtonPCG(tol=tol, max_pcg=20000))
-        for coarse in (True, False):
-            for acceleration in ACCELERATIONS:
-                for iterations in ITERATIONS:
-                    label = {"solver": "jacobi", "iterations": iterations, "coarse": coarse}
-                    label["acceleration"] = acceleration
-                    add(label, wf.Jacobi(iterations=iterations, coarse=coarse, acceleration=acceleration))
-    return out
+        for label, solver in solvers:
+            row, way = simulate(model, dt, steps, solver)
+            error = float(np.abs(way - reference).max() / travel) if row["outcome"] == "done" else None
+            yield {"scene": name, "unknowns": int(model.free_slots.sum()), **label, "tip_error": error, **row}
 
 
-def show(row: dict[str, Any]) -> None:
-    words = [f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()]
-    print("  ".join(words), flush=True)
-
-
-def main(arguments: list[str]) -> int:
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--out", required=True, help="result file, .json")
-    p.add_argument("--device", default="cpu")
-    p.add_argument("--steps", type=int, default=50, help="steps of each run")
-    o = p.parse_args(arguments)
-    content = {
-        "schema": 1,
-        "command": shlex.join(["python", "tests/jacobi_report.py", *arguments]),
-        "commit": commit(),
-        "machine": machine(o.device),
-        "versions": versions(),
-        "settings": {"steps": o.steps, "integrator": "backward_euler", "reference": "newton-pcg, tol 1e-10"},
-        "rows": measure(o.device, o.steps),
-    }
-    pathlib.Path(o.out).write_text(json.dumps(content, indent=1) + "\n")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+def run(options: argparse.Namespace) -> None:
+    """Do `warpfea study jacobi`."""
+    options.device = options.device or "cpu"
+    steps = options.steps or 50
+    settings = {"steps": steps, "integrator": "backward_euler", "reference": "newton-pcg, tol 1e-10"}
+    run_tables(options, {"rows": rows}, settings, device=options.device, steps=steps)

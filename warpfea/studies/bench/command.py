@@ -1,8 +1,8 @@
-"""`warpfea bench`: time and error of the solver on the problems of `bench_problems`.
+"""`warpfea bench`: time and error of the solver on the problems of problems.py.
 
 Sizes are numbers of unknowns, met as closely as the problem allows. The error of the tip is measured against the same
 mesh and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
-`--peer`, `--growth`, `--product` and `--cpu` are in `bench_peer`, `bench_growth`, `bench_product` and `bench_cpu`.
+The other kinds of measurement are in files of their own: peer.py, growth.py, product.py, cpu.py, scenes.py.
 """
 
 from __future__ import annotations
@@ -11,10 +11,18 @@ import argparse
 import pathlib
 from typing import Any
 
+from ...base.console import quiet_warp
+from ...base.errors import UsageError
+from ...base.writer import check_target
+from .cpu import cpu
+from .growth import growth
 from .measure import TIGHTER, WARM_UP, Row, check_sizes, measure, write
+from .peer import peer
 from .problems import PROBLEMS
+from .product import product
+from .scenes import scenes
 
-__all__ = ["bench"]
+__all__ = ["OPTIONS", "bench", "table"]
 
 OPTIONS = {
     "table": {"problem", "unknowns", "dtype", "linear", "steps", "repeat", "dt", "tol", "reference_up_to"},
@@ -22,16 +30,13 @@ OPTIONS = {
     "growth": {"problem", "unknowns"},
     "product": {"problem", "unknowns", "dtype", "repeat"},
     "cpu": {"rows", "steps", "limit"},
+    "scenes": {"rows", "before"},
 }
 """Options of each kind of measurement, besides those of all."""
 
 
-def bench(options: argparse.Namespace) -> int:
-    """Do `warpfea bench`."""
-    from ...base.console import quiet_warp
-    from ...base.errors import UsageError
-    from ...base.writer import check_target
-
+def bench(options: argparse.Namespace) -> None:
+    """Do `warpfea bench`. UsageError for options that do not go together, OutputError for an --out in no folder."""
     kind = next((name for name in OPTIONS if getattr(options, name, False)), "table")
     for name in sorted(set().union(*OPTIONS.values()) - OPTIONS[kind]):
         if getattr(options, name):
@@ -42,14 +47,9 @@ def bench(options: argparse.Namespace) -> int:
         if pathlib.Path(options.out).suffix != ".json":
             raise UsageError(f"--out {options.out}: the file name must end in .json")
         check_target(options.out, (".json",))
-    from .cpu import cpu
-    from .growth import growth
-    from .peer import peer
-    from .product import product
-
+    do = {"table": table, "peer": peer, "growth": growth, "product": product, "cpu": cpu, "scenes": scenes}[kind]
     with quiet_warp():
-        {"table": table, "peer": peer, "growth": growth, "product": product, "cpu": cpu}[kind](options)
-    return 0
+        do(options)
 
 
 def table(options: argparse.Namespace) -> None:

@@ -1,0 +1,33 @@
+"""Adding to an entry of a symmetric matrix of 3x3 blocks."""
+
+import functools
+
+import warp as wp
+
+from .structs import topology_struct
+from .types import precision
+
+__all__ = ["add_block_function"]
+
+
+@functools.cache
+def add_block_function(dtype: str) -> wp.Function:
+    """The function add_block(topo, at, A, world, value), `at` being a row of Pattern.upper."""
+    mat33 = precision(dtype).mat33
+    Topology = topology_struct(dtype)
+
+    @wp.func
+    def add_block(topo: Topology, at: wp.vec4i, A: mat33, world: int, value: wp.array2d(dtype=mat33)):
+        """Add A to an entry and its transpose to the mirrored one, on the free components."""
+        row_free = topo.free[at[2]]
+        column_free = topo.free[at[3]]
+        B = mat33()
+        for i in range(3):
+            for j in range(3):
+                B[i, j] = row_free[i] * column_free[j] * A[i, j]
+        B += value[world, at[0]]
+        value[world, at[0]] = B
+        if at[1] != at[0]:
+            value[world, at[1]] = wp.transpose(B)
+
+    return add_block

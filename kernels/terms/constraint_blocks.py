@@ -1,0 +1,109 @@
+"""What constraints add to H as a matrix."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.entries import add_block_function
+from ..common.structs import pattern_struct, topology_struct
+from ..common.types import SMALL, kernel_module, precision
+from .constraints import DISTANCE, TURN, constraint_struct, multiplier_struct
+
+__all__ = ["constraint_block_kernels", "coupling_struct"]
+
+
+@functools.cache
+def coupling_struct():
+    """What constraints add to entries: rho w grad_a grad_b^T."""
+
+    @wp.struct
+    class Couplings:
+        entry: wp.array(dtype=wp.int32)  # [item] index into Pattern.upper
+        start: wp.array(dtype=wp.int32)  # [item + 1]
+        term_a: wp.array(dtype=wp.int32)  # index into Multipliers.gradient
+        term_b: wp.array(dtype=wp.int32)
+        weight: wp.array(dtype=wp.float64)
+
+    return Couplings
+
+
+@functools.cache
+def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels that add the constraints' part to a matrix, in one precision of its blocks."""
+    mat33 = precision(dtype).mat33
+    f64 = wp.float64
+    Topology, Pattern, Couplings = topology_struct(dtype), pattern_struct(), coupling_struct()
+    Constraints, Multipliers = constraint_struct(), multiplier_struct()
+    add_block = add_block_function(dtype)
+    module = kernel_module(f"couplings_{dtype}", max_unroll=SMALL)
+
+    @wp.kernel(module=module)
+    def add_penalties(
+        topo: Topology,
+        pattern: Pattern,
+        pairs: Couplings,
+        gradient: wp.array2d(dtype=wp.vec3d),
+        stiffness: wp.array2d(dtype=f64),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):
+        """value += (dq/dv) J^T rho J."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        A = wp.mat33d()
+        for k in range(pairs.start[item], pairs.start[item + 1]):
+            a = pairs.term_a[k]
+            factor = pairs.weight[k] * dq_dv[world] * stiffness[world, a / 3]
+            A += factor * wp.outer(gradient[world, a], gradient[world, pairs.term_b[k]])
+        add_block(topo, pattern.upper[pairs.entry[item]], mat33(A), world, value)
+
+    @wp.func
+    def curvature(con: Constraints, mul: Multipliers, world: int, row: int, a: int, b: int) -> wp.mat33d:
+        """d2c / (d vector a  d vector b) of a row, a and b its sides."""
+        kind = con.kind[row]
+        f = mul.target[world, row]
+        scale = mul.scale[world, row]
+        one = wp.identity(n=3, dtype=f64)
+        if kind == DISTANCE:
+            n = mul.gradient[world, 3 * row] / scale
+            size = wp.abs(mul.value[world, row] / scale + f)
+            if a == 0 and b == 0:
+                return (scale / size) * (one - wp.outer(n, n))
+        elif kind == TURN:
+            if a + b == 1:
+                return -scale * wp.sin(f) * one
+            if a + b == 3:
+                return scale * wp.cos(f) * one
+        elif a + b == 1:
+            return scale * one
+        return wp.mat33d()
+
+    @wp.kernel(module=module)
+    def add_tangent(
+        topo: Topology,
+        pattern: Pattern,
+        pairs: Couplings,
+        con: Constraints,
+        mul: Multipliers,
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):
+        """value += (dq/dv) (J^T rho J + sum lambda d2c/dq2)."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        A = wp.mat33d()
+        for k in range(pairs.start[item], pairs.start[item + 1]):
+            a = pairs.term_a[k]
+            b = pairs.term_b[k]
+            row = a / 3
+            tight = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
+            bend = mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
+            A += pairs.weight[k] * (tight + bend)
+        add_block(topo, pattern.upper[pairs.entry[item]], mat33(dq_dv[world] * A), world, value)
+
+    return _types.SimpleNamespace(module=module, add_penalties=add_penalties, add_tangent=add_tangent)

@@ -1,0 +1,589 @@
+"""What a new user meets first: quiet, named errors, plausible sizes, names that are nearly right, files that go on."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpfea as wf
+from warpfea.base.console import compile_bar, quiet_warp
+from warpfea.base.errors import OutputError
+from warpfea.base.names import did_you_mean
+from warpfea.outputs import reel, usd
+from warpfea.outputs.frames import time_of
+from warpfea.outputs.usd import validate_usd
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+BOX = wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1))
+GROUPED = replace(BOX, element_sets={"body": np.arange(len(BOX.cells))})
+LAW = wf.SVK(E=1e7, nu=0.3, density=1000.0)
+WEIGHTLESS = {
+    "svk": wf.SVK(E=1e7, nu=0.3),
+    "svk from E": wf.SVK.from_E_nu(E=1e7, nu=0.3),
+    "neo_hookean": wf.NeoHookean(mu=4e6, k=1e7),
+    "neo_hookean from E": wf.NeoHookean.from_E_nu(E=1e7, nu=0.3),
+    "mooney_rivlin": wf.MooneyRivlin(mu10=3e6, mu01=1e6, k=1e7),
+    "mooney_rivlin from E": wf.MooneyRivlin.from_E_nu(E=1e7, nu=0.3),
+}
+
+
+def bar(material=LAW, gravity=(0, 0, -9.81), mesh=BOX, clamp=True, **options):
+    """A builder with a bar that is clamped at x- and pulled down at x+, and its body."""
+    b = wf.ModelBuilder(gravity=gravity)
+    body = b.add_solid(mesh, material=material, name="bar", **options)
+    if clamp:
+        b.clamp(body.nodes("x-"))
+        b.add_traction(body.surface("x+"), (0, 0, -200.0))
+        b.add_probe("tip", body.surface("x+"))
+    return b, body
+
+
+def simulation(**options):
+    return wf.Simulation(bar(**options)[0].finalize(device="cpu"), dt=2e-3)
+
+
+def python(code, **environment):
+    """Run code in a fresh interpreter."""
+    env = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+
+
+# quiet
+
+STEP = """
+import warp as wp, warpfea as wf
+{before}
+b = wf.ModelBuilder()
+body = b.add_solid(wf.mesh.box((1, .2, .2), cells=(2, 1, 1)), material=wf.SVK(E=1e7, nu=.3, density=1000.), name="bar")
+b.clamp(body.nodes("x-"))
+level = wp.config.log_level
+model = b.finalize(device="cpu")
+model.tangent_matrix(model.state())
+sim = wf.Simulation(model, dt=1e-3)
+sim.run(2e-3)
+sim.field("von_mises", body)
+assert wp.config.log_level == level, wp.config.log_level
+"""
+
+
+def test_a_simulation_prints_nothing_of_its_own():
+    done = python(STEP.format(before=""))
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_who_asks_warp_for_more_gets_it():
+    done = python(STEP.format(before="wp.config.log_level = wp.LOG_DEBUG"))
+    assert done.returncode == 0, done.stderr
+    assert "Warp" in done.stdout
+    assert "Module warpfea." in done.stdout
+
+
+def test_the_level_is_restored_after_an_error():
+    before = wp.config.log_level
+    wp.config.log_level = wp.LOG_INFO
+    try:
+        try:
+            with quiet_warp():
+                assert wp.config.log_level == wp.LOG_WARNING
+                raise KeyError
+        except KeyError:
+            pass
+        assert wp.config.log_level == wp.LOG_INFO
+    finally:
+        wp.config.log_level = before
+
+
+def test_the_bar_of_the_compilation_is_shown_on_a_terminal_only(capfd, monkeypatch):
+    model = bar()[0].finalize(device="cpu")
+    capfd.readouterr()
+    wf.Simulation(model, dt=1e-3)
+    assert capfd.readouterr() == ("", "")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    wf.Simulation(model, dt=1e-3)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "compiling kernels" in err
+    wf.Simulation(model, dt=1e-3, on_compile=lambda *_: None)  # who draws a bar of their own gets one only
+    assert capfd.readouterr() == ("", "")
+    with compile_bar(False) as update:
+        update(1, 2, "warpfea.kernels.x")
+    assert capfd.readouterr() == ("", "")
+
+
+# density
+
+
+@pytest.mark.parametrize("law", WEIGHTLESS)
+def test_a_material_has_no_density_unless_it_is_given(law):
+    material = WEIGHTLESS[law]
+    name = type(material).__name__
+    assert material.density is None
+    with pytest.raises(wf.ModelError, match=rf"'bar': the material {name} has no density, which gravity needs"):
+        bar(material)[0].finalize(device="cpu")
+    model = bar(material, gravity=(0, 0, 0))[0].finalize(device="cpu")
+    with pytest.raises(
+        wf.ModelError, match=rf"'bar': the material {name} has no density, which motion needs.*density="
+    ):
+        wf.Simulation(model, dt=1e-3)
+
+
+def test_statics_without_gravity_needs_no_density():
+    given, missing = (
+        wf.solve_static(bar(m, gravity=(0, 0, 0))[0].finalize(device="cpu"), load_steps=2)
+        for m in (wf.SVK(E=1e7, nu=0.3, density=7850.0), wf.SVK(E=1e7, nu=0.3))
+    )
+    a, b = (r.probe("tip").displacement[0, -1] for r in (given, missing))
+    assert a[2] < -1e-4
+    np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-12)
+
+
+def test_gravity_set_later_needs_a_density_too():
+    b, body = bar(wf.SVK(E=1e7, nu=0.3), gravity=(0, 0, 0))
+    model = b.finalize(device="cpu")
+
+    def later():
+        model.set_gravity((0, 0, -9.81))
+        wf.solve_static(model)
+
+    with pytest.raises(wf.ModelError, match="has no density, which gravity needs"):
+        later()
+
+
+def test_the_material_without_density_is_named_among_many():
+    b = wf.ModelBuilder()
+    b.add_solid(BOX, material=LAW, name="heavy")
+    b.add_solid(GROUPED, material={"body": wf.NeoHookean(mu=1e6, k=1e7)}, name="light")
+    with pytest.raises(wf.ModelError, match="'light': the material NeoHookean of group 'body' has no density"):
+        b.finalize(device="cpu")
+
+
+def test_a_body_force_needs_a_density():
+    @wp.func
+    def pull(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
+        return wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
+
+    b, body = bar(wf.SVK(E=1e7, nu=0.3), gravity=(0, 0, 0))
+    b.add_body_force(pull, bodies=[body])
+    with pytest.raises(wf.ModelError, match=r"'bar'.*has no density, which add_body_force needs"):
+        b.finalize(device="cpu")
+
+
+# sizes
+
+
+def written(tmp_path, mesh=BOX, drop=(), kind="msh22"):
+    """A Gmsh file of a mesh, without the groups of some dimensions."""
+    import importlib.util
+
+    spec = importlib.util.spec_from_file_location("mesh_writers", ROOT / "tests" / "mesh_writers.py")
+    writers = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(writers)
+    parts = writers.Parts.of(mesh)
+    path = tmp_path / "part.msh"
+    writers.write(parts, path, kind)
+    return path, parts, writers
+
+
+def test_a_part_in_mm_read_as_m_warns_with_the_scale(tmp_path):
+    path, _, _ = written(tmp_path, BOX.transformed(scale=50.0))  # 50 m x 10 m x 10 m of steel
+    steel = wf.SVK(E=2e11, nu=0.3, density=7850.0)
+    with pytest.warns(wf.MeshWarning, match=r"'bar' is 50 m long and weighs 3.9\de\+07 kg: is .*part.msh.*scale=1e-3"):
+        bar(steel, mesh=str(path), clamp=False)[0].finalize(device="cpu")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", wf.MeshWarning)
+        bar(steel, mesh=str(path), clamp=False, scale=1e-3)[0].finalize(device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("scale", "density", "text"),
+    [(2000.0, None, r"2e\+03 m long: lengths"), (1e-7, 1000.0, "1e-07 m long"), (1e-5, 10.0, r"weighs 4e-16 kg")],
+)
+def test_sizes_beyond_reason_warn(scale, density, text):
+    material = wf.SVK(E=1e7, nu=0.3, density=density)
+    with pytest.warns(wf.MeshWarning, match=text):
+        bar(material, gravity=(0, 0, 0), mesh=BOX.transformed(scale=scale), clamp=False)[0].finalize(device="cpu")
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0])
+def test_sizes_within_reason_do_not(scale):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", wf.MeshWarning)
+        bar(LAW, mesh=BOX.transformed(scale=scale), clamp=False)[0].finalize(device="cpu")
+
+
+# meshes
+
+
+def as_meshio(mesh=BOX, **options):
+    import meshio
+
+    return meshio.Mesh(mesh.points, [(mesh.cell_type, mesh.cells)], **options)
+
+
+def test_a_meshio_mesh_is_taken_as_it_is():
+    sets = {"left": [BOX.elements(lambda X: X[:, 0] < 0.5)], "right": [BOX.elements(lambda X: X[:, 0] > 0.5)]}
+    mesh = as_meshio(cell_sets=sets, point_sets={"held": BOX.nodes("x-")})
+    b = wf.ModelBuilder()
+    body = b.add_solid(mesh, material={"left": LAW, "right": LAW}, scale=2.0)
+    assert body.mesh.path is None
+    np.testing.assert_array_equal(body.mesh.points, 2.0 * BOX.points)
+    np.testing.assert_array_equal(body.mesh.cells, BOX.cells)
+    np.testing.assert_array_equal(body.nodes("held").indices, BOX.nodes("x-"))
+    assert len(body.elements("left")) + len(body.elements("right")) == len(BOX.cells)
+    quads = wf.mesh.grid((1, 1), cells=(2, 2))
+    plate = b.add_shell(as_meshio(quads), thickness=0.1, material=LAW)
+    assert len(plate.mesh.cells) == 4
+
+
+def test_groups_of_gmsh_survive_meshio(tmp_path):
+    import meshio
+
+    path, _, _ = written(tmp_path)
+    taken, read = wf.mesh.from_meshio(meshio.read(path)), wf.mesh.read(path)
+    assert sorted(read.surface_sets) == sorted(taken.surface_sets)
+    assert sorted(read.element_sets) == sorted(taken.element_sets)
+    for name, faces in read.surface_sets.items():
+        np.testing.assert_array_equal(taken.surface(name), faces)
+
+
+def test_what_is_no_mesh_is_named_in_full():
+    class Mesh:
+        pass
+
+    with pytest.raises(wf.ModelError, match=r"add_solid: mesh must be .* a meshio.Mesh, got .*Mesh"):
+        wf.ModelBuilder().add_solid(Mesh(), material=LAW)
+    with pytest.raises(wf.MeshError, match=r"expected a meshio.Mesh, got"):
+        wf.mesh.from_meshio(Mesh())
+    lost = as_meshio()
+    lost.points = np.full_like(BOX.points, np.nan)
+    with pytest.raises(wf.MeshError, match=r"meshio.Mesh: node 0"):
+        wf.ModelBuilder().add_solid(lost, material=LAW)
+
+
+def test_groups_of_surfaces_only_say_that_the_volume_has_none():
+    text = r"'steel' is not .*volume has no group .*'x-'.*: give one material for the whole body, material=law"
+    with pytest.raises(wf.ModelError, match=text + "$"):
+        wf.ModelBuilder().add_solid(BOX, material={"steel": LAW})
+    with pytest.raises(wf.ModelError, match=text + r", or name the volume in Gmsh, Physical Volume"):
+        wf.ModelBuilder().add_solid(replace(BOX, path="part.msh"), material={"steel": LAW})
+    with pytest.raises(wf.ModelError) as error:  # with groups of elements it is another mistake
+        wf.ModelBuilder().add_solid(GROUPED, material={"boddy": LAW})
+    assert "did you mean 'body'" in str(error.value)
+    assert "volume" not in str(error.value)
+
+
+def test_a_file_whose_volume_was_not_saved_says_why(tmp_path):
+    import meshio
+
+    triangles = BOX.faces("x-")[:, :3]
+    path = tmp_path / "skin.msh"
+    mesh = meshio.Mesh(
+        BOX.points, [("triangle", triangles)],
+        cell_data={"gmsh:physical": [np.full(len(triangles), 3)], "gmsh:geometrical": [np.full(len(triangles), 1)]},
+        field_data={"wall": np.array([3, 2])},
+    )  # fmt: skip
+    meshio.write(path, mesh, file_format="gmsh22")
+    with pytest.raises(wf.MeshError, match=r"no tetrahedra.*surfaces \('wall'\).*Physical Volume.*SaveAll"):
+        wf.mesh.read(path)
+
+
+def test_a_group_of_another_kind_is_said_so():
+    with pytest.raises(wf.MeshError, match=r"no surface set named 'body'; .*'body' is a set of elements"):
+        GROUPED.surface("body")
+    with pytest.raises(wf.MeshError, match=r"no element set named 'x-'; there are: 'body'; 'x-' is a set of faces and"):
+        GROUPED.elements("x-")
+
+
+# names
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "found"),
+    [
+        ("Von-Mises", ["von_mises", "displacement"], "; did you mean 'von_mises'?"),
+        ("displacment", ["von_mises", "displacement"], "; did you mean 'displacement'?"),
+        ("--materail", ["--material", "--clamp"], "; did you mean '--material'?"),
+        ("top", ["x-", "x+"], ""),
+        ("a", [], ""),
+        (3, ["4"], ""),
+    ],
+)
+def test_did_you_mean(name, known, found):
+    assert did_you_mean(name, known) == found
+
+
+def test_names_that_are_nearly_right_are_offered():
+    sim = simulation()
+    body = sim.model.bodies[0]
+    cases = {
+        "tip": lambda: sim.probe("tpi"),
+        "von_mises": lambda: sim.field("vonmises", body),
+        "displacement": lambda: sim.skin_field("displacements", body),
+        "revolute": lambda: wf.ModelBuilder().add_joint("revolut", parent=wf.GROUND, child=body.nodes("x-")),
+        "tied": lambda: wf.ModelBuilder().add_beam(
+            [(0, 0, 0), (1, 0, 0)], elements=1, section=wf.Rectangle(0.1, 0.1), normal=(0, 0, 1), material=LAW,
+            integration="tyed"),
+    }  # fmt: skip
+    for meant, action in cases.items():
+        if meant == "revolute":
+            b, own = bar()
+            action = lambda b=b, own=own: b.add_joint("revolut", parent=wf.GROUND, child=own.nodes("x-"))  # noqa: E731
+        with pytest.raises(wf.ModelError, match=f"did you mean '{meant}'"):
+            action()
+
+
+# files
+
+
+def codes(path):
+    """Time codes of an animation, and the points of its last frame."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    (mesh,) = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    times = mesh.GetPointsAttr().GetTimeSamples()
+    return list(times), np.array(mesh.GetPointsAttr().Get(times[-1]))
+
+
+def colours(path, code):
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    (mesh,) = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    return np.array(mesh.GetDisplayColorPrimvar().Get(code))
+
+
+def test_an_animation_goes_on_where_it_ended(tmp_path):
+    whole, parts, check = tmp_path / "whole.usdc", tmp_path / "parts.usdc", tmp_path / "c.npz"
+    simulation().run(0.02, outputs=[wf.USDWriter(whole, fps=500)])
+    simulation().run(0.01, outputs=[wf.USDWriter(parts, fps=500), wf.Checkpoint(check)])
+    sim = simulation()
+    sim.resume(check)
+    sim.run(0.02, outputs=[wf.USDWriter(parts, fps=500, extend=True)])
+    assert validate_usd(parts) == []
+    (times, last), (expected, points) = codes(parts), codes(whole)
+    assert times == expected
+    assert len(times) == 11
+    np.testing.assert_array_equal(last, points)
+    for code in (times[2], times[-1]):  # the colours of the first half are of the range of both
+        np.testing.assert_allclose(colours(parts, code), colours(whole, code), atol=1e-6)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.npz", "parts.usdc", "whole.usdc"]
+
+
+def test_an_animation_of_many_worlds_keeps_its_grid(tmp_path):
+    from pxr import Usd
+
+    def worlds():
+        return wf.Simulation(bar()[0].finalize(device="cpu", worlds=2), dt=2e-3)
+
+    def place():
+        stage = Usd.Stage.Open(str(path))
+        return tuple(stage.GetPrimAtPath("/World/world_0001").GetAttribute("xformOp:translate").Get())
+
+    path, check = tmp_path / "o.usdc", tmp_path / "c.npz"
+    worlds().run(0.006, outputs=[wf.USDWriter(path, fps=500), wf.Checkpoint(check)])
+    before = place()
+    sim = worlds()
+    sim.resume(check)
+    sim.run(0.012, outputs=[wf.USDWriter(path, fps=500, extend=True)])
+    assert validate_usd(path) == []
+    assert place() == before
+    assert before[0] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "until", "text"),
+    [
+        ({"fps": 100}, 0.01, "frames per second is 500.0, of this run 100"),
+        ({"fps": 500, "fields": []}, 0.01, "fields"),
+        ({"fps": 500, "color": "displacement"}, 0.01, "field in colour"),
+        ({"fps": 500}, 0.014, "it goes on to t = 0.014 s, and the run is resumed at t = 0.01 s"),
+        ({"fps": 500}, 0.004, "it ends at t = 0.004 s.*frames are missing"),
+    ],
+)
+def test_an_animation_that_does_not_fit_is_refused_and_kept(tmp_path, options, until, text):
+    path, check = tmp_path / "o.usdc", tmp_path / "c.npz"
+    simulation().run(until, outputs=[wf.USDWriter(path, fps=500)])
+    simulation().run(0.01, outputs=[wf.Checkpoint(check)])
+    before = path.read_bytes()
+    sim = simulation()
+    sim.resume(check)
+    with pytest.raises(OutputError, match=f"o.usdc: can't go on with this file: .*{text}.*another file name"):
+        sim.run(0.02, outputs=[wf.USDWriter(path, extend=True, **options)])
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.npz", "o.usdc"]
+
+
+def test_an_animation_of_something_else_is_refused(tmp_path):
+    path, check = tmp_path / "o.usdc", tmp_path / "c.npz"
+    simulation(gravity=(0, 0, 5000.0)).run(0.01, outputs=[wf.USDWriter(path, fps=500)])
+    simulation().run(0.01, outputs=[wf.Checkpoint(check)])
+    sim = simulation()
+    sim.resume(check)
+    with pytest.raises(OutputError, match="its last frame shows body 'bar' elsewhere"):
+        sim.run(0.02, outputs=[wf.USDWriter(path, fps=500, extend=True)])
+    other = wf.Simulation(bar(mesh=wf.mesh.box((1, 0.2, 0.2), cells=(3, 1, 1)))[0].finalize(device="cpu"), dt=2e-3)
+    other.run(0.01)
+    with pytest.raises(OutputError, match="body 'bar' is not in it, or has another mesh"):
+        other.run(0.02, outputs=[wf.USDWriter(path, fps=500, extend=True)])
+    path.write_text("no stage")
+    with pytest.raises(OutputError, match=r"o\.usdc"):
+        sim.run(0.02, outputs=[wf.USDWriter(path, fps=500, extend=True)])
+    assert path.read_text() == "no stage"
+
+
+def test_a_series_for_paraview_goes_on(tmp_path):
+    whole, parts, check = tmp_path / "whole", tmp_path / "parts", tmp_path / "c.npz"
+    simulation().run(0.02, outputs=[wf.VTUWriter(whole, fps=250)])
+    simulation().run(0.012, outputs=[wf.VTUWriter(parts, fps=250), wf.Checkpoint(check)])
+    sim = simulation()
+    sim.resume(check)
+    sim.run(0.02, outputs=[wf.VTUWriter(parts, fps=250, extend=True)])
+    texts = [(folder / f"{folder.name}.pvd").read_text() for folder in (whole, parts)]
+    assert texts[0] == texts[1]
+    assert texts[0].count("<DataSet") == 6
+    names = [sorted(p.name for p in folder.iterdir() if p.suffix == ".vtu") for folder in (whole, parts)]
+    assert names[0] == names[1]
+
+
+def test_usd_speaks_our_words(tmp_path, monkeypatch):
+    from pxr import Tf, Usd
+
+    target = pathlib.Path("/proc/o.usdc")
+    if target.parent.is_dir():
+        with pytest.raises(OutputError, match=r"/proc/o.usdc: .*(takes no files|not writable)"):
+            wf.USDWriter(target).open(simulation())
+    try:
+        Usd.Stage.Open(str(tmp_path / "none.usdc"))
+        pytest.fail("USD opens what is not there")
+    except Tf.ErrorException as error:
+        raw = error
+    assert "line" in str(raw)
+
+    def fail(_):
+        raise raw
+
+    monkeypatch.setattr(usd, "check_target", lambda path, suffixes: pathlib.Path(path))
+    monkeypatch.setattr(Usd.Stage, "CreateNew", fail)
+    with pytest.raises(OutputError) as told:
+        wf.USDWriter(tmp_path / "o.usdc").open(simulation())
+    text = str(told.value)
+    assert text.startswith(f"{tmp_path / 'o.usdc'}: can't be written (")
+    assert "none.usdc" in text
+    for word in ("pxrInternal", ".cpp", "line", "\n", "Error in"):
+        assert word not in text
+
+
+# statics
+
+
+def labels(monkeypatch):
+    """Collects what is written under pictures."""
+    seen = []
+    label = reel.label
+
+    def note(image, time, bar):
+        seen.append(time)
+        return label(image, time, bar)
+
+    monkeypatch.setattr(reel, "label", note)
+    return seen
+
+
+def test_statics_write_outputs_and_say_the_load(tmp_path, monkeypatch):
+    seen = labels(monkeypatch)
+    model = bar()[0].finalize(device="cpu")
+    small = {"size": (160, 90)}
+    outputs = [
+        wf.PNGWriter(tmp_path / "o.png", **small),
+        wf.GIFWriter(tmp_path / "o.gif", progress=False, **small),
+        wf.USDWriter(tmp_path / "o.usdc"),
+        wf.VTUWriter(tmp_path / "vtu"),
+    ]
+    static = wf.solve_static(model, load_steps=4, outputs=outputs)
+    assert seen[0] == "load 100 %"
+    assert seen[-5:] == ["load 0 %", "load 25 %", "load 50 %", "load 75 %", "load 100 %"]
+    assert validate_usd(tmp_path / "o.usdc") == []
+    assert len(codes(tmp_path / "o.usdc")[0]) == 5
+    assert (tmp_path / "vtu" / "vtu.pvd").read_text().count("<DataSet") == 5
+    assert static.state.time.numpy().max() == 0.0
+    # a picture that is made afterwards, as of any simulation, and one of the file
+    seen.clear()
+    picture = wf.PNGWriter(tmp_path / "later.png", **small)
+    picture.open(static.simulation)
+    picture.close(static.simulation)
+    from warpfea.outputs.render import render_usd
+
+    render_usd(tmp_path / "o.usdc", tmp_path / "usd.png", size=(160, 90))
+    assert seen == ["load 100 %", "load 100 %"]
+    assert time_of(static.simulation) == 1.0
+
+
+def test_a_motion_still_says_the_time(tmp_path, monkeypatch):
+    seen = labels(monkeypatch)
+    simulation().run(0.004, outputs=[wf.PNGWriter(tmp_path / "o.png", size=(160, 90))])
+    assert len(seen) == 1
+    assert seen[0].startswith("t = 0.004")
+
+
+def test_a_load_step_that_fails_is_told_by_the_load():
+    b, body = bar()
+    b.add_traction(body.surface("x+"), (0, 0, -1e30))
+    solver = wf.NewtonPCG(max_halvings=0)
+    with pytest.raises(wf.ConvergenceError, match=r"load step from 0 % to 50 % of the load was not accepted"):
+        wf.solve_static(b.finalize(device="cpu"), load_steps=2, solver=solver)
+
+
+# pictures
+
+
+def test_fields_and_colours_are_checked_before_the_first_step(tmp_path):
+    for writer in (
+        wf.PNGWriter(tmp_path / "o.png", field="von_misses"),
+        wf.GIFWriter(tmp_path / "o.gif", field="von_misses"),
+        wf.USDWriter(tmp_path / "o.usdc", color="von_misses"),
+        wf.VTUWriter(tmp_path / "vtu", fields=["von_misses"]),
+    ):
+        sim = simulation()
+        with pytest.raises(wf.ModelError, match=r"'von_misses' is unknown.*did you mean 'von_mises'"):
+            sim.run(0.01, outputs=[writer])
+        assert sim.steps == 0
+    for bad in ((1.0, 1.0), (2.0, 1.0), (0.0, np.nan), 3.0, "ab"):
+        for kind in (wf.PNGWriter, wf.GIFWriter, wf.USDWriter):
+            name = {wf.PNGWriter: "o.png", wf.GIFWriter: "o.gif", wf.USDWriter: "o.usdc"}[kind]
+            with pytest.raises(OutputError, match="color_range"):
+                kind(tmp_path / name, color_range=bad)
+    assert list(tmp_path.iterdir()) == []
+
+
+# what things say of themselves
+
+
+def test_reprs_are_one_informative_line():
+    b, body = bar()
+    assert repr(wf.ModelBuilder()) == "ModelBuilder(no bodies)"
+    assert repr(b) == "ModelBuilder(Body('bar', T10, 12 elements), 1 support, 1 load, 1 probe)"
+    model = b.finalize(device="cpu")
+    sim = wf.Simulation(model, dt=2e-3)
+    sim.step(2)
+    assert repr(sim) == (
+        f"Simulation(t = 0.004 s, 2 steps, dt = 0.002 s, backward_euler, newton-pcg, {model.slots} slots, cpu, float64)"
+    )
+    static = wf.solve_static(model, load_steps=2)
+    assert repr(static.simulation).startswith("Simulation(static, load 100 %, 2 load steps, ")
+    assert repr(static).startswith("StaticResult(2 load steps, ")
+    many = wf.ModelBuilder()
+    for _ in range(5):
+        many.add_solid(BOX, material=LAW)
+    assert repr(many) == "ModelBuilder(5 bodies)"
+    for thing in (b, sim, static, many, body):
+        assert "\n" not in repr(thing)
+        assert len(repr(thing)) < 200

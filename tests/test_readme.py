@@ -1,0 +1,303 @@
+"""READMEs: every Python block runs, commands parse, links and names exist, numbers are those of the result files."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import re
+import runpy
+import shlex
+
+import pytest
+import warp as wp
+from warpfea.kernels.elements import materials
+
+import warpfea as wf
+from warpfea.cli.parser import parse
+from warpfea.elements import family
+from warpfea.simulation import integrators
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "tests" / "results"
+FOLDERS = (".", "kernels", "scenes", "tests", "warpfea", "warpfea/builder", "warpfea/simulation", "warpfea/solvers")
+READMES = [ROOT / folder / "README.md" for folder in FOLDERS]
+TEXT = {path.relative_to(ROOT).as_posix(): path.read_text() for path in READMES}
+REGISTRIES = (family._families, materials.LAWS, integrators.INTEGRATORS)
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+
+def fences(name, *languages):
+    """The text of the fenced blocks of a README in some languages, with the lines that they begin at."""
+    found = FENCE.finditer(TEXT[name])
+    return [(m[2], TEXT[name][: m.start()].count("\n") + 1) for m in found if m[1] in languages]
+
+
+def prose(name):
+    """A README without its fenced blocks."""
+    return FENCE.sub("", TEXT[name])
+
+
+PYTHON = [pytest.param(code, id=f"{name}:{line}") for name in TEXT for code, line in fences(name, "python")]
+
+
+def test_all_readmes_are_known():
+    found = {p for p in ROOT.rglob("README.md") if not any(part.startswith(".") for part in p.relative_to(ROOT).parts)}
+    assert {p for p in found if "build" not in p.relative_to(ROOT).parts} == set(READMES)
+
+
+def test_the_first_readme_is_short():
+    assert len(TEXT["README.md"].splitlines()) <= 240
+
+
+@pytest.mark.parametrize("name", TEXT)
+def test_text_speaks_of_the_project_alone(name):
+    words = ["/wo" + "rk/", "/ro" + "ot/", "/tm" + "p/", "pypi" + r"\.org", r"\bsess" + "ions?", r"\bhelp" + "ers?"]
+    assert not re.search("|".join(words), TEXT[name])
+
+
+# code
+
+
+@pytest.fixture
+def _registries():
+    """A recipe's element, law and integrator are gone after it."""
+    before = [dict(registry) for registry in REGISTRIES]
+    yield
+    for registry, entries in zip(REGISTRIES, before):
+        registry.clear()
+        registry.update(entries)
+
+
+@pytest.mark.parametrize("code", PYTHON)
+@pytest.mark.usefixtures("_registries")
+def test_code_runs(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "example.py"
+    file.write_text(code)
+    monkeypatch.setattr(wp, "get_preferred_device", lambda: wp.get_device("cpu"))
+    runpy.run_path(str(file))
+
+
+def test_there_is_code_for_newcomers():
+    first, builder = (
+        "\n".join(code for code, _ in fences(name, "python")) for name in ("README.md", "warpfea/builder/README.md")
+    )
+    wanted = ("add_solid", "add_beam", "add_shell", "add_joint", "solve_static", "PNGWriter", "USDWriter", "GIFWriter")
+    for name in (*wanted, "mass_matrix", "tangent_matrix", "free_slots", "eigsh", "set_gravity", "worlds="):
+        assert name in first, name
+    wanted = ("add_moment", "spline", "weld", "add_pressure", "add_traction", "add_body_force", "add_point_load")
+    joints = ("drive", "GROUND", "joint_force", "joint_record", "joint_value", "violation", "add_constraint")
+    for name in (*wanted, *joints, "clamp", "set_initial", "add_probe"):
+        assert name in builder, name
+
+
+# commands
+
+
+def commands():
+    """The lines that call warpfea, of blocks and of `code`, with what they need to be parsed."""
+    for name in TEXT:
+        lines = [line for code, _ in fences(name, "sh") for line in code.replace("\\\n", " ").splitlines()]
+        lines += [" ".join(text.split()) for text in re.findall(r"`(warpfea [^`]*)`", prose(name))]
+        for line in lines:
+            for part in line.split("&&"):
+                words = shlex.split(part, comments=True)
+                if words and words[0].endswith("warpfea") and len(words) > 1:
+                    yield pytest.param(words[1:], id=f"{name}: {' '.join(words[1:])}"[:100])
+
+
+@pytest.mark.parametrize("words", list(commands()))
+def test_commands_parse(words, capsys):
+    if len(words) == 1 or "COMMAND" in words:  # the name alone
+        with pytest.raises(SystemExit, match="0"):
+            parse([word for word in words[:1] if word != "COMMAND"] + ["--help"])
+    else:
+        assert callable(parse(words).command)
+
+
+# links, names, numbers
+
+
+@pytest.mark.parametrize("name", TEXT)
+def test_links_lead_somewhere(name):
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(name)):
+        if target.startswith("https://"):
+            continue
+        file, _, anchor = target.partition("#")
+        path = (ROOT / name).parent / file if file else ROOT / name
+        assert path.exists(), target
+        if anchor:
+            assert anchor in anchors(path), target
+
+
+def anchors(path):
+    """Those that a renderer gives to headings."""
+    titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("name", TEXT)
+def test_files_named_in_code_exist(name):
+    for text in re.findall(r"`([\w./-]+\.(?:py|json|npz|msh))`", prose(name)):
+        places = [ROOT, (ROOT / name).parent, ROOT / "warpfea", RESULTS]
+        if "/" in text or text.endswith("_h200.json"):
+            assert any((place / text).exists() for place in places), text
+
+
+@pytest.mark.parametrize("name", TEXT)
+def test_public_names_exist(name):
+    for attribute in re.findall(r"\bwf\.(\w+)", TEXT[name]):
+        assert attribute in wf.__all__, attribute
+
+
+def rows(name, section):
+    """Cells of the rows of the tables between two marks, or below a heading; without heads."""
+    text = TEXT[name]
+    if section.startswith("#"):
+        text = re.split(r"^##? ", text.split(f"\n{section}\n")[1], flags=re.MULTILINE)[0]
+    else:
+        text = text.split(f"<!-- {section} -->")[1].split(f"<!-- /{section} -->")[0]
+    lines = text.splitlines()
+    rules = {k for k, line in enumerate(lines) if line.startswith("|") and set(line) <= set("|-")}
+    heads = {k - 1 for k in rules}
+    kept = [line for k, line in enumerate(lines) if line.startswith("|") and k not in rules | heads]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in kept]
+
+
+@pytest.mark.parametrize("section", ["## Paper I", "## Paper T"])
+def test_equations_are_where_the_table_says(section):
+    table = rows("kernels/README.md", section)
+    assert len(table) > 10
+    for equation, _, functions, files in table:
+        sources = [(ROOT / "kernels" / target).read_text() for target in re.findall(r"\]\((.*?)\)", files)]
+        names = re.findall(r"`(\w+)`", functions)
+        assert names, equation
+        assert sources, equation
+        for wanted in names:
+            assert any(re.search(rf"(?m)^\s*def {wanted}\(|^{wanted}\b.*=", text) for text in sources), (
+                equation,
+                wanted,
+            )
+
+
+def test_the_table_has_the_equations_that_readers_look_for():
+    text = " ".join(row[0] for row in rows("kernels/README.md", "## Paper I"))
+    covered = set()
+    for low, high in re.findall(r"\((\d+)\)(?:-\((\d+)\))?", text):
+        covered |= set(range(int(low), int(high or low) + 1))
+    left_out = {14, 15, 16, *range(73, 84)}  # what is said of them stands below the table
+    assert covered == set(range(1, 85)) - left_out
+
+
+def test_launches_come_in_the_order_of_the_table(monkeypatch):
+    from warpfea.base.launch import Launcher
+
+    seen = []
+    count = Launcher._count
+
+    def watch(self, kernel):
+        seen.append((pathlib.Path(kernel.func.__code__.co_filename).stem, kernel.func.__name__))
+        count(self, kernel)
+
+    monkeypatch.setattr(Launcher, "_count", watch)
+    b = wf.ModelBuilder()
+    bar = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(4, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1000.0))
+    b.clamp(bar.nodes("x-"))
+    b.add_traction(bar.surface("x+"), (0, 0, 10.0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, capture=False)
+    sim.step()
+    seen.clear()
+    sim.step()
+    names = {stem: f"{stem[0]}.{stem[1]}" for stem in seen}
+    table = rows("kernels/README.md", "launch-order")
+    always = [
+        re.findall(r"`([\w.]+)`", kernel)[0] for _, kernel, when, _ in table if when in ("always", "energy ledger")
+    ]
+    assert len(always) > 15
+    order = [name if name in always else plain for (_, plain), name in names.items()]
+    assert [name for name in order if name in always] == always
+    sources = {path.stem: path.read_text() for path in (ROOT / "kernels").rglob("*.py")}
+    for _, kernel, _, _ in table:
+        for name in re.findall(r"`([\w.]+)`", kernel):
+            file, _, plain = name.rpartition(".")
+            assert any(f"def {plain}(" in text for stem, text in sources.items() if file in ("", stem)), name
+
+
+def result(name, key="rows"):
+    return json.loads((RESULTS / name).read_text())[key]
+
+
+def test_numbers_of_the_peer_table():
+    measured = {row["label"]: row for row in result("peer_h200.json") if row["dtype"] == "float64"}
+    table = rows("tests/README.md", "peer-numbers")
+    assert [row[0] for row in table] == list(measured)
+    for label, unknowns, peer, ms, speedup, iterations, residual, tip in table:
+        row = measured[label]
+        assert int(unknowns) == row["unknowns"]
+        assert ms == f"{row['ms_per_step']:.3g}"
+        assert peer == (str(row["peer_ms"]) if row["peer_ms"] else "-")
+        assert speedup == (f"{row['speedup']:.3g}" if row["peer_ms"] else "-")
+        assert iterations == f"{row['newton_per_step']:.1f}, {row['pcg_per_step']:.0f}"
+        assert residual == f"{row['residual_force']:.0e}"
+        assert tip == (f"{row['tip_difference']:.0e}" if row["peer_ms"] else "-")
+
+
+def test_numbers_of_one_core():
+    measured = {}
+    for row in result("cpu.json"):
+        measured.setdefault(row["label"], {})[row["solver"]] = row
+    table = rows("tests/README.md", "cpu-numbers")
+    assert [row[0] for row in table] == list(measured)
+    for label, unknowns, *times, chrono in table:
+        own = measured[label]
+        assert int(unknowns) == own["default"]["unknowns"]
+        for text, solver in zip(times, ("default", "block-jacobi", "direct")):
+            assert float(text.split()[0]) == pytest.approx(own[solver]["ms_per_step"], rel=0.006), (label, solver)
+        if chrono != "-":
+            pair = [own["default"]["chrono_1"], own["default"]["chrono_2"]]
+            assert [float(x) for x in chrono.split("/")] == pytest.approx(pair)
+
+
+def test_numbers_of_joints():
+    for device, joints, E, ms, iterations, before, *_ in rows("tests/README.md", "joint-numbers"):
+        cost = result({"H200": "joints_h200.json", "CPU": "joints_cpu.json"}[device], "cost")
+        own = [r for r in cost if "worlds" not in r and r["joints"] == int(joints) and r["E"] == float(E)]
+        default = {r["dtype"]: r for r in own if r["method"] == "default"}
+        for text, dtype in zip(ms.split(" / "), ("float64", "float32")):
+            assert float(text) == pytest.approx(default[dtype]["ms_per_step"], abs=0.051)
+        newton, pcg = map(float, iterations.split(","))
+        assert (newton, pcg) == pytest.approx((default["float64"]["newton"], default["float64"]["pcg"]), abs=0.51)
+        (old,) = (r for r in own if r["method"].startswith("before") and r["dtype"] == "float64")
+        assert float(before) == pytest.approx(old["ms_per_step"], abs=0.051)
+
+
+def test_numbers_of_orders():
+    finest = {row["element"]: row for row in result("ancf_reference.json", "parts")["manufactured"]["rows"]}
+    table = rows("tests/README.md", "order-numbers")
+    assert {row[0] for row in table} == set(finest)
+    for element, cells, unknowns, error, order in table:
+        row = finest[element]
+        assert (int(cells), int(unknowns)) == (row["cells"], row["unknowns"])
+        assert error == f"{row['error']:.1e}"
+        assert order == f"{row['order']:.2f}"
+
+
+def test_files_of_results_are_listed():
+    listed = TEXT["tests/README.md"].split("## Results and the commands")[1]
+    for path in RESULTS.glob("*.json"):
+        assert f"`{path.name}`" in listed, path.name
+
+
+# pictures
+
+
+def test_every_scene_has_its_picture():
+    from PIL import Image
+
+    scenes = {p.stem for p in (ROOT / "scenes").glob("*.py")} - {"__init__"}
+    pictures = {p.stem: p for p in (RESULTS / "scenes").glob("*.png")}
+    assert set(pictures) == scenes
+    for name, path in pictures.items():
+        assert f"results/scenes/{name}.png" in TEXT["scenes/README.md"]
+        assert Image.open(path).size == (480, 300)
+    assert sum(p.stat().st_size for p in pictures.values()) < 1.5e6

@@ -1,0 +1,108 @@
+"""The committed table of `warpfea bench --scenes`: no scene launches, compiles or holds more than it did before.
+
+After a change that is meant to alter them, make the table anew (it keeps what it is compared with):
+
+    warpfea bench --scenes --device cpu --before tests/results/scenes_cpu.json --out tests/results/scenes_cpu.json
+"""
+
+import json
+import pathlib
+
+import pytest
+
+import warpfea as wf
+from warpfea.builder.scene import names
+from warpfea.cli import main
+from warpfea.studies.bench import scenes as bench
+
+PATH = pathlib.Path(__file__).resolve().parent / "results" / "scenes_cpu.json"
+LABELS = [case.label for case in bench.cases()]
+COSTS = ("launches", "per_step", "modules", "bytes")
+
+
+def content():
+    assert PATH.exists(), f"{PATH} is missing: make it with the command in this file"
+    return json.loads(PATH.read_text())
+
+
+@pytest.fixture(scope="module")
+def tables():
+    """Rows by label: now, before."""
+    found = content()
+    return tuple({row["label"]: row for row in rows} for rows in (found["rows"], found["before"]["rows"]))
+
+
+def test_the_table_is_whole_and_says_where_it_comes_from():
+    found = content()
+    assert found["command"].startswith("warpfea bench --scenes --device cpu --before")
+    assert found["machine"]["device"] == "cpu"
+    assert len(found["commit"]) >= 40
+    assert len(found["before"]["commit"]) >= 40
+    assert found["commit"][:40] != found["before"]["commit"][:40]
+    for rows in (found["rows"], found["before"]["rows"]):
+        assert [row["label"] for row in rows] == LABELS
+    assert set(names()) < set(LABELS)
+
+
+@pytest.mark.parametrize("label", LABELS)
+def test_costs_no_more_than_before(tables, label):
+    now, before = (table[label] for table in tables)
+    for name in COSTS:
+        assert (now[name] is None) == (before[name] is None), name
+        assert now[name] is None or now[name] <= before[name], (name, now[name], before[name])
+    for name in ("newton", "pcg"):
+        assert now[name] == before[name], name
+
+
+@pytest.mark.parametrize("label", ["cantilever", "slider_crank", "loads rate auto"])
+def test_the_table_is_up_to_date(tables, label):
+    """What is recorded for a step, counted anew."""
+    case = next(case for case in bench.cases() if case.label == label)
+    model = case.make().finalize(device="cpu", dtype=case.dtype, worlds=case.worlds)
+    solver = wf.NewtonPCG(tol=case.tol, **case.solver)
+    sim = wf.Simulation(model, dt=case.dt, integrator=case.integrator, solver=solver)
+    row = tables[0][label]
+    assert sim.stepper.launch.launches == row["launches"]
+    assert len(sim.stepper.launch.modules) == row["modules"]
+    assert sum(sim.bytes().values()) == row["bytes"]
+
+
+def test_the_command_compares_with_an_earlier_file(tmp_path, capfd):
+    old, new = tmp_path / "old.json", tmp_path / "new.json"
+    words = ["bench", "--scenes", "--rows", "rollup", "--device", "cpu"]
+    assert main([*words, "--out", str(old)]) == 0
+    (row,) = json.loads(old.read_text())["rows"]
+    assert row["per_step"] >= row["newton"] / bench.STEPS > 0
+    assert "before" not in capfd.readouterr().out
+    earlier = json.loads(old.read_text())
+    earlier["rows"][0]["launches"] += 1
+    old.write_text(json.dumps(earlier))
+    assert main([*words, "--before", str(old), "--out", str(new)]) == 0
+    assert f"before: launches {row['launches'] + 1}" in capfd.readouterr().out
+    found = json.loads(new.read_text())
+    assert found["rows"] == [row]
+    assert found["before"]["rows"] == earlier["rows"]
+    # a file with a `before` of its own hands that on
+    assert bench.earlier(str(new)) == found["before"]
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--scenes", "--before", "nowhere.json"], "nowhere.json"),
+        (["--scenes", "--rows", "crane"], "'crane'"),
+        (["--scenes", "--steps", "3"], "--steps"),
+        (["--before", "x.json"], "--scenes"),
+    ],
+)
+def test_bad_usage_is_named(words, named, capsys):
+    assert main(["bench", *words, "--device", "cpu"]) == 2
+    assert named in capsys.readouterr().err
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path, capsys):
+    for text in ("{}", "[]", "no json"):
+        path = tmp_path / "x.json"
+        path.write_text(text)
+        assert main(["bench", "--scenes", "--before", str(path)]) == 2
+        assert "x.json" in capsys.readouterr().err

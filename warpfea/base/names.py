@@ -1,0 +1,32 @@
+"""Names that a user misspells: what was likely meant."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+__all__ = ["did_you_mean", "listing"]
+
+CUTOFF = 0.6
+"""Similarity, 0 to 1, from which a known name is offered."""
+
+
+def did_you_mean(name: object, known: Iterable[object]) -> str:
+    """The text "; did you mean 'x'?" with the known name closest to `name`, or nothing where none is close.
+
+    Upper and lower case, and hyphens for underscores, count as the same.
+    """
+    plain: dict[str, str] = {}
+    for text in map(str, known):
+        plain.setdefault(_plain(text), text)
+    found = difflib.get_close_matches(_plain(str(name)), plain, n=1, cutoff=CUTOFF)
+    return f"; did you mean {plain[found[0]]!r}?" if found else ""
+
+
+def listing(known: Iterable[object]) -> str:
+    """The names in quotes with commas, or "none"."""
+    return ", ".join(repr(str(name)) for name in known) or "none"
+
+
+def _plain(text: str) -> str:
+    return text.casefold().replace("-", "_")

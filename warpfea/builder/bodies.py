@@ -1,0 +1,102 @@
+"""Bodies from meshes, materials and options, and the names they get."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from .. import elements as element_families
+from .. import mesh as meshes
+from ..base.errors import ModelError
+from ..base.names import did_you_mean
+from ..elements.sections import Rectangle
+from ..mesh import Mesh
+from ..model.bodies import Body
+from .checks import assign_materials
+from .solids import solid_geometry
+
+__all__ = ["MeshLike", "as_mesh", "make_solid", "make_structure", "unused_name"]
+
+MeshLike = str | pathlib.Path | Mesh | Any
+"""A file, a Mesh, or a meshio.Mesh, which this package does not import."""
+
+
+def as_mesh(mesh: MeshLike, what: str, scale: float, transform: Any) -> Mesh:
+    """A checked mesh, m, of a file, a Mesh or a meshio.Mesh. ModelError for anything else, MeshError for a bad mesh."""
+    if isinstance(mesh, (str, pathlib.Path)):
+        return meshes.read(mesh, scale=scale, transform=transform)
+    if meshes.is_meshio(mesh):
+        return meshes.from_meshio(mesh, scale=scale, transform=transform)
+    if not isinstance(mesh, Mesh):
+        kind = f"{type(mesh).__module__}.{type(mesh).__qualname__}".removeprefix("builtins.")
+        raise ModelError(f"{what}: mesh must be a file name, a warpfea.mesh.Mesh or a meshio.Mesh, got {kind}")
+    if scale != 1.0 or transform is not None:
+        mesh = mesh.transformed(scale=scale, transform=transform)
+    return meshes.check(mesh)
+
+
+def make_solid(name: str, mesh: Mesh, material: Any, element: str | None, quadrature: str | None) -> Body:
+    """A solid body; see ModelBuilder.add_solid."""
+    if len(mesh.cells) == 0:
+        raise ModelError(f"body {name!r}: the mesh has no elements")
+    if element is None and mesh.cell_type in ("quad", "line"):
+        raise ModelError(
+            f"body {name!r}: {mesh.label} is a surface of {mesh.cell_type} cells, not a solid; use add_shell(mesh, "
+            "thickness=...)"
+        )
+    family = element_families.get(element) if element else element_families.for_cell(mesh.cell_type)
+    mesh, frames = solid_geometry(name, mesh, family)
+    rule = family.rule(quadrature).name
+    curved = family.curved_rule.name if quadrature is None else rule
+    return Body(name, mesh, family, *assign_materials(name, mesh, material), rule, curved, frames)
+
+
+def make_structure(
+    name: str,
+    mesh: Mesh,
+    element: str,
+    material: Any,
+    integration: str | None,
+    axes: np.ndarray,
+    frames: np.ndarray,
+    section: Rectangle | None = None,
+) -> Body:
+    """A beam or shell with the axes and frames of its geometry; see ModelBuilder.add_beam and add_shell."""
+    materials, index = assign_materials(name, mesh, material)
+    family = element_families.get(element)
+    split = all(law.law == "svk" for _, law in materials)
+    scheme = integration or ("tied" if split else "full")
+    known = [*family.schemes, *family.rules]
+    if scheme not in known:
+        raise ModelError(
+            f"body {name!r}: integration = {scheme!r} is none of {', '.join(map(repr, known))}"
+            f"{did_you_mean(scheme, known)}"
+        )
+    if scheme in family.schemes and not split:
+        bad = next(law for _, law in materials if law.law != "svk")
+        raise ModelError(
+            f"body {name!r}: integration = {scheme!r} splits the St. Venant-Kirchhoff law; use 'full' with "
+            f"{type(bad).__name__}"
+        )
+    return Body(name, mesh, family, materials, index, scheme, scheme, frames, axes, section)
+
+
+def unused_name(name: Any, default: str, taken: set[str], what: str) -> str:
+    """The name a user gave, or a new one from `default`; `what`: "body" or "joint".
+
+    Raises:
+        ModelError: the name is no text, or used already.
+    """
+    if name is None:
+        k = 1
+        first = f"{default}_1" if what == "joint" else default
+        while (out := first if k == 1 else f"{default}_{k}") in taken:
+            k += 1
+        return out
+    if not isinstance(name, str) or not name:
+        raise ModelError(f"{what} name {name!r} is no text")
+    if name in taken:
+        raise ModelError(f"{what} name {name!r} is used twice")
+    return name

@@ -1,0 +1,115 @@
+"""Loads, initial states and probes as a builder records them; the methods of ModelBuilder say what they mean."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..laws import time_law
+from ..model.assembly import center_of_mass, surface_weights
+from ..model.bodies import Body
+from ..model.description import DeadLoad, Moment, Pressure, Probe, support_slots
+from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
+from .checks import slot_field, vector
+
+__all__ = [
+    "check_field",
+    "dead_traction",
+    "follower_pressure",
+    "point_load",
+    "probe_at",
+    "set_initial_state",
+    "spin_moment",
+]
+
+
+def point_load(body: Body, point: MaterialPoint | NodeSet, force: Any) -> DeadLoad:
+    """See ModelBuilder.add_point_load."""
+    law = time_law(force, f"point load on {body.name!r}")
+    if isinstance(point, NodeSet):
+        slots = support_slots(point, "position")
+        weights = np.full(len(slots), 1.0 / len(slots))
+    else:
+        slots, weights = point.slots, point.weights
+    return DeadLoad(body, slots, weights, law, "point load")
+
+
+def spin_moment(body: Body, point: MaterialPoint | NodeSet, moment: Any) -> Moment:
+    """See ModelBuilder.add_moment."""
+    law = time_law(moment, f"moment on {body.name!r}")
+    if isinstance(point, MaterialPoint):
+        slots, vectors, axes = point.slots[None], (point.gradients @ point.axes)[None], point.axes[None]
+    else:
+        nodes = point.indices[body.node_slot_count[point.indices] == 4]
+        if not len(nodes):
+            raise ModelError(
+                f"add_moment: nodes of body {body.name!r} ({body.family.name}) have no gradients to turn; use a "
+                "point body.at(...), or add_traction"
+            )
+        slots = body.node_slot[nodes][:, None] + np.arange(1, 4)
+        vectors = np.tile(np.eye(3), (len(slots), 1, 1))
+        axes = np.swapaxes(body.reference[slots], 1, 2)
+    vectors = vectors * (np.arange(3) >= 3 - body.family.spin_vectors)
+    return Moment(body, slots, vectors, axes, law)
+
+
+def dead_traction(body: Body, surface: SurfaceSet, traction: Any) -> DeadLoad:
+    """See ModelBuilder.add_traction."""
+    law = time_law(traction, f"traction on {surface.name or 'faces'!r} of body {body.name!r}")
+    slots, weights = surface_weights(surface)
+    return DeadLoad(body, slots, weights, law, "traction")
+
+
+def follower_pressure(body: Body, surface: SurfaceSet, pressure: Any) -> Pressure:
+    """See ModelBuilder.add_pressure."""
+    law = time_law(pressure, f"pressure on {surface.name or 'faces'!r} of body {body.name!r}", scalar=True)
+    if not len(surface):
+        raise ModelError(f"pressure on body {body.name!r}: the surface has no faces")
+    return Pressure(surface, law)
+
+
+def check_field(field: Any) -> None:
+    """Raise ModelError unless a body force is a wp.func of place and time."""
+    if not isinstance(field, wp.Function):
+        raise ModelError(f"add_body_force: the field must be a wp.func, got {field!r}")
+    if len(field.input_types) != 2:
+        raise ModelError(
+            f"add_body_force: {field.key} takes {len(field.input_types)} arguments; it must be "
+            "(x: wp.vec3d, t: wp.float64) -> wp.vec3d, or the same in float32"
+        )
+
+
+def set_initial_state(body: Body, velocity: Any, angular_velocity: Any, displacement: Any) -> None:
+    """See ModelBuilder.set_initial."""
+    label = f"body {body.name!r}"
+    if displacement is not None:
+        body.initial_displacement = slot_field(body, displacement, f"{label}: initial displacement")
+    if velocity is None and angular_velocity is None:
+        return
+    slots = np.zeros((body.slot_count, 3))
+    if velocity is not None:
+        slots += slot_field(body, velocity, f"{label}: velocity")
+    if angular_velocity is not None:
+        spin = vector(angular_velocity, f"{label}: angular_velocity")
+        x = body.reference + (0.0 if body.initial_displacement is None else body.initial_displacement)
+        position = body.slot_kind == 0
+        arm = np.where(position[:, None], x + body.origin - center_of_mass(body, x), x)
+        slots += np.cross(spin, arm)
+    body.velocity = slots
+
+
+def probe_at(name: str, body: Body, where: MaterialPoint | SurfaceSet | NodeSet) -> Probe:
+    """See ModelBuilder.add_probe."""
+    if isinstance(where, MaterialPoint):
+        slots, weights = where.slots, where.weights
+    elif isinstance(where, SurfaceSet):
+        slots, weights = surface_weights(where)
+        weights = weights / weights[body.slot_kind[slots] == 0].sum()
+    else:
+        slots = support_slots(where, "position")
+        weights = np.full(len(slots), 1.0 / len(slots))
+    X = weights @ (body.reference[slots] + (body.slot_kind[slots] == 0)[:, None] * body.origin)
+    return Probe(name, body, slots, weights, X)

@@ -1,0 +1,60 @@
+"""Supports as a builder records them: nodes held, moved or turned."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..laws import time_law
+from ..model.bodies import Body
+from ..model.description import Rotation, Support, support_slots
+from ..model.handles import NodeSet
+from .checks import component_mask, vector
+
+__all__ = ["clamp_support", "drive_supports"]
+
+
+def clamp_support(body: Body, nodes: NodeSet, slots: str, components: str) -> Support:
+    """See ModelBuilder.clamp."""
+    held = support_slots(nodes, slots)
+    if not len(held):
+        raise ModelError(f"clamp on {body.name!r}: the nodes {nodes.name!r} have no slots {slots!r}")
+    return Support(body, held, component_mask(components, f"clamp on {body.name!r}"))
+
+
+def drive_supports(
+    body: Body, nodes: NodeSet, displacement: Any, rotation: Any, components: str, slots: str | None
+) -> list[Support]:
+    """One support that moves, and one that holds the gradients named with a displacement; see ModelBuilder.drive."""
+    what = f"drive of {nodes.name or 'nodes'!r} on body {body.name!r}"
+    if (displacement is None) == (rotation is None):
+        raise ModelError(f"{what}: give either displacement or rotation")
+    slots = slots or ("position" if rotation is None else "all")
+    support = Support(body, support_slots(nodes, slots), component_mask(components, what))
+    if rotation is not None:
+        if not isinstance(rotation, Rotation):
+            raise ModelError(f"{what}: rotation must be a Rotation(anchor, axis, angle), got {rotation!r}")
+        axis = vector(rotation.axis, f"{what}: axis")
+        if not np.linalg.norm(axis) > 0.0:
+            raise ModelError(f"{what}: axis is zero")
+        support.law = time_law(rotation.angle, f"{what}: angle", scalar=True)
+        support.rotation = (vector(rotation.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis))
+        return [support]
+    out = []
+    moved = np.isin(support.slots, support_slots(nodes, "position"))
+    if not moved.any():
+        raise ModelError(f"{what}: slots = {slots!r} has no position to displace; clamp holds gradients")
+    if not moved.all():  # gradients stay as they are
+        out.append(Support(body, support.slots[~moved], support.components))
+    support.slots = support.slots[moved]
+    if isinstance(displacement, tuple) and len(displacement) == 2 and np.ndim(displacement[1]) == 3:
+        times, values = np.asarray(displacement[0], float), np.asarray(displacement[1], float)
+        if values.shape != (len(times), len(nodes), 3):
+            raise ModelError(f"{what}: values have shape {values.shape}, expected {(len(times), len(nodes), 3)}")
+        used = np.flatnonzero(body.node_slot[nodes.indices] >= 0)
+        support.node_laws = [time_law((times, values[:, k]), what) for k in used]
+    else:
+        support.law = time_law(displacement, f"{what}: displacement")
+    return [*out, support]

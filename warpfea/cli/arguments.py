@@ -1,0 +1,123 @@
+"""What the parsers of all commands share: the parser, types of values, general options."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from typing import Any, NoReturn
+
+from ..base.errors import UsageError
+from ..base.names import did_you_mean
+
+__all__ = [
+    "Parser",
+    "add_general",
+    "call",
+    "color_range",
+    "count",
+    "counts",
+    "numbers",
+    "pair",
+    "positive",
+    "size",
+    "vector",
+]
+
+
+class Parser(argparse.ArgumentParser):
+    """Help that keeps its line breaks; errors as UsageError."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        defaults: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+        super().__init__(*args, **(defaults | options))
+
+    def error(self, message: str) -> NoReturn:
+        choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if choice:
+            message += did_you_mean(choice[1], re.findall(r"[\w-]+", choice[2]))
+        raise UsageError(f"{message} ({self.prog} --help tells more)")
+
+
+def positive(text: str) -> float:
+    """A positive finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive finite number")
+    return value
+
+
+def count(text: str) -> int:
+    """A positive whole number."""
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
+    return int(text)
+
+
+def counts(text: str) -> list[int]:
+    """Positive whole numbers with commas; 1e5 counts as one."""
+    try:
+        values = [float(part) for part in text.split(",")]
+        assert all(math.isfinite(v) and v >= 1 and v == int(v) for v in values)
+    except (ValueError, AssertionError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of positive whole numbers") from None
+    return [int(v) for v in values]
+
+
+def numbers(text: str, size: int) -> tuple[float, ...]:
+    """Finite numbers with commas."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != size or not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not {size} finite numbers with commas")
+    return values
+
+
+def vector(text: str) -> tuple[float, ...]:
+    """x,y,z."""
+    return numbers(text, 3)
+
+
+def pair(text: str) -> tuple[float, ...]:
+    """Two numbers with a comma."""
+    return numbers(text, 2)
+
+
+def color_range(text: str) -> tuple[float, ...]:
+    """Two finite rising numbers with a comma."""
+    low, high = numbers(text, 2)
+    if not low < high:
+        raise argparse.ArgumentTypeError(f"{text!r} does not rise: give LOW,HIGH")
+    return low, high
+
+
+def size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT in pixels."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT, such as 960x540")
+    return int(match[1]), int(match[2])
+
+
+def call(module: str, function: str) -> Any:
+    """The command, imported when it is called."""
+
+    def command(arguments: argparse.Namespace) -> int:
+        import importlib
+
+        return int(getattr(importlib.import_module(f"{__package__}.{module}"), function)(arguments))
+
+    return command
+
+
+def add_general(to: argparse.ArgumentParser, quiet: str = "no bars and no summary table") -> None:
+    """The options that every command has; `quiet` is the help of --quiet."""
+    group = to.add_argument_group("general")
+    group.add_argument("--quiet", action="store_true", help=quiet)
+    group.add_argument("--no-progress", action="store_true", help="no bars; there are none without a terminal")
+    group.add_argument("--debug", action="store_true", help="errors as Python tracebacks")

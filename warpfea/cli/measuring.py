@@ -1,0 +1,192 @@
+"""The options of the commands that measure: bench, study, profile."""
+
+from __future__ import annotations
+
+import argparse
+import textwrap
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from ..base.errors import UsageError
+from ..base.names import did_you_mean
+from .arguments import Parser, add_general, call, count, counts, positive
+
+__all__ = ["add_bench", "add_profile", "add_study", "check_study"]
+
+PROFILE_EXAMPLES = """\
+examples:
+  warpfea profile hook                                  where the time of a step goes
+  warpfea profile cantilever --set cells=200 --device cuda:0 --png p.png --json p.json
+  warpfea profile my_scenes.py:swing --steps 50 --dtype float32
+  warpfea profile part.msh --material svk:E=7e8,nu=0.33,density=2700 --clamp base
+
+parts:
+@PARTS@
+
+how to read it:
+  A step runs as one recorded graph: its time is that of the graph. The same steps are then done again from the same
+  state, launch by launch, each timed alone (on a GPU by events around the kernel, on the CPU by the clock), less the
+  time of an empty launch. "between" is what a step takes beyond its kernels; a large share means that the problem is
+  too small for the device. On the CPU kernels timed alone take somewhat longer, since caches cool down in between.
+
+  MB are the bytes of the arrays that a launch can reach through its arguments, each array counted once, and GB/s those
+  bytes over the time. That is an estimate of the traffic: it is too high for a kernel that touches an array in part
+  and too low for one that reads it several times; small problems stay in the caches, and come out above the rate of a
+  copy. Where "of copy" is near 100 % for arrays much larger than the caches, memory is the limit; where it is low,
+  arithmetic, scattered access or the launch itself is.
+"""
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from ..studies.bench.command import bench
+
+    bench(arguments)
+    return 0
+
+
+def add_bench(commands: Any) -> None:
+    """`warpfea bench`."""
+    to = commands.add_parser(
+        "bench",
+        help="time and error of the solver on a bar, a beam or a plate",
+        description="ms per step, PCG iterations, bytes per unknown, residual and tip error of bodies (SVK, "
+        "E = 7e8 Pa, nu = 0.33, 2700 kg/m^3) that are clamped at x = 0 and loaded at the other end. bar: T10, "
+        "3 x 2 x 1 m, 5000 N along x. beam: 3243, elements of 0.5 x 0.1 x 0.1 m, 3100 N across. plate: 3443, "
+        "4 x 2 x 0.1 m, 1000 N down. ENMC, FN18, H3843: the bar of ANCF solids.",
+        epilog="examples:\n  warpfea bench --problem plate --unknowns 1e4,1e5\n"
+        "  warpfea bench --peer --large --out peer.json\n  warpfea bench --peer --rows 'beam-*,bar-3x2x1'\n"
+        "  warpfea bench --growth --out growth.json\n  warpfea bench --product --out product.json\n"
+        "  warpfea bench --cpu --out cpu.json\n"
+        "  warpfea bench --scenes --device cpu --before old.json --out scenes.json",
+    )
+    kind = to.add_mutually_exclusive_group()
+    kind.add_argument("--peer", action="store_true", help="120 steps to 5e-4 N on the peer's sizes, beside its times")
+    kind.add_argument("--growth", action="store_true", help="PCG iterations of a step for all E, dt and nu, by size")
+    kind.add_argument("--product", action="store_true", help="unknowns per second of the operator H v, its limits")
+    kind.add_argument("--cpu", action="store_true", help="ms per step of three linear solvers on this CPU, to 5e-4 N")
+    kind.add_argument("--scenes", action="store_true", help="launches, modules, bytes and iterations of every scene")
+    to.add_argument(
+        "--problem",
+        action="append",
+        choices=("bar", "beam", "plate", "ENMC", "FN18", "H3843"),
+        help="may be repeated; default bar, of --growth and --product several",
+    )
+    to.add_argument(
+        "--unknowns", "--sizes", type=counts, default=[], metavar="N,N,...", help="sizes (default: a few per problem)"
+    )
+    to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
+    to.add_argument(
+        "--dtype",
+        action="append",
+        choices=("float64", "float32"),
+        help="may be repeated; default both, of --peer float64 (--cpu: float64 only)",
+    )
+    to.add_argument(
+        "--linear", action="append", choices=("pcg", "direct"), help="linear solver, may be repeated; default pcg"
+    )
+    to.add_argument("--steps", type=count, metavar="N", help="steps to simulate (default 10, --peer 120, --cpu 20)")
+    to.add_argument("--repeat", type=count, metavar="N", help="runs; the median counts (default 3, --product 9)")
+    to.add_argument("--dt", type=positive, metavar="S", help="step, s (default 1e-3)")
+    to.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
+    to.add_argument(
+        "--reference-up-to",
+        type=counts,
+        metavar="N",
+        help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
+    )
+    group = to.add_argument_group("with --peer, --cpu or --scenes")
+    group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
+    group.add_argument(
+        "--before", metavar="FILE", help="--scenes: an earlier file to stand beside (the `before` in it, if it has one)"
+    )
+    group.add_argument(
+        "--limit", type=positive, metavar="S", help="--cpu: s after which a row takes no more steps (default 60)"
+    )
+    group.add_argument("--large", action="store_true", help="a bar of 4 million unknowns too, ten steps")
+    group.add_argument("--meshes", metavar="FOLDER", help="unstructured meshes (default: tests/data of the checkout)")
+    to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")
+    add_general(to, "no bars; the table is what it is for")
+    to.set_defaults(command=_bench)
+
+
+STUDY_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
+    "device": ("--device", {"help": "cpu, cuda:0, ..."}),
+    "only": ("--only", {"action": "append", "metavar": "PART", "help": "parts; the others stay in --out as they are"}),
+    "quick": ("--quick", {"action": "store_true", "help": "a trial: few and small rows, no result"}),
+    "steps": ("--steps", {"type": count, "metavar": "N", "help": "steps of each run"}),
+    "joints": ("--joints", {"type": counts, "metavar": "N,N,...", "help": "joints per chain (default 10,100,1000)"}),
+    "sizes": ("--sizes", {"type": counts, "metavar": "N,N,...", "help": "unknowns (default 100,300,1000,3000,10000)"}),
+    "repeat": (
+        "--repeat",
+        {"type": count, "default": 3, "metavar": "N", "help": "runs; the median counts (default 3)"},
+    ),
+}
+"""Options of studies: name in the registry -> flag, and how it is read."""
+
+
+def add_study(commands: Any) -> None:
+    """`warpfea study`: a command of its own for each study of the registry."""
+    from ..studies.registry import STUDIES
+
+    to = commands.add_parser(
+        "study",
+        help="repeat the measurements behind the tables: accuracy, agreement, cost",
+        description="Repeat a measurement: its rows are printed, and written with --out. The committed results lie in "
+        "tests/results.",
+        epilog="examples:\n  warpfea study ancf-tets --quick\n  warpfea study joints --help\n"
+        "  warpfea study mechanisms --only free_fall --out mechanisms.json",
+    )
+    names = to.add_subparsers(title="studies", metavar="STUDY", dest="study", required=True, parser_class=Parser)
+    for entry in STUDIES.values():
+        lines = ["parts:", *_columns(entry.parts), ""] if entry.parts else []
+        lines += [f"takes {entry.takes} on two cores", "", "example:"]
+        lines.append(f"  warpfea study {entry.name} {entry.example}".rstrip())
+        if entry.results:
+            lines += ["", f"results, in tests/results: {', '.join(entry.results)}"]
+        about = textwrap.fill(entry.about, 100)
+        one = names.add_parser(entry.name, help=entry.summary, description=about, epilog="\n".join(lines))
+        for name in entry.options:
+            flag, how = STUDY_OPTIONS[name]
+            choices = {"choices": [part for part, _ in entry.parts]} if name == "only" else {}
+            one.add_argument(flag, **how, **choices)
+        if entry.out:
+            what = "JSON with command, machine, settings and rows" if entry.out == "FILE" else "where files are written"
+            one.add_argument("--out", metavar=entry.out, help=what)
+        add_general(one, "no bars, no table")
+        one.set_defaults(command=call("study", "study"))
+
+
+def check_study(words: Sequence[str]) -> None:
+    """Refuse a study that is not there, scenes among them, in words of our own. UsageError."""
+    from ..studies.registry import STUDIES
+
+    if len(words) > 1 and words[0] == "study" and not words[1].startswith("-") and words[1] not in STUDIES:
+        hint = did_you_mean(words[1], STUDIES)
+        raise UsageError(f"study {words[1]!r} is not part of this version; there are {', '.join(STUDIES)}{hint}")
+
+
+def _columns(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Names and what they mean, a line each."""
+    width = max(len(name) for name, _ in rows)
+    return [f"  {name:{width}}  {text}" for name, text in rows]
+
+
+def add_profile(commands: Any, add_model: Callable[[argparse.ArgumentParser], None]) -> None:
+    """`warpfea profile`; `add_model` adds the options of what is simulated."""
+    from ..terms.term_set import all_parts
+
+    parts = "\n".join(f"  {name:14}  {text}" for name, text in all_parts().items())
+    to = commands.add_parser(
+        "profile",
+        help="where the time of a step goes",
+        description="Time per part of a step and per kernel, iterations, launches, bytes, bandwidth beside that of a "
+        "copy, compile time.",
+        epilog=PROFILE_EXAMPLES.replace("@PARTS@", parts),
+    )
+    add_model(to)
+    to.add_argument("--steps", type=count, default=10, metavar="N", help="steps that are timed, after 2 (default 10)")
+    out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
+    out.add_argument("--png", metavar="FILE", help="picture of the parts (pip install 'warpfea[plots]')")
+    out.add_argument("--json", metavar="FILE", help="all numbers, with fixed keys; - for stdout")
+    add_general(to)
+    to.set_defaults(command=call("profile", "profile"))

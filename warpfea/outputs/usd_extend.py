@@ -1,0 +1,135 @@
+"""Going on with an animation that an earlier part of a run has written: does it fit, and what does it hold."""
+
+from __future__ import annotations
+
+import pathlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warpfea.base.errors import OutputError
+from warpfea.outputs.frames import Surface, is_static, time_of
+
+__all__ = ["Earlier", "read_earlier"]
+
+SAME = 1e-4
+"""Distance, over the size of what is drawn, at which the last frame and the present state are not one motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class Earlier:
+    """What a stage of :class:`warpfea.USDWriter` holds.
+
+    Attributes:
+        codes: time codes of its frames.
+        time: of the last frame, s.
+        ranges: extremes of each field, SI units.
+        box: lowest and highest corner of all frames, (3,) each, m.
+        offsets: (worlds, 3) origins of the worlds on the grid, m.
+        paths: prims of each body's meshes, [body][world].
+    """
+
+    codes: list[float]
+    time: float
+    ranges: dict[str, tuple[float, float]]
+    box: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
+    offsets: npt.NDArray[np.float64]
+    paths: list[list[str]]
+
+
+def read_earlier(
+    target: pathlib.Path, stage: Any, sim: Any, surface: Surface, paths: list[list[str]], wanted: dict[str, Any]
+) -> Earlier:
+    """The contents of a stage that the run of `sim` goes on with.
+
+    Args:
+        target: its file, for messages.
+        surface: what is drawn of the simulation.
+        paths: prims of the bodies' meshes, [body][world].
+        wanted: "fps", "fields" and "color" of the writer.
+
+    Raises:
+        OutputError: it is of another writer, scene or setting, does not end where the simulation is, or shows another
+            motion.
+    """
+    from pxr import UsdGeom
+
+    root = stage.GetDefaultPrim()
+    about = root.GetCustomDataByKey("warpfea") if root else None
+    if not about:
+        raise _refused(target, "it was not written by warpfea")
+    has = {
+        "number of worlds": (int(about["worlds"]), surface.worlds),
+        "frames per second": (float(stage.GetTimeCodesPerSecond()), float(wanted["fps"])),
+        "fields": (sorted(about["fields"]), sorted(wanted["fields"])),
+        "field in colour": (str(about["color"]), wanted["color"] or ""),
+        "up axis": (str(UsdGeom.GetStageUpAxis(stage)), surface.up_axis),
+        "kind": (bool(about.get("static", False)), is_static(sim)),
+    }
+    for what, (old, new) in has.items():
+        if old != new:
+            raise _refused(target, f"its {what} is {old!r}, of this run {new!r}")
+    meshes = [[UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in worlds] for worlds in paths]
+    for body, worlds in zip(surface.bodies, meshes, strict=True):
+        for mesh in worlds:
+            faces = np.asarray(mesh.GetFaceVertexIndicesAttr().Get() if mesh else ()).reshape(-1)
+            if not np.array_equal(faces, np.asarray(body.skin.triangles).ravel()):
+                raise _refused(target, f"body {body.name!r} is not in it, or has another mesh")
+    codes = list(map(float, meshes[0][0].GetPointsAttr().GetTimeSamples()))
+    if not codes:
+        raise _refused(target, "it has no frames")
+    time, now = codes[-1] / wanted["fps"], time_of(sim)
+    slack = 1e-6 * max(1.0 / wanted["fps"], abs(now))
+    if time > now + slack:
+        raise _refused(target, f"it goes on to t = {time:.6g} s, and the run is resumed at t = {now:.6g} s")
+    if time < now - slack - 1.001 / wanted["fps"]:
+        raise _refused(
+            target, f"it ends at t = {time:.6g} s, and the run is resumed at t = {now:.6g} s: frames are missing"
+        )
+    offsets = np.array([_offset(stage, meshes[0][world]) for world in range(surface.worlds)])
+    box = _box(meshes, codes, offsets)
+    if abs(time - now) <= slack:
+        size = float(np.linalg.norm(box[1] - box[0]))
+        for body, worlds in zip(surface.bodies, meshes, strict=True):
+            points = surface.points_of(sim, body)
+            for world, mesh in enumerate(worlds):
+                drawn = np.asarray(mesh.GetPointsAttr().Get(codes[-1]), dtype=float) + _center(mesh, codes[-1])
+                if np.abs(drawn - points[world]).max() > SAME * size:
+                    raise _refused(target, f"its last frame shows body {body.name!r} elsewhere than the checkpoint")
+    ranges = {name: (float(field["range"][0]), float(field["range"][1])) for name, field in about["fields"].items()}
+    return Earlier(codes, time, ranges, box, offsets, paths)
+
+
+def _refused(target: pathlib.Path, reason: str) -> OutputError:
+    return OutputError(f"{target}: can't go on with this file: {reason}; give another file name")
+
+
+def _center(mesh: Any, code: float) -> npt.NDArray[np.float64]:
+    """The body's centre in its world at a time code, (3,) m."""
+    from pxr import UsdGeom
+
+    (op,) = UsdGeom.Xformable(mesh.GetPrim().GetParent()).GetOrderedXformOps()
+    return np.asarray(op.Get(code), dtype=float)
+
+
+def _offset(stage: Any, mesh: Any) -> npt.NDArray[np.float64]:
+    """Where the world of a mesh lies on the grid, (3,) m."""
+    from pxr import UsdGeom
+
+    (op,) = UsdGeom.Xformable(mesh.GetPrim().GetParent().GetParent()).GetOrderedXformOps()
+    return np.asarray(op.Get(), dtype=float)
+
+
+def _box(
+    meshes: list[list[Any]], codes: list[float], offsets: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Corners of the box of all frames, m."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for worlds in meshes:
+        for world, mesh in enumerate(worlds):
+            for code in codes:
+                extent = np.asarray(mesh.GetExtentAttr().Get(code), dtype=float) + _center(mesh, code) + offsets[world]
+                low, high = np.minimum(low, extent[0]), np.maximum(high, extent[1])
+    return low, high

@@ -1,0 +1,80 @@
+"""What a simulation tells: of a step, and of probes and joints over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["JointRecord", "ProbeRecord", "StepReport", "describe", "idle_report"]
+
+
+@dataclass(frozen=True, eq=False)
+class StepReport:
+    """What a step took, each an array [world].
+
+    Attributes:
+        converged: the step was accepted and is within the solver's tolerance. With wf.Jacobi a world may go on without:
+            False with status 0.
+        newton, pcg: iterations, refused attempts included; Jacobi's count as newton.
+        residual: |g| over the largest force, of the last attempt.
+        halvings: refused attempts.
+        status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
+        min_J: smallest det F; a value <= 0 means that an element turned inside out (SVK only; others refuse it).
+        time: s.
+        residual_force: |g| over the free components, N, of the last attempt.
+        violation: largest of the constraints, m.
+        outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
+    """
+
+    converged: np.ndarray
+    newton: np.ndarray
+    pcg: np.ndarray
+    residual: np.ndarray
+    halvings: np.ndarray
+    status: np.ndarray
+    min_J: np.ndarray
+    time: np.ndarray
+    failure: np.ndarray
+    violation: np.ndarray
+    outer: np.ndarray
+    residual_force: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class JointRecord:
+    """A joint over time: time (steps,); force (worlds, steps, 3), N, and moment about its anchor, N m, on the child in
+    world axes; violation (worlds, steps), m, the largest of its rows."""
+
+    time: np.ndarray
+    force: np.ndarray
+    moment: np.ndarray
+    violation: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ProbeRecord:
+    """A probe over time: time (steps,), position, displacement and velocity (worlds, steps, 3), in m and m/s."""
+
+    time: np.ndarray
+    position: np.ndarray
+    displacement: np.ndarray
+    velocity: np.ndarray
+
+
+def idle_report(sim: Any) -> StepReport:
+    """The report of a simulation that has done no step since it was made or resumed."""
+    count = sim.model.worlds
+    zero, none = np.zeros(count, int), np.zeros(count)
+    return StepReport(sim.status == 0, zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero, none)
+
+
+def describe(sim: Any) -> str:
+    """A simulation in one line."""
+    m, steps = sim.model, sim.steps
+    at = f"t = {float(sim.time.max()):.6g} s, {steps} steps, dt = {sim.dt:g} s, {sim.integrator.name}"
+    if sim.load is not None:
+        at = f"static, load {100.0 * float(sim.load.max()):.4g} %, {steps} load step{'s' * (steps != 1)}"
+    worlds = f", {m.worlds} worlds" if m.worlds > 1 else ""
+    return f"Simulation({at}, {sim.methods['solver']}, {m.slots} slots, {m.device}, {m.dtype}{worlds})"

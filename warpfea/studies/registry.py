@@ -1,0 +1,148 @@
+"""The studies that `warpfea study` knows: one line here, one module with `run(options)`, one committed result."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from dataclasses import dataclass
+
+__all__ = ["STUDIES", "Entry"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A study, described without importing it.
+
+    Attributes:
+        name: as users type it.
+        module: below warpfea.studies, with a function `run(options)`.
+        summary: a line for the list of studies.
+        about: what it does, for its own help.
+        parts: names for --only, each with a line of help.
+        options: those it takes besides --out, of `cli.measuring.STUDY_OPTIONS`.
+        out: what --out names, "FILE" (.json) or "FOLDER"; empty where nothing is written.
+        example: a command line, after the name.
+        takes: how long it takes on two cores.
+        results: files of tests/results that it made.
+    """
+
+    name: str
+    module: str
+    summary: str
+    about: str
+    parts: tuple[tuple[str, str], ...] = ()
+    options: tuple[str, ...] = ()
+    out: str = "FILE"
+    example: str = ""
+    takes: str = "minutes"
+    results: tuple[str, ...] = ()
+
+    def run(self, options: argparse.Namespace) -> None:
+        """Do the study. UsageError for what it can't do, other errors of warpfea from its runs."""
+        importlib.import_module(f"{__package__}.{self.module}").run(options)
+
+
+_ENTRIES = (
+    Entry(
+        name="ancf-tets",
+        module="ancf_tets.command",
+        summary="error against run time of T4, T10, ENMC, FN, FN18 and the brick H3843",
+        about="Paper T's comparison repeated: the elements on a rigid pendulum and on a soft bar with large "
+        "deflection, static and in motion. Error against unknowns and run time, as a table, JSON, CSV and a plot.",
+        options=("device", "sizes", "repeat", "quick"),
+        out="FOLDER",
+        example="--device cpu --out results",
+        results=("ancf_tets.json", "ancf_tets.csv", "ancf_tets.png"),
+    ),
+    Entry(
+        name="ancf",
+        module="reports.ancf",
+        summary="ANCF beams, shells and solids against closed forms and other programs",
+        about="The ANCF elements against references that were not made with warpfea (tests/data of a checkout), for "
+        "every integration.",
+        parts=(
+            ("static_beam", "a cantilever beside Project Chrono's rows"),
+            ("static_shell", "the same as one row of shells"),
+            ("rollup", "a beam rolled into a circle"),
+            ("princeton", "the Princeton beam beside the exact beam"),
+            ("frequencies", "of a cantilever beam and a plate"),
+            ("pendulum", "a flexible pendulum beside a spectral solution"),
+            ("slender", "beam and plate of slenderness 1000"),
+            ("manufactured", "orders of all solids in h, on a cube"),
+            ("manufactured_structures", "the same of beam and plate"),
+        ),
+        options=("device", "only", "quick"),
+        example="--out tests/results/ancf_reference.json",
+        results=("ancf_reference.json",),
+    ),
+    Entry(
+        name="mechanisms",
+        module="reports.mechanisms",
+        summary="joints against mechanisms computed without warpfea",
+        about="Mechanisms against closed forms and models that share no equation with warpfea. no_drift takes long: "
+        "it keeps a checkpoint beside --out, and the same command goes on from it after an interruption.",
+        parts=(
+            ("rigid_slider_crank", "so stiff that it follows the closed form"),
+            ("flexible_slider_crank", "an elastic rod beside a floating frame"),
+            ("double_pendulum", "two stiff links beside rigid ones"),
+            ("hanging_chain", "reactions beside the weight below each joint"),
+            ("free_fall", "two tied bodies fall as one"),
+            ("no_drift", "violation over a hundred thousand steps"),
+        ),
+        options=("device", "only", "quick"),
+        example="--only free_fall --quick",
+        takes="about an hour",
+        results=("mechanisms.json",),
+    ),
+    Entry(
+        name="mechanism-models",
+        module="reports.mechanisms.checks",
+        summary="checks of the reference models that `mechanisms` uses",
+        about="Prints how far the reference models are from differences, from a chain of point masses and from their "
+        "own limits: the numbers that their docstrings quote.",
+        out="",
+        takes="a minute",
+    ),
+    Entry(
+        name="joints",
+        module="reports.joints",
+        summary="cost and stability of constraints",
+        about="ms per step and iterations of chains with 10 to 1000 joints for several ways to solve for the "
+        "multipliers, and cases that are hard: mass ratios to 1e4, E from 1e4 to 1e12 Pa, redundant hinges, a linkage "
+        "through its dead points.",
+        parts=(("cost", "chains of m links on m joints"), ("stability", "hard cases")),
+        options=("device", "only", "steps", "joints"),
+        example="--steps 40 --out tests/results/joints_cpu.json",
+        results=("joints_cpu.json", "joints_h200.json"),
+    ),
+    Entry(
+        name="jacobi",
+        module="reports.jacobi",
+        summary="error and cost of the solver wf.Jacobi beside Newton's method",
+        about="Four scenes with 2 to 32 iterations, with and without the coarse space, and each acceleration: error "
+        "of the tip, ms per step, and what the steps say is left.",
+        options=("device", "steps"),
+        example="--out tests/results/jacobi_cpu.json",
+        results=("jacobi_cpu.json",),
+    ),
+    Entry(
+        name="devices",
+        module="reports.devices",
+        summary="a CUDA device against the CPU, in both precisions",
+        about="Every kind of element, law, load and constraint on both devices: differences over the tip's travel.",
+        options=("device", "steps"),
+        example="--device cuda:0 --out tests/results/device_agreement.json",
+        results=("device_agreement.json",),
+    ),
+    Entry(
+        name="peer-meshes",
+        module="bench.peer_meshes",
+        summary="make the unstructured meshes of `warpfea bench --peer` with Gmsh",
+        about="Writes bar_*.npz into --out, by default tests/data of the checkout; needs gmsh.",
+        out="FOLDER",
+        example="--out tests/data",
+        takes="seconds",
+    ),
+)
+STUDIES: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
+"""By name."""

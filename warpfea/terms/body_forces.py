@@ -1,0 +1,122 @@
+"""Fields b(r, t) at the current position, Eq. (23)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from .. import elements as families
+from ..elements import Rule
+from ..kernels.common.traits import Traits
+from ..kernels.terms.loads import body_force_kernel
+from ..model import assembly
+from ..model.description import BodyForce
+from .term import At, Term
+from .time_laws import TimeLaws, argument_precision
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["BodyForces"]
+
+
+@dataclass(eq=False)
+class FieldPart:
+    """A body force on the elements of one block that belong to one body; `offset` in the term's own entries."""
+
+    kernel: Any
+    block: Any
+    members: Any
+    origin: Any
+    offset: int
+    count: int
+
+
+class BodyForces(Term):
+    """Fields have no potential in general: their force is held dead inside a line search."""
+
+    name = "body forces"
+    potential = False
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.traits = Traits(nonpotential=True)
+        self.parts_of_fields: list[FieldPart] = []
+
+    @classmethod
+    def of(cls, model: Model) -> BodyForces | None:
+        return cls(model) if model.description.body_forces else None
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {"body forces": bool(model.description.body_forces)}
+
+    def build(self, laws: TimeLaws) -> None:
+        offset = 0
+        for force in self.model.description.body_forces:
+            for field, conn in self._parts(force):
+                field.offset = offset
+                offset += conn.size
+                self.parts_of_fields.append(field)
+                self.connectivity.append(conn)
+
+    def _parts(self, force: BodyForce) -> list[tuple[FieldPart, np.ndarray]]:
+        m = self.model
+        out = []
+        for block in m.blocks:
+            first = 0
+            for host in block.parts:
+                members = np.arange(first, first + len(host.elements))
+                first += len(host.elements)
+                if host.body not in force.bodies or block.key.part:  # one part of an element's energy stands for it
+                    continue
+                rule = self._tables(block)
+                take = argument_precision(force.function, m.dtype)
+                field = FieldPart(
+                    kernel=body_force_kernel(force.function, m.dtype, block.slots, len(rule.weights), take),
+                    block=block,
+                    members=m.array("loads", members, wp.int32),
+                    origin=wp.vec3d(*host.body.origin),
+                    offset=0,
+                    count=len(members),
+                )
+                out.append((field, host.conn + host.body.slot_offset))
+        return out
+
+    def _tables(self, block: Any) -> Rule:
+        """Shape functions and rho w at the points of the mass rule, made once per block."""
+        m = self.model
+        rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.parts]
+        rule = max(rules, key=lambda r: r.degree)
+        if block.field_rule is None:
+            weights, shapes = [], []
+            for host in block.parts:
+                for elems in assembly.chunks(host.body, host.elements, len(rule.weights)):
+                    s, _, _, det = assembly.geometry(host.body, elems, rule.points)
+                    rho = assembly.density_at(host.body, elems, s, host.body.connectivity[elems])
+                    weights.append(rho * det * rule.weights)
+                    shapes.append(s)
+            per_element = families.get(block.key.family).has_gradients
+            shape = np.concatenate(shapes) if per_element else shapes[0]
+            block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
+            block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
+            block.field_rule = rule
+        return block.field_rule
+
+    def modules(self, at: At) -> Iterable[wp.Module]:
+        return {field.kernel.module for field in self.parts_of_fields}
+
+    def force(self, at: At, active: wp.array) -> None:
+        m, w = self.model, at.work
+        for field in self.parts_of_fields:
+            args = [field.block.data, field.members, m.reference_device, field.origin, w.u, w.step.new_time]
+            args += [w.step.ramp, active, self.offset + field.offset, w.nonpotential_contribution]
+            at.launch(field.kernel, (m.worlds, field.count), args)
+
+    def hash(self, h: Any) -> None:
+        for force in self.model.description.body_forces:
+            h.update(force.function.key.encode())

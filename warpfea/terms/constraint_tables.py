@@ -1,0 +1,397 @@
+"""Tables of constraints on the device: rows, their order, and the pairs of rows that share slots."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.terms.constraint_blocks import coupling_struct
+from ..kernels.terms.constraints import (
+    DISTANCE,
+    DOT,
+    TURN,
+    constraint_kernels,
+    constraint_struct,
+    joint_struct,
+)
+from ..laws import TimeLaw
+from ..model.joints import Joint, Vector
+from .time_laws import TimeLaws
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["ConstraintTables"]
+
+DENSE = 64
+"""Most coupled rows of several joints whose matrix is inverted as one; beyond, joints are swept colour by colour."""
+
+
+class ConstraintTables:
+    """Rows of a model on the device, ordered by connected component and by cluster of rows that share slots.
+
+    Attributes:
+        joints: in the order they were added.
+        count: number of rows.
+        rows_of: for each joint the indices of its rows.
+        data: the device tables.
+    """
+
+    def __init__(self, model: Model, joints: Sequence[Joint]) -> None:
+        self.model = model
+        self.joints = list(joints)
+        self.kernels = constraint_kernels(model.dtype)
+        self.data: Any = None
+        self.joint_data: Any = None
+        self.cluster_sizes = self.colour_sizes = np.zeros(0, dtype=np.int64)
+        self.colour_host = self.cluster_host = np.zeros(0, dtype=np.int64)
+        self.rows = [row for joint in self.joints for row in joint.rows]
+        self.count = len(self.rows)
+
+    # connectivity, before the model knows its components
+
+    def slot_groups(self) -> list[np.ndarray]:
+        """For each joint the model slots that its rows tie."""
+        return [
+            np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.terms]))
+            for joint in self.joints
+        ]
+
+    def hold(self, free: np.ndarray) -> None:
+        """Clear the directions (components, 3) in which a component is tied to the ground."""
+        position = self.model.slot_kind == 0
+        for k, row in enumerate(self.rows):
+            felt = False
+            for side in range(3):
+                slots, weights, _ = self._entries[3 * k + side]
+                size = np.abs(weights).sum()
+                felt |= bool(abs(weights[position[slots]].sum()) > 1e-9 * size) if len(slots) else False
+            if felt:
+                axis = row.b.value if row.kind == DOT and not row.b.parts else np.ones(3)
+                free[self.component_host[k], np.abs(axis) > 1e-12] = 0.0
+
+    # the device tables
+
+    def build(self, component: np.ndarray, laws: TimeLaws) -> None:
+        """Upload; `component` of each slot."""
+        self._order(component)
+        self._fill_terms(laws)
+        self._fill_pairs()
+        self._fill_joints()
+
+    def _order(self, component: np.ndarray) -> None:
+        """Sort the joints by component and cluster."""
+        groups = self.slot_groups()
+        free = np.any(self.model.free_host > 0.0, axis=1)
+        joint_of = np.concatenate([np.full(len(g), k) for k, g in enumerate(groups)])
+        slot = np.concatenate(groups)
+        keep = free[slot]
+        shared = sp.csr_matrix(
+            (np.ones(keep.sum()), (joint_of[keep], slot[keep])), shape=(len(groups), self.model.slots)
+        )
+        cluster = sp.csgraph.connected_components(shared @ shared.T, directed=False)[1]
+        own = np.array([component[g[0]] for g in groups])
+        order = np.lexsort((np.arange(len(groups)), cluster, own))
+        first, rows, self.rows_of = 0, [], [np.zeros(0, dtype=np.int64)] * len(groups)
+        clusters, components = [], []
+        for k in order:
+            n = len(self.joints[k].rows)
+            self.rows_of[k] = np.arange(first, first + n)
+            first += n
+            rows += self.joints[k].rows
+            clusters += [cluster[k]] * n
+            components += [own[k]] * n
+        self.rows = rows
+        # renumber in order of appearance, so that clusters are runs of rows
+        seen: dict[int, int] = {}
+        self.cluster_host = np.array([seen.setdefault(int(c), len(seen)) for c in clusters])
+        self.component_host = np.array(components)
+
+    def _fill_terms(self, laws: TimeLaws) -> None:
+        m, rows = self.model, self.rows
+        entries = [vector.entries() for row in rows for vector in row.terms]
+        start = np.concatenate([[0], np.cumsum([len(e[0]) for e in entries])])
+        slot = np.concatenate([e[0] for e in entries])
+        weight = np.concatenate([e[1] for e in entries])
+        self.child_host = np.concatenate([e[2] for e in entries])
+        term = np.repeat(np.arange(len(entries)), np.diff(start))
+        self.term_host, self.slot_host, self.weight_host, self.start_host = term, slot, weight, start
+        numbers: dict[TimeLaw, int] = {}
+        law = np.full(len(rows), -1)
+        for k, row in enumerate(rows):
+            if row.law is not None:
+                if row.law not in numbers:
+                    numbers[row.law] = laws.add(row.law)
+                law[k] = numbers[row.law]
+        data = constraint_struct()()
+        self.scale_host = np.array([r.scale * (m.size if r.angular else 1.0) for r in rows])
+        order = np.argsort(slot, kind="stable")
+        slot_start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
+        self.reference_host = np.array([vector.value for row in rows for vector in row.terms])
+        tables: dict[str, tuple[Any, Any]] = {
+            "kind": ([r.kind for r in rows], wp.int32),
+            "scale": (self.scale_host, wp.float64),
+            "constant": ([r.constant for r in rows], wp.float64),
+            "fixed": ([r.fixed for r in rows], wp.float64),
+            "law": (law, wp.int32),
+            "law_component": ([r.component for r in rows], wp.int32),
+            "component": (self.component_host, wp.int32),
+            "start": (start, wp.int32),
+            "slot": (slot, wp.int32),
+            "weight": (weight, wp.float64),
+            "reference": (self.reference_host, wp.vec3d),
+            "slot_start": (slot_start, wp.int32),
+            "slot_term": (term[order], wp.int32),
+            "slot_weight": (weight[order], wp.float64),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
+        self.data = data
+        self._entries = entries
+
+    def _fill_pairs(self) -> None:
+        """For each pair of rows that share slots the pairs of vectors that do: dense in clusters, else couplings."""
+        first = self._cluster_rows()
+        shared = self._shared_vectors()
+        n = np.diff(first)
+        pair_start, pair_side, pair_block = [0], [], []
+        couple_start, couple_column = [0], []
+        couple_pairs: list[list[tuple[tuple[int, int], int]]] = []
+        for i in range(self.count):
+            c = self.cluster_host[i]
+            columns = shared[i]
+            for j in range(first[c], first[c + 1]):
+                for side, block in columns.get(j, ()):
+                    pair_side.append(side)
+                    pair_block.append(block)
+                pair_start.append(len(pair_block))
+            for j in sorted(columns):
+                if self.cluster_host[j] != c:
+                    couple_column.append(j)
+                    couple_pairs.append(columns[j])
+            couple_start.append(len(couple_column))
+        couple_pair = [len(pair_block)]
+        for pairs in couple_pairs:
+            pair_side += [side for side, _ in pairs]
+            pair_block += [block for _, block in pairs]
+            couple_pair.append(len(pair_block))
+        self.couple_count = len(couple_column)
+        self.matrix_entries = int((n**2).sum())
+        self.cluster_sizes = n
+        couple_row = np.repeat(np.arange(self.count), np.diff(couple_start))
+        self._colour_clusters(couple_row, np.array(couple_column, dtype=np.int64))
+        tables: dict[str, tuple[Any, Any]] = {
+            "cluster": (self.cluster_host, wp.int32),
+            "cluster_start": (first, wp.int32),
+            "matrix_start": (np.concatenate([[0], np.cumsum(n**2)[:-1]]), wp.int32),
+            "pair": (pair_start, wp.int32),
+            "pair_side": (np.reshape(pair_side or [(0, 0)], (-1, 2)), wp.vec2i),
+            "pair_block": (pair_block or [0], wp.int32),
+            "couple_start": (couple_start, wp.int32),
+            "couple_row": (couple_row if len(couple_row) else [0], wp.int32),
+            "couple_column": (couple_column or [0], wp.int32),
+            "couple_pair": (couple_pair, wp.int32),
+            "colour": (self.colour_host, wp.int32),
+            "colour_cluster": (np.argsort(self.colour_host, kind="stable"), wp.int32),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(self.data, name, self.model.array("constraints", np.asarray(values), dtype))
+
+    def _cluster_rows(self) -> np.ndarray:
+        """Split runs of coupled rows that are too large for a dense inverse into their joints; first row of each."""
+        sizes = np.bincount(self.cluster_host)
+        joint = np.zeros(self.count, dtype=np.int64)
+        for k, rows in enumerate(self.rows_of):
+            joint[rows] = k
+        split = (sizes > DENSE)[self.cluster_host]
+        label = np.where(split, self.count + joint, self.cluster_host)
+        starts = np.flatnonzero(np.concatenate([[True], label[1:] != label[:-1]]))
+        self.cluster_host = np.cumsum(np.concatenate([[0], (label[1:] != label[:-1]).astype(int)]))
+        return np.concatenate([starts, [self.count]])
+
+    def _shared_vectors(self) -> list[dict[int, list[tuple[tuple[int, int], int]]]]:
+        """For each row the rows that it shares slots with: pairs of sides and the block of both vectors.
+
+        Blocks sum w w' D^-1 over the slots; rows share vectors (a pin's three rows are of one), so blocks are few.
+        """
+        free = np.any(self.model.free_host > 0.0, axis=1)
+        number: dict[Vector, int] = {}
+        weights: list[dict[int, float]] = []
+        rows_of_vector: list[list[tuple[int, int]]] = []
+        sides: list[list[tuple[int, int]]] = []
+        for k, row in enumerate(self.rows):
+            own = []
+            for side, vector in enumerate((row.a, row.b, row.a2)):
+                if vector is None or not vector.parts:
+                    continue
+                if vector not in number:
+                    slots, w, _ = self._entries[3 * k + side]
+                    merged: dict[int, float] = {}
+                    for s, x in zip(slots.tolist(), w.tolist()):
+                        if free[s]:
+                            merged[s] = merged.get(s, 0.0) + x
+                    number[vector] = len(weights)
+                    weights.append(merged)
+                    rows_of_vector.append([])
+                own.append((side, number[vector]))
+                rows_of_vector[own[-1][1]].append((k, side))
+            sides.append(own)
+        of_slot: dict[int, list[int]] = {}
+        for v, merged in enumerate(weights):
+            for s in merged:
+                of_slot.setdefault(s, []).append(v)
+        blocks: dict[tuple[int, int], int] = {}
+        near: list[list[tuple[int, int]]] = []
+        block_start, block_slot, block_weight = [0], [], []
+        for u, merged in enumerate(weights):
+            own_blocks = []
+            for v in sorted({v for s in merged for v in of_slot[s]}):
+                key = (min(u, v), max(u, v))
+                if key not in blocks:
+                    common = [(s, x * weights[v][s]) for s, x in merged.items() if s in weights[v]]
+                    blocks[key] = len(block_start) - 1
+                    block_slot += [s for s, _ in common]
+                    block_weight += [x for _, x in common]
+                    block_start.append(len(block_slot))
+                own_blocks.append((v, blocks[key]))
+            near.append(own_blocks)
+        out: list[dict[int, list[tuple[tuple[int, int], int]]]] = []
+        for own in sides:
+            columns: dict[int, list[tuple[tuple[int, int], int]]] = {}
+            for side, u in own:
+                for v, block in near[u]:
+                    for other, other_side in rows_of_vector[v]:
+                        columns.setdefault(other, []).append(((side, other_side), block))
+            out.append(columns)
+        self.block_count = len(block_start) - 1
+        m = self.model
+        self.data.block_start = m.array("constraints", np.asarray(block_start), wp.int32)
+        self.data.block_slot = m.array("constraints", np.asarray(block_slot or [0]), wp.int32)
+        self.data.block_weight = m.array("constraints", np.asarray(block_weight or [0.0]), wp.float64)
+        return out
+
+    def _colour_clusters(self, row: np.ndarray, column: np.ndarray) -> None:
+        """Greedy colouring of coupled clusters; `colour_sizes` counts those of each colour."""
+        n = len(self.cluster_sizes)
+        near: list[set[int]] = [set() for _ in range(n)]
+        for a, b in zip(self.cluster_host[row].tolist(), self.cluster_host[column].tolist()):
+            near[a].add(b)
+        colour = np.full(n, -1)
+        for k in range(n):
+            taken = {int(colour[j]) for j in near[k]}
+            colour[k] = next(c for c in itertools.count() if c not in taken)
+        self.colour_host = colour
+        self.colour_sizes = np.bincount(colour)
+
+    def _fill_joints(self) -> None:
+        m = self.model
+        position = m.slot_kind == 0
+        origin = np.concatenate([np.tile(b.origin, (b.slot_count, 1)) for b in m.bodies])
+        place = m.reference + position[:, None] * origin
+        anchors = [joint.anchor.entries() for joint in self.joints]
+        data = joint_struct()()
+        side = np.where(self.child_host, 1, 0)
+        for rows in self.rows_of:
+            own = slice(self.start_host[3 * rows[0]], self.start_host[3 * rows[-1] + 3])
+            if not self.child_host[own].any():  # the child is in space: it feels what the parent does, reversed
+                side[own] = -1
+        tables: dict[str, tuple[Any, Any]] = {
+            "first": ([rows[0] for rows in self.rows_of], wp.int32),
+            "last": ([rows[-1] + 1 for rows in self.rows_of], wp.int32),
+            "anchor": ([joint.anchor.value for joint in self.joints], wp.vec3d),
+            "anchor_start": (np.concatenate([[0], np.cumsum([len(a[0]) for a in anchors])]), wp.int32),
+            "anchor_slot": (np.concatenate([a[0] for a in anchors] + [np.zeros(1)]), wp.int32),
+            "anchor_weight": (np.concatenate([a[1] for a in anchors] + [np.zeros(1)]), wp.float64),
+            "role": (side * (1 + position[self.slot_host]), wp.int32),
+            "place": (place[self.slot_host], wp.vec3d),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
+        self.joint_data = data
+        for k, joint in enumerate(self.joints):
+            joint.index = k
+
+    # on the host, for supports, tests and users
+
+    def expand(self, G: np.ndarray) -> sp.csr_matrix:
+        """Rows of the Jacobian from the gradients of the vectors (rows, 3, 3)."""
+        data = self.weight_host[:, None] * G.reshape(-1, 3)[self.term_host]
+        rows = np.repeat(self.term_host // 3, 3)
+        columns = (3 * self.slot_host[:, None] + np.arange(3)).ravel()
+        return sp.csr_matrix((data.ravel(), (rows, columns)), shape=(self.count, 3 * self.model.slots))
+
+    def measure(self, joint: Joint, what: str | None, state: Any) -> np.ndarray:
+        """ "angle" (rad), "travel" or "length" (m) of a joint, (worlds,); ModelError where it has none."""
+        length = joint.rows[0].a if joint.rows[0].kind == DISTANCE else None
+        has = {"angle": joint.angle, "travel": joint.travel, "length": length}
+        known = [name for name, vectors in has.items() if vectors]
+        what = what or next(iter(known), None)
+        if what not in known:
+            raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no {what or 'angle, travel or length'}")
+        target = self.targets(state)
+        out = []
+        for world, u in enumerate(state.displacement.numpy().astype(float)):
+            if what == "length":
+                assert length is not None
+                out.append(np.linalg.norm(self._present(length, u)))
+            elif what == "travel":
+                gap, axis = (self._present(v, u) for v in joint.travel or ())
+                out.append(gap @ axis)
+            else:
+                a, a2, b = (self._present(v, u) for v in joint.angle or ())
+                angle = np.arctan2(b @ a2, b @ a)
+                driven = [k for k in self.rows_of[joint.index] if self.rows[k].kind == TURN]
+                if driven:
+                    angle += 2.0 * np.pi * np.round((target[world, driven[0]] - angle) / (2.0 * np.pi))
+                out.append(angle)
+        return np.array(out)
+
+    def targets(self, state: Any) -> np.ndarray:
+        """Right sides (worlds, rows) that the state was brought to; of a state that never stepped those of its time."""
+        at_time = self.model.terms.constraints.values(state)[2]
+        if "constraint_target" not in state.names:
+            return at_time
+        reached = state.constraint_target.numpy()
+        return np.where(np.isnan(reached), at_time, reached)
+
+    @staticmethod
+    def _present(vector: Vector, u: np.ndarray) -> np.ndarray:
+        slots, weights, _ = vector.entries()
+        return vector.value + weights @ u[slots]
+
+    def hash(self, h: Any) -> None:
+        """Feed what defines the rows into a hash."""
+        for row in self.rows:
+            h.update(f"{row.kind} {row.scale!r} {row.constant!r} {row.fixed!r} {row.component}".encode())
+        for values in (self.slot_host, self.weight_host, self.start_host, self.reference_host):
+            h.update(np.ascontiguousarray(values).tobytes())
+
+    def couplings(self, pattern: Any) -> tuple[Any, int]:
+        """Upper entries of a matrix's pattern that the rows add to, with their pairs of vectors, and their number."""
+        items, term_a, term_b, weight = [], [], [], []
+        for row in range(self.count):
+            first, last = self.start_host[3 * row], self.start_host[3 * row + 3]
+            slot, term, w = self.slot_host[first:last], self.term_host[first:last], self.weight_host[first:last]
+            i, j = np.meshgrid(np.arange(len(slot)), np.arange(len(slot)), indexing="ij")
+            keep = slot[i] <= slot[j]
+            i, j = i[keep], j[keep]
+            items.append(pattern.find(slot[i], slot[j]))
+            term_a.append(term[i])
+            term_b.append(term[j])
+            weight.append(w[i] * w[j])
+        item = np.concatenate(items)
+        order = np.argsort(item, kind="stable")
+        entry, count = np.unique(item, return_counts=True)
+        data, array = coupling_struct()(), self.model.array
+        data.entry = array("matrix pattern", entry, wp.int32)
+        data.start = array("matrix pattern", np.concatenate([[0], np.cumsum(count)]), wp.int32)
+        data.term_a = array("matrix pattern", np.concatenate(term_a)[order], wp.int32)
+        data.term_b = array("matrix pattern", np.concatenate(term_b)[order], wp.int32)
+        data.weight = array("matrix pattern", np.concatenate(weight)[order], wp.float64)
+        return data, len(entry)

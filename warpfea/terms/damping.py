@@ -1,0 +1,89 @@
+"""Kelvin-Voigt damping beside the elements' kernels, which hold its incremental and its rate form.
+
+Incremental: the strain at the start of the step, from which the rate is taken. Explicit: the force of Eqs. (58)-(70) at the start
+of the step, held during it among the dead loads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from ..kernels.step.gather import gather_kernels
+from ..kernels.terms.loads import load_kernels
+from .term import HELD_VISCOUS, At, Column, Term, part
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from .workspace import Workspace
+
+__all__ = ["Damping"]
+
+FORMS = ("incremental", "rate", "explicit")
+
+
+class Damping(Term):
+    """What damping does at the start of an attempt."""
+
+    name = "damping"
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.explicit = any(b.key.damping == "explicit" for b in model.blocks)
+        self.columns = (Column("viscous", HELD_VISCOUS),) if self.explicit else ()  # type: ignore[misc]
+        self.kernels = load_kernels(model.dtype)
+
+    @classmethod
+    def of(cls, model: Model) -> Damping | None:
+        return cls(model) if any(b.key.damping in ("incremental", "explicit") for b in model.blocks) else None
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        forms = {b.key.damping for b in model.blocks}
+        return {f"damping {form}": form in forms for form in FORMS}
+
+    def allocate(self, work: Workspace, at: At) -> None:
+        if self.explicit:
+            m = self.model
+            force = work.array("explicit", (m.worlds, m.slots), m.types.vec3)
+            power = work.array("explicit_power", (m.worlds, m.element_count), wp.float64)
+            at.scratch[self.name] = force, power
+
+    def modules(self, at: At) -> Iterable[wp.Module]:
+        if not at.inertia:
+            return set()
+        out = {b.kernels.viscous_force.module for b in self.model.blocks if b.key.damping == "explicit"}
+        out |= {b.kernels.strain_history.module for b in self.model.blocks if b.key.damping == "incremental"}
+        return out | ({self.kernels.add_explicit.module} if self.explicit else set())
+
+    @part("loads")
+    def begin(self, at: At, active: wp.array) -> None:
+        if not at.inertia:
+            return
+        m, w, launch, state = self.model, at.work, at.launch, at.state
+        force, power = at.scratch[self.name] if self.explicit else (None, None)
+        if self.explicit:
+            w.contribution.zero_()  # the gather below sums the entries of all blocks
+        for block in m.blocks:
+            dim = (m.worlds, block.count)
+            if block.key.damping == "incremental":
+                args = [block.data, state.displacement, at.u_before, w.step.a0, w.step.a1, active, w.history]
+                launch(block.kernels.strain_history, dim, args)
+            elif block.key.damping == "explicit":
+                args = [block.data, state.displacement, state.velocity, active, w.contribution, power]
+                launch(block.kernels.viscous_force, dim, args)
+        if self.explicit:
+            gather = gather_kernels(m.dtype, m.terms.traits).gather_force
+            launch(gather, (m.worlds, m.slots), [m.topology, w.contribution, active, force])
+            launch(self.kernels.add_explicit, (m.worlds, m.slots), [force, active, w.dead])
+
+    def book(self, at: At, accepted: wp.array) -> wp.array | None:
+        """Work of the held force: what it takes is viscous loss."""
+        if not (self.explicit and at.inertia):
+            return None
+        m, w = self.model, at.work
+        force, _ = at.scratch[self.name]
+        at.launch(self.kernels.work_rows, (m.worlds, m.slots), [force, w.u, at.state.displacement, accepted, w.rows])
+        return w.rows

@@ -1,0 +1,101 @@
+"""Loads that do not depend on the iterate: gravity Eq. (24), forces and tractions Eq. (72)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.terms.loads import load_kernels
+from .term import At, Term, part
+from .time_laws import TimeLaws
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["DeadLoads"]
+
+
+class DeadLoads(Term):
+    """Fills work.dead once per attempt. Gravity, [world] on the device, belongs to every model; without any load nothing
+    is launched."""
+
+    name = "dead loads"
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.kernels = load_kernels(model.dtype)
+        self.gravity_host = np.tile(model.gravity, (model.worlds, 1))
+        self.gravity = model.array("loads", self.gravity_host, wp.vec3d)
+
+    @classmethod
+    def of(cls, model: Model) -> DeadLoads:
+        """Always there: it holds gravity."""
+        return cls(model)
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {
+            "gravity": bool(np.any(model.terms.dead.gravity_host)),
+            "dead loads": bool(model.description.dead_loads),
+        }
+
+    def build(self, laws: TimeLaws) -> None:
+        m = self.model
+        slots, numbers, weights = [], [], []
+        for load in m.description.dead_loads:
+            index = laws.add(load.law)
+            slots.append(load.body.slot_offset + load.slots)
+            numbers.append(np.full(len(load.slots), index))
+            weights.append(load.weights)
+        slot = np.concatenate(slots) if slots else np.zeros(0, dtype=np.int64)
+        order = np.argsort(slot, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
+        law = np.concatenate(numbers) if numbers else np.zeros(0)
+        weight = np.concatenate(weights) if weights else np.zeros(0)
+        explicit = any(b.key.damping == "explicit" for b in m.blocks)  # its force is added to those here
+        self.present = bool(len(slots)) or bool(np.any(self.gravity_host)) or explicit
+        self.start_of_slot = m.array("loads", start, wp.int32)
+        self.law = m.array("loads", law[order] if len(order) else np.zeros(1), wp.int32)
+        table = np.repeat(weight[order][:, None], 3, axis=1) if len(order) else np.zeros((1, 3))
+        self.weight = m.array("loads", table, m.types.vec3)
+        self._defined_by = (slot, law, weight)
+
+    def modules(self, at: At) -> Iterable[wp.Module]:
+        return [self.kernels.dead_load.module] * self.present
+
+    @part("loads")
+    def begin(self, at: At, active: wp.array) -> None:
+        """Force and magnitude of all dead loads per slot."""
+        if not self.present:
+            return
+        m, w = self.model, at.work
+        args = [self.start_of_slot, self.law, self.weight, w.law_value, m.lumped, self.gravity, w.step.ramp, active]
+        at.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])
+
+    def set_gravity(self, gravity: Any) -> None:
+        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2.
+
+        Raises:
+            ModelError: wrong shape, a value that is not finite, or a model built without gravity.
+        """
+        values = np.asarray(gravity, dtype=float)
+        shape = (self.model.worlds, 3)
+        if values.shape == (3,):
+            values = np.broadcast_to(values, shape)
+        if values.shape != shape or not np.all(np.isfinite(values)):
+            raise ModelError(f"gravity has shape {values.shape}, expected finite values of shape (3,) or {shape}")
+        if not self.present and np.any(values):
+            raise ModelError(
+                "the model was built without gravity or dead loads, so their kernels were left out: build it with a "
+                "gravity that is not zero"
+            )
+        self.gravity_host = values.copy()
+        self.gravity.assign(values)
+
+    def hash(self, h: Any) -> None:
+        for values in self._defined_by:
+            h.update(np.ascontiguousarray(values).tobytes())

@@ -1,0 +1,63 @@
+"""The elements: internal force Eq. (32) with the viscous stress of Eq. (70), its derivative, its diagonal blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from .term import At, Term
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["Elements"]
+
+MANY_POINTS = 8
+"""Points of an element from which lanes of a warp share them."""
+
+
+class Elements(Term):
+    """The blocks of a model. Contributions lie in work.contribution, energies in work.energy_rows."""
+
+    name = "elements"
+
+    @classmethod
+    def of(cls, model: Model) -> Elements:
+        return cls(model)
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {
+            "straight elements": any(b.key.affine for b in model.blocks),
+            "table elements": any(not b.key.affine for b in model.blocks),
+        }
+
+    def kernels(self, at: At) -> list:
+        """Kernels of the blocks; statics has no rates, so those without damping serve there."""
+        return [b.kernels if at.inertia else b.kernels_for(self.model.dtype, None) for b in self.model.blocks]
+
+    def modules(self, at: At) -> Iterable[wp.Module]:
+        return {kernels.module for kernels in self.kernels(at)}
+
+    def force(self, at: At, active: wp.array) -> None:
+        m, w, launch = self.model, at.work, at.launch
+        for block, kernels in zip(m.blocks, self.kernels(at)):
+            lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1
+            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, lanes, w.contribution, w.energy_rows]
+            dim = (w.u.shape[0], launch.padded(block.count * lanes))
+            launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
+
+    def tangent(self, at: At, p: wp.array, active: wp.array) -> None:
+        """K p of all elements into work.contribution, where products go by the elements one by one."""
+        m, w = self.model, at.work
+        for block, kernels in zip(m.blocks, self.kernels(at)):
+            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
+            at.launch(kernels.tangent_product, (p.shape[0], block.count), args)
+
+    def diagonal(self, at: At, active: wp.array) -> None:
+        m, w = self.model, at.work
+        for block, kernels in zip(m.blocks, self.kernels(at)):
+            args = [block.data, w.u, w.step.dq_dv, active, w.block_contribution]
+            at.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)

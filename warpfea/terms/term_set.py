@@ -1,0 +1,215 @@
+"""The terms of a model, and what is made of all of them: pools, ledger, fields, features, report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..base.launch import PARTS
+from ..kernels.common.traits import Traits
+from ..kernels.step.step import LEDGER, REPORT, booked_struct
+from ..model import assembly
+from .body_forces import BodyForces
+from .constraints import Constraints
+from .damping import Damping
+from .dead_loads import DeadLoads
+from .elements import Elements
+from .followers import Followers
+from .supports import Supports
+from .term import At, FieldSpec, Term
+from .time_laws import TimeLaws
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["KINDS", "TermSet", "all_parts"]
+
+KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Constraints)
+"""The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
+LATER = ("contact", "friction", "per-world parameters")
+"""Features of later versions, which `info` lists as left out."""
+ZERO = ("contact", "friction")
+"""Columns of energies() of later versions."""
+
+
+def all_parts() -> dict[str, str]:
+    """Parts of a profile, of every step and of all kinds of terms, with a line about each."""
+    return PARTS | {name: text for kind in KINDS for name, text in kind.parts.items()}
+
+
+class TermSet:
+    """The terms there are, in order; iterate over it.
+
+    Attributes:
+        laws: the table of time laws.
+        supports: prescribed motion.
+        dead: dead loads and gravity.
+        traits: what the terms ask of the kernels of a step.
+        side_entries: entries of the pool of forces without a potential; pool_entries: of that of potential ones.
+        side_topology: who contributes to a slot there, None without.
+        rows: rows of potentials.
+        ledger: columns of the energy ledger. report: columns of the report of a step.
+    """
+
+    def __init__(self, model: Model, more: list[Callable[[Model], Term | None]] | None = None) -> None:
+        self.model = model
+        self.laws, self.supports = TimeLaws(model), Supports(model)
+        makers = [kind.of for kind in KINDS] + list(more or ())
+        self.all: list[Term] = [term for make in makers if (term := make(model)) is not None]
+        names = [term.name for term in self.all]
+        for name in names:
+            if names.count(name) > 1:
+                raise ModelError(f"two terms have the name {name!r}; give each its own")
+        self.dead = self.find(DeadLoads)
+        self.traits = Traits(*map(any, zip(*(term.traits for term in self.all))))
+        self.side_topology: Any = None
+
+    @property
+    def later(self) -> tuple[str, ...]:
+        """Features of later versions."""
+        return LATER
+
+    def __iter__(self) -> Iterator[Term]:
+        return iter(self.all)
+
+    def find(self, kind: type[Any]) -> Any:
+        """The term of a kind, or None."""
+        return next((term for term in self.all if isinstance(term, kind)), None)
+
+    @property
+    def constraints(self) -> Constraints | None:
+        """The constraints' term, or None."""
+        return self.find(Constraints)
+
+    @property
+    def products(self) -> bool:
+        """Whether terms beside the elements add to H."""
+        return self.traits.tangent or self.traits.pooled or self.traits.ties
+
+    # for the model
+
+    def ties(self) -> list[np.ndarray]:
+        """Sets of slots that terms tie."""
+        return [slots for term in self.all for slots in term.ties()]
+
+    def build(self) -> None:
+        """Make the terms' tables, once the model knows its components, and their places in the pools."""
+        dead, rest = self.all[:2], self.all[2:]
+        for term in dead:
+            term.build(self.laws)
+        self.supports.build(self.laws)
+        for term in rest:
+            term.offset = self._entries(rest, term.potential)
+            term.build(self.laws)
+        self.laws.upload()
+        self.side_entries, self.pool_entries = self._entries(self.all, False), self._entries(self.all, True)
+        self.rows = 0
+        column = len(REPORT) + 6 * len(self.model.description.probes)
+        for term in self.all:
+            term.row_offset, term.report_offset = self.rows, column
+            self.rows += term.rows
+            column += term.report_columns
+        self.report_width = column
+        if self.side_entries:
+            self.side_topology = self._topology([c for t in self.all if not t.potential for c in t.connectivity])
+        named = [column.name for term in self.all for column in term.columns if column.name]
+        self.ledger = (*LEDGER, *dict.fromkeys(name for name in named if name not in LEDGER))
+
+    @staticmethod
+    def _entries(terms: list[Term], potential: bool) -> int:
+        """Entries of a pool that are taken so far."""
+        return sum(conn.size for term in terms if term.potential == potential for conn in term.connectivity)
+
+    def _topology(self, conns: list[np.ndarray]) -> Any:
+        from ..kernels.common.structs import topology_struct
+
+        m = self.model
+        start, order = assembly.gather_table(conns, m.slots)
+        out = topology_struct(m.dtype)()
+        out.start, out.entry = m.array("loads", start, wp.int32), m.array("loads", order, wp.int32)
+        return out
+
+    def join(self, topology: Any) -> None:
+        """Put the table of the pool of potential terms into the model's topology."""
+        if self.pool_entries:
+            conns = [conn for term in self.all if term.potential for conn in term.connectivity]
+            pool = self._topology(conns)
+            topology.pool_start, topology.pool_entry = pool.start, pool.entry
+
+    def hold(self, free: np.ndarray) -> None:
+        """Clear the directions (components, 3) in which terms tie components to the ground."""
+        for term in self.all:
+            term.hold(free)
+
+    @property
+    def features(self) -> dict[str, bool]:
+        """Which optional features of all kinds of terms the model uses."""
+        kinds = [*KINDS, *(type(term) for term in self.all if type(term) not in KINDS)]
+        out: dict[str, bool] = {}
+        for kind in kinds:
+            out |= kind.features(self.model)
+        return out | {term.name: True for term in self.all if type(term) not in KINDS}
+
+    def hash(self, h: Any) -> None:
+        """Feed what defines the terms into a hash."""
+        self.laws.hash(h)
+        self.supports.hash(h)
+        for term in self.all:
+            term.hash(h)
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """Parts of a profile that the terms add, with a line about each."""
+        return {name: text for term in self.all for name, text in term.parts.items()}
+
+    @property
+    def fields(self) -> dict[str, tuple[Term, FieldSpec]]:
+        """Fields that users may ask for beside those of the elements."""
+        return {name: (term, spec) for term in self.all for name, spec in term.fields.items()}
+
+    # for one simulation
+
+    @property
+    def booking(self) -> list[Term]:
+        """Terms that book rows of the ledger."""
+        return [term for term in self.all if term.columns]
+
+    def booked(self, work: Any) -> Any:
+        """Device table of what terms book; the sums are those of `book`."""
+        columns = [column for term in self.booking for column in term.columns]
+        out = booked_struct()()
+        device = self.model.device
+        out.kind = wp.array([c.kind for c in columns], dtype=wp.int32, device=device)
+        numbers = [self.ledger.index(c.name) if c.name else -1 for c in columns]
+        out.column = wp.array(numbers, dtype=wp.int32, device=device)
+        out.sums = work.booked
+        return out
+
+    def book(self, at: At, reduce: Any, accepted: wp.array) -> None:
+        """Let the terms book an accepted substep."""
+        first = 0
+        for term in self.booking:
+            rows, count = term.book(at, accepted), len(term.columns)
+            if rows is not None:
+                reduce(rows, count, accepted, at.work.booked[first : first + count])
+            first += count
+
+    def modules(self, at: At) -> set[wp.Module]:
+        """Modules that terms launch in a step."""
+        out = self.laws.modules() | self.supports.modules()
+        for term in self.all:
+            out |= set(term.modules(at))
+        return out
+
+    def energies(self, ledger: np.ndarray) -> dict[str, np.ndarray]:
+        """Columns of the ledger (worlds, columns) by name; of kinds of terms that are not there zeros."""
+        out = {name: ledger[:, k].copy() for k, name in enumerate(self.ledger)}
+        known = [column.name for kind in KINDS for column in kind.columns if column.name]
+        for name in (*known, *ZERO):
+            out.setdefault(name, np.zeros(len(ledger)))
+        out["work"] = sum(values for name, values in out.items() if name.startswith("work_"))
+        return out

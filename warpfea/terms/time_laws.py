@@ -1,0 +1,85 @@
+"""The table of time laws of a model on the device."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.terms.loads import law_function_kernel, law_struct, load_kernels
+from ..laws import TimeLaw
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+
+__all__ = ["TimeLaws", "argument_precision"]
+
+
+class TimeLaws:
+    """Laws are numbered as they are added, then uploaded; `evaluate` fills one row of values per world."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.kernels = load_kernels(model.dtype)
+        self.laws: list[TimeLaw] = []
+        self.functions: list[tuple[Any, int]] = []
+        self.data = law_struct()()
+
+    def add(self, law: TimeLaw) -> int:
+        """The number of a new law."""
+        self.laws.append(law)
+        return len(self.laws) - 1
+
+    @property
+    def count(self) -> int:
+        """Number of laws."""
+        return len(self.laws)
+
+    def upload(self) -> None:
+        """Make the device table; nothing without laws."""
+        m, laws = self.model, self.laws
+        if not laws:
+            return
+        start = np.concatenate([[0], np.cumsum([len(w.times) for w in laws])])
+        self.data.start = m.array("laws", start, wp.int32)
+        self.data.times = m.array("laws", np.concatenate([w.times for w in laws] + [[0.0]]), wp.float64)
+        self.data.values = m.array("laws", np.concatenate([w.values for w in laws] + [np.zeros((1, 3))]), wp.vec3d)
+        for k, law in enumerate(laws):
+            if law.function is not None:
+                take = argument_precision(law.function, m.dtype)
+                self.functions.append((law_function_kernel(law.function, law.scalar, take), k))
+
+    def evaluate(
+        self, launch: Launcher, time: wp.array, ramp: wp.array, active: wp.array, value: wp.array
+    ) -> None:  # fmt: skip
+        """value[world, law] at the times [world]; constants are multiplied by the ramp [world] of a static load path."""
+        if not self.laws:
+            return
+        B = self.model.worlds
+        launch(self.kernels.evaluate_laws, (B, self.count), [self.data, time, ramp, active, value])
+        for kernel, law in self.functions:
+            launch(kernel, B, [law, time, active, value])
+
+    def modules(self) -> set[wp.Module]:
+        """Modules that `evaluate` launches."""
+        out = {kernel.module for kernel, _ in self.functions}
+        return out | ({self.kernels.evaluate_laws.module} if self.laws else set())
+
+    def hash(self, h: Any) -> None:
+        """Feed the laws into a hash."""
+        for law in self.laws:
+            h.update(law.times.tobytes() + law.values.tobytes())
+            if law.function is not None:
+                h.update(law.function.key.encode())
+
+
+def argument_precision(function: wp.Function, default: str) -> str:
+    """Precision that a user's function takes, from its annotations."""
+    text = " ".join(str(t) for t in getattr(function, "input_types", {}).values())
+    if any(word in text for word in ("float64", "vec3d", "vec_t[float64")):
+        return "float64"
+    if any(word in text for word in ("float32", "vec3f", "<class 'float'>")):
+        return "float32"
+    return default
