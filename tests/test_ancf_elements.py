@@ -16,8 +16,8 @@ import warpfea as wf
 from warpfea import elements
 from warpfea.elements import ancf, ancf_beam, ancf_shell
 from warpfea.elements.quadrature import box_rule, conical_tet
-from warpfea.model.discretisation import element_functions
 from warpfea.model import assembly
+from warpfea.model.discretisation import element_functions
 
 RHO, E_MODULUS = 7.0, 1e6
 SVK = wf.SVK(E=E_MODULUS, nu=0.3, density=RHO)

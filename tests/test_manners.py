@@ -454,6 +454,26 @@ def test_a_series_for_paraview_goes_on(tmp_path):
     assert names[0] == names[1]
 
 
+def test_a_series_leaves_out_what_comes_after_the_checkpoint(tmp_path):
+    folder, check = tmp_path / "vtu", tmp_path / "c.npz"
+    simulation().run(0.008, outputs=[wf.Checkpoint(check)])
+    simulation().run(0.02, outputs=[wf.VTUWriter(folder, fps=250)])
+    listed = folder / "vtu.pvd"
+    before = listed.read_text()
+    sim = simulation()
+    sim.resume(check)
+    writer = wf.VTUWriter(folder, fps=250, extend=True)
+    writer.open(sim)
+    writer.close(sim)
+    assert listed.read_text().count("<DataSet") == 3
+    sim.run(0.02, outputs=[writer])
+    assert listed.read_text() == before
+    listed.write_text("<VTKFile>")
+    with pytest.raises(OutputError, match=r"vtu\.pvd: can't go on with this series .*another folder"):
+        sim.run(0.03, outputs=[wf.VTUWriter(folder, extend=True)])
+    assert listed.read_text() == "<VTKFile>"
+
+
 def test_usd_speaks_our_words(tmp_path, monkeypatch):
     from pxr import Tf, Usd
 

@@ -236,3 +236,12 @@ def test_cuda_tests_collect_without_meshio_and_usd(tmp_path):
     assert out.returncode == 0, out.stdout[-4000:]
     for name in ("test_device.py", "test_profile.py", "test_jacobi.py"):
         assert f"tests/{name}::" in out.stdout
+    # and what they simulate is made without them
+    code = (
+        "from warpfea.studies.reports import devices\n"
+        "from warpfea.builder.scene import find\n"
+        "for make in (*devices.CASES.values(), find('cantilever')): make()\n"
+    )
+    call = [sys.executable, "-c", code]
+    out = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False, env=env)
+    assert out.returncode == 0, out.stderr

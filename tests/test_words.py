@@ -12,25 +12,7 @@ RENAMED = ("pushed", "massive", "lagged", "guess")
 
 # to be done: this set may only shrink
 WITHOUT: set[str] = {
-    "kernels/solvers/blocks.py:block_at",
-    "kernels/solvers/newton.py:largest_violation",
-    "kernels/solvers/newton.py:magnitude",
-    "kernels/solvers/newton.py:objective",
-    "kernels/solvers/newton.py:record",
-    "kernels/step/gather.py:weighted",
-    "kernels/terms/followers.py:column",
-    "kernels/terms/followers.py:place",
-    "warpfea/base/provenance.py:cpu_name",
     "warpfea/builder/scene.py:Parameter.required",
-    "warpfea/cli/arguments.py:Parser.error",
-    "warpfea/studies/reports/devices/cases.py:cantilever",
-    "warpfea/studies/reports/devices/cases.py:swirl",
-    "warpfea/studies/reports/mechanisms/pair.py:Pair.consistent",
-    "warpfea/studies/reports/mechanisms/rigid.py:double_pendulum_acceleration",
-    "warpfea/studies/reports/mechanisms/rod.py:Rod.acceleration",
-    "warpfea/studies/reports/mechanisms/rod.py:Rod.motion",
-    "warpfea/studies/reports/mechanisms/rod.py:Rod.rhs",
-    "warpfea/studies/reports/mechanisms/rod.py:Rod.slider",
 }
 
 

@@ -10,8 +10,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .base.errors import ModelError
+from .base.names import did_you_mean
 
 __all__ = ["SVK", "KelvinVoigt", "Material", "MooneyRivlin", "NeoHookean"]
+
+FORMS = ("incremental", "rate", "explicit")
+"""How damping is taken in a step."""
 
 Density = float | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
@@ -69,8 +73,9 @@ class KelvinVoigt:
 
     def __post_init__(self) -> None:
         _non_negative("KelvinVoigt", eta=self.eta, lambda_v=self.lambda_v)
-        if self.form not in ("incremental", "rate", "explicit"):
-            raise ModelError(f"KelvinVoigt: form = {self.form!r} is none of 'incremental', 'rate', 'explicit'")
+        if self.form not in FORMS:
+            hint = did_you_mean(self.form, FORMS)
+            raise ModelError(f"KelvinVoigt: form = {self.form!r} is none of 'incremental', 'rate', 'explicit'{hint}")
 
 
 @dataclass(frozen=True, eq=False)

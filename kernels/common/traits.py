@@ -1,4 +1,4 @@
-"""What the terms of a model ask of the kernels of a step: a kernel is specialised by it, so that absent terms cost nothing."""
+"""What the terms of a model ask of the kernels of a step, which are specialised by it: absent terms cost nothing."""
 
 from typing import NamedTuple
 

@@ -41,6 +41,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
 
     @wp.func
     def block_at(matrix: wp.array3d(dtype=Number), world: int, elem: int, where: int) -> mat33:
+        """The 3x3 block at a place of an element's matrix."""
         if wp.static(rows):
             first = 9 * P * (where / P) + where % P
             A = mat33()

@@ -119,6 +119,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
+        """Phi of Eq. (18) at the trial, over dq/dv, with what terms hold in the search."""
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
         if wp.static(stored):
             energy += ctl.term_sums[0, world]
@@ -126,6 +127,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def magnitude(ctl: Control, world: int) -> f64:
+        """Sum of the magnitudes of Phi's parts: its rounding is a few eps of it."""
         energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
         if wp.static(stored):
             energy += ctl.term_sums[2, world]
@@ -133,6 +135,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def largest_violation(ctl: Control, world: int) -> f64:
+        """Of the constraints of all components, m."""
         largest = f64(0.0)
         for c in range(ctl.components):
             largest = wp.max(largest, ctl.violation[world, c])
@@ -199,6 +202,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def record(ctl: Control, world: int):
+        """Keep the relative residual of the iterate, for messages."""
         k = ctl.iterations[world]
         if k < ctl.history.shape[1]:
             ctl.history[world, k] = ctl.relative[world]

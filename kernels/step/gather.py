@@ -48,6 +48,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
+        """a.D^-1 a, with 0/0 = 0."""
         s = f64(0.0)
         for k in range(3):
             x = f64(a[k])
@@ -178,8 +179,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         slot: int,
         result: wp.array2d(dtype=vec3),
     ) -> f64:
-        """H p: follower loads, pooled terms and constraints added to the elements' part, on the free components; returns
-        p.Hp."""
+        """H p on the free components: what terms add to the elements' part included. Returns p.Hp."""
         out = h
         if wp.static(tangent):
             f = vec3()

@@ -61,11 +61,11 @@ LEDGER = (
     "ledger_residual",
     "unbalanced",
 )
-"""Columns of the energy ledger, J, accumulated since the start (the first three: current values); those of terms follow."""
+"""Columns of the energy ledger, J, accumulated since the start (the first three: current values); terms add theirs."""
 
 STORED, WORK, LOSS, NUMERICAL, HELD_VISCOUS = range(5)
-"""What a term books per substep: what it stores now; work done on the model; loss; a part of the integrator's; viscous loss
-of a force that counts among the dead loads."""
+"""What a term books per substep: what it stores now; work done on the model; loss; a part of the integrator's; viscous
+loss of a force that counts among the dead loads."""
 
 LEDGER_ROWS = 10
 

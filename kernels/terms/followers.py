@@ -136,10 +136,12 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
 
     @wp.func
     def column(A: mat33, k: int) -> vec3:
+        """Column k."""
         return vec3(A[0, k], A[1, k], A[2, k])
 
     @wp.func
     def place(A: mat33, k: int, a: vec3) -> mat33:
+        """A with column k replaced by a."""
         out = A
         for c in range(3):
             out[c, k] = a[c]

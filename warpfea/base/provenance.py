@@ -58,6 +58,7 @@ def machine(device: Any) -> dict[str, Any]:
 
 
 def cpu_name() -> str:
+    """Name of the processor."""
     if sys.platform == "linux":
         for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

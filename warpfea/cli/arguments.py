@@ -33,6 +33,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*args, **(defaults | options))
 
     def error(self, message: str) -> NoReturn:
+        """Raise UsageError, with the name that was likely meant."""
         choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if choice:
             message += did_you_mean(choice[1], re.findall(r"[\w-]+", choice[2]))

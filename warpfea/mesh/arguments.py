@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import MeshError
+from ..base.names import did_you_mean
 from .cells import ELEMENT_CELLS, Floats
 
 __all__ = ["PointMap", "cell_type_of", "counts", "even", "finite", "mapped", "positive"]
@@ -59,7 +60,8 @@ def even(what: str, value: int) -> None:
 def cell_type_of(what: str, element: Any) -> str:
     """The cell type of an element of :data:`ELEMENT_CELLS`."""
     if not isinstance(element, str) or element not in ELEMENT_CELLS:
-        raise MeshError(f"{what}: unknown element {element!r}, known are {', '.join(ELEMENT_CELLS)}")
+        hint = did_you_mean(element, ELEMENT_CELLS)
+        raise MeshError(f"{what}: unknown element {element!r}, known are {', '.join(ELEMENT_CELLS)}{hint}")
     return ELEMENT_CELLS[element]
 
 

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from .. import elements
 from ..base.errors import ModelError
-from ..kernels.common.structs import topology_struct
 from ..kernels.common.types import precision
-from ..kernels.elements.cluster import cluster_size
-from ..kernels.elements.element import element_kernels
 from ..kernels.elements.materials import ANY_J, NCOEF
-from ..kernels.elements.points import block_struct
-from ..kernels.elements.tied import tied_kernels, tied_struct
-from ..kernels.elements.with_mass import with_mass_kernel
-from ..kernels.solvers.pcg import groups_struct
 from . import assembly
+from .blocks import Block, build_block
 from .bodies import Body
 from .description import Description
 from .state import State
+from .topology import free_groups, label_components, make_topology
 
 __all__ = ["Block", "Model", "find_device"]
 
@@ -39,46 +32,6 @@ class Source(Protocol):
 
     def assemble(self, model: Model) -> tuple[Any, Any]:
         """The TermSet of a model, and what evaluates it at a state."""
-
-
-@dataclass(eq=False)
-class Block:
-    """Elements that one kernel does: their kind, device data, and where they came from."""
-
-    key: assembly.BlockKey
-    data: Any
-    kernels: Any
-    parts: list[assembly.HostBlock]
-    count: int
-    points: int
-    slots: int
-    contribution_offset: int
-    element_offset: int
-    cluster: int
-    field_rule: Any = None
-    shear: Any = None
-
-    @property
-    def connectivity(self) -> np.ndarray:
-        """(elements, slots per element) slots of the model, on the host."""
-        return np.concatenate([p.conn + p.body.slot_offset for p in self.parts])
-
-    @property
-    def with_mass(self) -> bool:
-        """Whether the mass of an element is one table times a number."""
-        return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
-
-    def kernels_for(self, dtype: str, damping: str | None) -> Any:
-        """The kernels of this kind of element with another form of damping."""
-        k = self.key
-        if k.tying:
-            return self.kernels
-        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
-
-    def with_mass_product(self, dtype: str, damping: str | None) -> wp.Kernel:
-        """The kernel of the product of a with_mass block, with a form of damping."""
-        k = self.key
-        return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster)
 
 
 class Model:
@@ -124,10 +77,12 @@ class Model:
         self.gravity = np.asarray(builder.gravity, dtype=float)
         self.probes = list(builder.description.probes)
         self.terms, self.evaluation = builder.assemble(self)
-        self._label_components()
+        self.part, self.component = label_components(self.graph(), self.terms.ties())
+        self.component_count = int(self.component.max()) + 1
         self.terms.build()
-        self._build_topology()
-        self._build_groups()
+        self.topology = make_topology(self)
+        self._upload_components()
+        self.groups, self.group_count = free_groups(self)
 
     # construction
 
@@ -206,7 +161,7 @@ class Model:
         self.blocks: list[Block] = []
         contribution, element, history = 0, 0, 0
         for key, parts in groups.items():
-            block = self._build_block(key, parts, contribution, element, history)
+            block = build_block(self, key, parts, contribution, element, history)
             self.blocks.append(block)
             contribution += block.count * block.slots
             element += block.count
@@ -214,202 +169,24 @@ class Model:
                 history += block.count * block.points
         self.contributions, self.element_count, self.history_count = contribution, element, history
 
-    def _build_block(
-        self, key: assembly.BlockKey, parts: list[assembly.HostBlock], contribution: int, element: int, history: int
-    ) -> Block:
-        family = elements.get(key.family)
-        conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
-        data = (tied_struct if key.tying else block_struct)(self.dtype)()
-        data.conn = self.array("elements", conn.T, wp.int32)
-        data.is_position = self.array("elements", (family.slot_kind == 0).astype(float), self.types.T)
-        rows = [np.full(len(p.elements), p.row) for p in parts]
-        data.material = self.array("elements", np.concatenate(rows), wp.int32)
-        data.coefficients = self.coefficients
-        data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
-        data.count = len(conn)
-        if key.tying:
-            self._tied_tables(data, key, parts)
-            points = len(key.tying.points)
-            kernels = tied_kernels(self.dtype, family.slots, points, key.tying.width)
-        else:
-            self._point_tables(data, key, parts)
-            points = len(key.rule.weights)
-            kind = (key.law, family.slots, points, key.affine, key.damping, key.framed)
-            kernels = element_kernels(self.dtype, *kind)
-        cluster = cluster_size(self.dtype, len(conn), fit=self.device.is_cuda)
-        return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element, cluster)
-
-    def shear_block(self, block: Block) -> Block:
-        """Elements of a tied block with their shears at points, for output."""
-        name = "shear stress"
-        key = replace(block.key, scheme=name, part=0, law="orthotropic", framed=True)
-        (part,) = key.output_scheme(name) or ()
-        assert part.law is not None
-        parts, rows = [], []
-        for host in block.parts:
-            _, values = part.law(host.body.materials[host.material][1])
-            parts.append(assembly.HostBlock(key, host.body, host.elements, host.material, values))
-            rows.append(np.pad(values, (0, NCOEF - len(values))))
-        data = block_struct(self.dtype)()
-        data.conn, data.is_position, data.count = block.data.conn, block.data.is_position, block.count
-        data.coefficients = self.array("output", np.array(rows)[None], self.types.T)
-        index = np.concatenate([np.full(len(p.elements), k) for k, p in enumerate(parts)])
-        data.material = self.array("output", index, wp.int32)
-        self._point_tables(data, key, parts)
-        points = len(key.rule.weights)
-        kernels = element_kernels(self.dtype, key.law, block.slots, points, False, None, True)
-        return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster)
-
-    def _tied_tables(self, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
-        T, vec3 = self.types.T, self.types.vec3
-        tables = [
-            assembly.tied_tables(part, members)
-            for part in parts
-            for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
-        ]
-        for name, dtype in (("first", T), ("second", T), ("X_first", vec3), ("X_second", vec3), ("coupling", T)):
-            table = np.concatenate([getattr(t, name) for t in tables])
-            axis = 1 if dtype is vec3 else 2
-            setattr(data, name, self.element_array(np.moveaxis(table, 0, axis), dtype))
-
-    def _point_tables(self, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
-        T, vec3, mat33 = self.types.T, self.types.vec3, self.types.mat33
-        family, rule = elements.get(key.family), key.rule
-        Q = len(rule.weights)
-        points = np.vstack([rule.points, family.vertices])
-        h, w, J0, axes = [], [], [], []
-        for part in parts:
-            for members in assembly.chunks(part.body, part.elements, len(points)):
-                if key.affine:
-                    _, _, J, det = assembly.geometry(part.body, members, family.vertices[:1])
-                    J0.append(np.linalg.inv(J[:, 0]))
-                    w.append(det[:, 0])
-                else:
-                    _, ds, J, det = assembly.geometry(part.body, members, points)
-                    h.append(assembly.gradients(ds, J))
-                    w.append(det[:, :Q] * rule.weights)
-                    if key.framed:
-                        axes.append(assembly.orthonormal(J[:, :Q]))
-        if key.affine:
-            _, ds = family.shape(points, np.zeros((1, len(family.node_slots), 3)))
-            table = ds[0][:, :, None, :]
-            data.J0_inv = self.element_array(np.concatenate(J0).reshape(-1, 9).T, T)
-            data.det_J0 = self.array("elements", np.concatenate(w), T)
-            if not any(callable(p.body.materials[p.material][1].density) for p in parts):
-                data.mass = self.array("elements", assembly.parent_mass(family), T)
-                density = [assembly.element_density(p) for p in parts]
-                data.density = self.array("elements", np.concatenate(density) * np.concatenate(w), T)
-            data.weight = self.array("elements", rule.weights[:, None], T)
-        else:
-            table = np.moveaxis(np.concatenate(h), 0, 2)
-            data.weight = self.element_array(np.concatenate(w).T, T)
-        data.gradient = self.element_array(table[:Q], vec3)
-        if key.law not in ANY_J:
-            data.vertex_gradient = self.element_array(table[Q:], vec3)
-        if key.framed:
-            data.frame = self.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)
-
     @property
     def constraints(self) -> Any:
         """Tables of the constraints (see terms.constraint_tables), or None."""
         term = self.terms.constraints
         return term and term.tables
 
-    def _build_topology(self) -> None:
-        T, vec3 = self.types.T, self.types.vec3
-        topo = topology_struct(self.dtype)()
-        start, entry = assembly.gather_table([b.connectivity for b in self.blocks], self.slots)
-        topo.start = self.array("topology", start, wp.int32)
-        topo.entry = self.array("topology", entry, wp.int32)
-        topo.mass_start = self.array("mass", self.mass_host.indptr, wp.int32)
-        topo.mass_column = self.array("mass", self.mass_host.indices, wp.int32)
-        topo.mass_value = self.array("mass", self.mass_host.data, T)
-        topo.free = self.array("slots", self.free_host, vec3)
-        topo.held = self.array("slots", (self.free_host == 0.0) @ [1, 2, 4], wp.uint8)
-        self.terms.join(topo)
-        self.topology = topo
+    def _upload_components(self) -> None:
+        """Slots by component, where there are several."""
+        if self.component_count > 1:
+            order = np.argsort(self.component, kind="stable")
+            edges = np.concatenate([[0], np.cumsum(np.bincount(self.component, minlength=self.component_count))])
+            self.component_start = self.array("components", edges, wp.int32)
+            self.component_slot = self.array("components", order, wp.int32)
+            self.component_of_slot = self.array("components", self.component, wp.int32)
 
     def graph(self) -> sp.csr_matrix:
         """Which slots share an element."""
         return assembly.slot_graph([b.connectivity for b in self.blocks], self.slots)
-
-    def _label_components(self) -> None:
-        """Connected component of each slot: by elements alone (`part`), and with what joints tie (`component`)."""
-        self.part = assembly.components_of(self.graph())
-        self.component = self.part
-        groups = self.terms.ties()
-        if groups:
-            ties = sp.lil_matrix((self.part.max() + 1, self.part.max() + 1))
-            for slots in groups:
-                parts = np.unique(self.part[slots])
-                ties[parts[0], parts] = 1.0
-            self.component = assembly.components_of(ties.tocsr())[self.part]
-        self.component_count = int(self.component.max()) + 1
-
-    def _build_groups(self) -> None:
-        """Bodies, or separate parts of one, that no support holds in some direction (DESIGN 5)."""
-        T, vec3 = self.types.T, self.types.vec3
-        label, count = self.component, self.component_count
-        free = np.ones((count, 3))
-        for c in range(3):
-            held = np.unique(label[self.free_host[:, c] == 0.0])
-            free[held, c] = 0.0
-        self.terms.hold(free)
-        if count > 1:
-            order = np.argsort(label, kind="stable")
-            edges = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
-            self.component_start = self.array("components", edges, wp.int32)
-            self.component_slot = self.array("components", order, wp.int32)
-            self.component_of_slot = self.array("components", label, wp.int32)
-        keep = np.flatnonzero(free.any(axis=1))
-        self.group_count = len(keep)
-        self.groups = groups_struct(self.dtype)()
-        if not self.group_count:
-            return
-        number = np.full(count, -1)
-        number[keep] = np.arange(len(keep))
-        of_slot = number[label]
-        slots = np.flatnonzero((of_slot >= 0) & (self.slot_kind == 0))
-        slots = slots[np.argsort(of_slot[slots], kind="stable")]
-        mass = np.bincount(of_slot[slots], weights=self.lumped_host[slots], minlength=len(keep))
-        start = np.concatenate([[0], np.cumsum(np.bincount(of_slot[slots], minlength=len(keep)))])
-        self.groups.start = self.array("groups", start, wp.int32)
-        self.groups.slot = self.array("groups", slots, wp.int32)
-        self.groups.of_slot = self.array("groups", of_slot, wp.int32)
-        self.groups.is_position = self.is_position
-        self.groups.lumped = self.lumped
-        self.groups.mass = self.array("groups", mass, T)
-        self.groups.free = self.array("groups", free[keep], vec3)
-
-    def check_static_supports(self) -> None:
-        """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
-        ties = None
-        if self.constraints:
-            ties = self.constraint_jacobian(self.state())
-        for label in range(self.component_count):
-            slots = np.flatnonzero(self.component == label)
-            parts, part = np.unique(self.part[slots], return_inverse=True)
-            motions = np.zeros((len(parts), 6, len(slots), 3))
-            for k in range(len(parts)):
-                own = np.flatnonzero(part == k)
-                motions[k][:, own] = assembly.rigid_modes(self.reference[slots[own]], self.slot_kind[slots[own]])
-            modes = motions.reshape(6 * len(parts), -1)
-            modes /= np.linalg.norm(modes, axis=1)[:, None]
-            held = modes[:, (self.free_host[slots] == 0.0).ravel()]
-            if ties is not None:
-                columns = (3 * slots[:, None] + np.arange(3)).ravel()
-                assert self.constraints is not None
-                rows = np.flatnonzero(self.constraints.component_host == label)
-                held = np.hstack([held, (ties[rows][:, columns] @ modes.T).T / self.size])
-            values = np.linalg.svd(held, compute_uv=False) if held.size else np.zeros(0)
-            free = len(modes) - int(np.sum(values > 1e-9))
-            if free:
-                body = next(b for b in self.bodies if b.slot_offset <= slots[0] < b.slot_offset + b.slot_count)
-                raise ModelError(
-                    f"body {body.name!r} is not supported: supports and joints leave {free} rigid "
-                    f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "
-                    "not counted): clamp or drive more nodes, or let a damped dynamic run come to rest"
-                )
 
     # what users call
 

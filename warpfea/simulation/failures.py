@@ -16,8 +16,8 @@ from ..kernels.solvers.newton import (
     FAIL_LINE_SEARCH,
     FAIL_NAN,
 )
-from ..terms.evaluation import lowest_jacobian
 from ..solvers import NewtonPCG
+from ..terms.evaluation import lowest_jacobian
 
 if TYPE_CHECKING:
     from ..model.model import Model

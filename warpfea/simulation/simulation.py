@@ -140,7 +140,7 @@ class Simulation(Results):
     def dt(self, value: float) -> None:
         _check_dt(value)
         self._dt = float(value)
-        self.stepper.work.step.dt.fill_(self._dt)
+        self.stepper.set_dt(self._dt)
 
     @property
     def time(self) -> np.ndarray:

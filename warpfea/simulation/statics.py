@@ -12,6 +12,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..model.assembly import require_density
 from ..model.state import State
+from ..model.topology import check_static_supports
 from ..solvers import NewtonPCG
 from .integrators import INTEGRATORS
 from .simulation import Simulation, StepReport, check_model
@@ -130,7 +131,7 @@ def begin_static(
     check_model(model)
     if np.any(model.terms.dead.gravity_host):
         require_density(model.bodies, "gravity")
-    model.check_static_supports()
+    check_static_supports(model)
     if not isinstance(solver, (NewtonPCG, type(None))):
         raise ModelError(f"solve_static: solver = {solver!r} must be wf.NewtonPCG(...): an equilibrium is to be found")
     options = solver or NewtonPCG(max_pcg=20000, max_newton=50)

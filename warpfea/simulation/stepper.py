@@ -196,6 +196,10 @@ class Stepper:
                 ) from error
             raise
 
+    def set_dt(self, dt: float) -> None:
+        """Step of all worlds, s."""
+        self.work.step.dt.fill_(dt)
+
     def run(self) -> None:
         """Do one step of every running world."""
         if self.graph is not None:

@@ -76,6 +76,9 @@ class Constraints(Term):
     def hold(self, free: np.ndarray) -> None:
         self.tables.hold(free)
 
+    def restraints(self, state: State, component: int) -> sp.csr_matrix:
+        return self.jacobian(state, 0)[np.flatnonzero(self.tables.component_host == component)]
+
     def incidence(self) -> tuple[np.ndarray, np.ndarray, int]:
         return self.tables.term_host // 3, self.tables.slot_host, self.tables.count
 

@@ -1,7 +1,7 @@
 """Kelvin-Voigt damping beside the elements' kernels, which hold its incremental and its rate form.
 
-Incremental: the strain at the start of the step, from which the rate is taken. Explicit: the force of Eqs. (58)-(70) at the start
-of the step, held during it among the dead loads.
+Incremental: the strain at the start of the step, from which the rate is taken. Explicit: the force of Eqs. (58)-(70) at
+the start of the step, held during it among the dead loads.
 """
 
 from __future__ import annotations

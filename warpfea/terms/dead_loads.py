@@ -20,8 +20,10 @@ __all__ = ["DeadLoads"]
 
 
 class DeadLoads(Term):
-    """Fills work.dead once per attempt. Gravity, [world] on the device, belongs to every model; without any load nothing
-    is launched."""
+    """Fills work.dead once per attempt.
+
+    Gravity, [world] on the device, belongs to every model; without any load nothing is launched.
+    """
 
     name = "dead loads"
 

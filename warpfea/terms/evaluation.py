@@ -18,6 +18,7 @@ from ..kernels.elements.materials import ANY_J
 from ..kernels.step.gather import gather_kernels
 from ..model import assembly
 from ..model.assembly import chunks, geometry, gradients
+from ..model.blocks import shear_block
 from ..model.state import State
 from .elements import Elements
 from .term import At
@@ -50,7 +51,7 @@ class Evaluation:
         return wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
 
     def _at(self, u: wp.array) -> At:
-        """What the elements' term takes for its work and writes: the elastic part at displacements u (worlds, slots)."""
+        """Work arrays for the elements' term: the elastic part at displacements u (worlds, slots)."""
         m, B = self.model, u.shape[0]
         least = [wp.full(B, 1e30, dtype=wp.float64, device=m.device) for _ in range(2)]
         work: Any = SimpleNamespace(
@@ -148,7 +149,7 @@ class Evaluation:
             if block.key.tying:
                 if block.key.output_scheme("shear stress") is None:
                     continue  # the transverse shear of a shell vanishes at its faces, where its stress is wanted
-                block.shear = block.shear or m.shear_block(block)
+                block.shear = block.shear or shear_block(m, block)
                 block = block.shear
             stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
             J = self._zeros((m.worlds, block.points, block.count), m.types.T)

@@ -113,9 +113,9 @@ def part(name: str) -> Callable[[F], F]:
 class Term:
     """One contribution to the residual. Forces are in N, on slots; flags `active` are int32 arrays [world].
 
-    Pools: a term with a potential that has `connectivity` writes at `offset + local * items + item` of work.pool_force (what
-    it adds to the residual, the derivative of its potential), work.pool_product (the derivative of that along p) and
-    work.pool_block (3x3 blocks on the diagonal, Voigt order). A term without a potential does so in
+    Pools: a term with a potential that has `connectivity` writes at `offset + local * items + item` of work.pool_force
+    (what it adds to the residual, the derivative of its potential), work.pool_product (the derivative of that along p)
+    and work.pool_block (3x3 blocks on the diagonal, Voigt order). A term without a potential does so in
     work.nonpotential_contribution, with the force on the body, and in work.nonpotential_tangent. Slots gather from the
     pools in a fixed order.
 
@@ -168,9 +168,13 @@ class Term:
     def hold(self, free: np.ndarray) -> None:
         """Clear directions (components, 3) in which it ties a component to the ground.
 
-        Translations of a free component pass through the elements and the mass alone; where a term resists them, a solve
-        can't be corrected by them.
+        Translations of a free component pass through the elements and the mass alone. Where a term resists them, a
+        solve can't be corrected by them.
         """
+
+    def restraints(self, state: State, component: int) -> Any:
+        """Rows (n, 3 slots), CSR, of directions in which it resists motion of a component, for statics; None without."""
+        return None
 
     def incidence(self) -> tuple[np.ndarray, np.ndarray, int] | None:
         """(item, slot, number of items) of entries off the elements' pattern: slots of one item couple."""

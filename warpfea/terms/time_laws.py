@@ -54,7 +54,7 @@ class TimeLaws:
     def evaluate(
         self, launch: Launcher, time: wp.array, ramp: wp.array, active: wp.array, value: wp.array
     ) -> None:  # fmt: skip
-        """value[world, law] at the times [world]; constants are multiplied by the ramp [world] of a static load path."""
+        """value[world, law] at times [world]; constants are multiplied by the ramp [world] of a static load path."""
         if not self.laws:
             return
         B = self.model.worlds

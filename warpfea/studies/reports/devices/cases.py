@@ -24,6 +24,7 @@ DAMPING = {form: wf.KelvinVoigt(3e3, 4.5e3, form=form) for form in ("incremental
 
 @wp.func
 def swirl(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
+    """A body force about the z axis, with a part that swings with time; N/kg."""
     return wp.vec3d(-x[1], x[0], wp.sin(t))
 
 
@@ -34,6 +35,7 @@ def s3_mesh():
 
 
 def cantilever(material=None, mesh=None, **options):
+    """The S3 cantilever, or another mesh clamped at its lowest x; the probe is the face 0.5 m from there."""
     b = wf.ModelBuilder()
     body = b.add_solid(mesh or s3_mesh(), material=material or wf.SVK(**SVK), name="s3", **options)
     low = body.mesh.points[:, 0].min()

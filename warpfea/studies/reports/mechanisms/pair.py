@@ -102,6 +102,7 @@ class Pair:
 
     @property
     def consistent(self):
+        """Mass matrix of the slots of both bodies, one component of three, kg."""
         return self.model.mass_matrix()[::3, ::3][self.mask][:, self.mask]
 
     def points_error(self, sim, exact):

@@ -111,6 +111,7 @@ def double_pendulum_terms(masses: Any, lengths: Any, centers: Any, inertias: Any
 
 
 def double_pendulum_acceleration(terms: tuple, angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Angular accelerations (2,) of both links, rad/s^2, from `double_pendulum_terms`."""
     a, b, c, g1, g2 = terms
     cos, sin = math.cos(angles[0] - angles[1]), math.sin(angles[0] - angles[1])
     f1 = -b * sin * rates[1] ** 2 - g1 * math.sin(angles[0])

@@ -64,10 +64,12 @@ class Rod:
         return g, length, sin, math.sqrt(1.0 - sin**2)
 
     def slider(self, t: float, q: np.ndarray) -> float:
+        """The slider's x, m."""
         _, length, _, cos = self.chord(t, q)
         return self.crank * math.cos(self.speed * t) + length * cos
 
     def motion(self, t: float, y: np.ndarray) -> _Motion:
+        """Place, velocity and strains of the rod at time t (s) in state y."""
         q, v = y[: self.n], y[self.n :]
         g, length, sin, cos = self.chord(t, q)
         turn = self.speed * t
@@ -98,6 +100,7 @@ class Rod:
         return _Motion(to_chord.T, np.array([u, w]), velocity, jacobian, bias, (h - 1.0, bend), (self.e, bend_q))
 
     def acceleration(self, m: _Motion) -> np.ndarray:
+        """Second derivatives (n,) of the coordinates, by d'Alembert's principle."""
         weighted = self.mass[:, None] * m.jacobian
         M = weighted[0].T @ m.jacobian[0] + weighted[1].T @ m.jacobian[1]
         f = weighted[0].T @ m.bias[0] + weighted[1].T @ m.bias[1]
@@ -106,6 +109,7 @@ class Rod:
         return -np.linalg.solve(M, f)
 
     def rhs(self, t: float, y: np.ndarray) -> np.ndarray:
+        """dy/dt."""
         return np.concatenate([y[self.n :], self.acceleration(self.motion(t, y))])
 
     def energy(self, t: float, y: np.ndarray) -> float:

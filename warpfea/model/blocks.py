@@ -1,0 +1,162 @@
+"""Blocks of elements: tables on the device for elements that one kernel does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .. import elements
+from ..kernels.elements.cluster import cluster_size
+from ..kernels.elements.element import element_kernels
+from ..kernels.elements.materials import ANY_J, NCOEF
+from ..kernels.elements.points import block_struct
+from ..kernels.elements.tied import tied_kernels, tied_struct
+from ..kernels.elements.with_mass import with_mass_kernel
+from . import assembly
+
+__all__ = ["Block", "build_block", "shear_block"]
+
+
+@dataclass(eq=False)
+class Block:
+    """Elements that one kernel does: their kind, device data, and where they came from."""
+
+    key: assembly.BlockKey
+    data: Any
+    kernels: Any
+    parts: list[assembly.HostBlock]
+    count: int
+    points: int
+    slots: int
+    contribution_offset: int
+    element_offset: int
+    cluster: int
+    field_rule: Any = None
+    shear: Any = None
+
+    @property
+    def connectivity(self) -> np.ndarray:
+        """(elements, slots per element) slots of the model, on the host."""
+        return np.concatenate([p.conn + p.body.slot_offset for p in self.parts])
+
+    @property
+    def with_mass(self) -> bool:
+        """Whether the mass of an element is one table times a number."""
+        return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
+
+    def kernels_for(self, dtype: str, damping: str | None) -> Any:
+        """The kernels of this kind of element with another form of damping."""
+        k = self.key
+        if k.tying:
+            return self.kernels
+        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
+
+    def with_mass_product(self, dtype: str, damping: str | None) -> wp.Kernel:
+        """The kernel of the product of a with_mass block, with a form of damping."""
+        k = self.key
+        return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster)
+
+
+def build_block(
+    model: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock], contribution: int, element: int, history: int
+) -> Block:
+    """The block of a key; offsets of its contributions, elements and strain history."""
+    family = elements.get(key.family)
+    conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
+    data = (tied_struct if key.tying else block_struct)(model.dtype)()
+    data.conn = model.array("elements", conn.T, wp.int32)
+    data.is_position = model.array("elements", (family.slot_kind == 0).astype(float), model.types.T)
+    rows = [np.full(len(p.elements), p.row) for p in parts]
+    data.material = model.array("elements", np.concatenate(rows), wp.int32)
+    data.coefficients = model.coefficients
+    data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
+    data.count = len(conn)
+    if key.tying:
+        _tied_tables(model, data, key, parts)
+        points = len(key.tying.points)
+        kernels = tied_kernels(model.dtype, family.slots, points, key.tying.width)
+    else:
+        _point_tables(model, data, key, parts)
+        points = len(key.rule.weights)
+        kind = (key.law, family.slots, points, key.affine, key.damping, key.framed)
+        kernels = element_kernels(model.dtype, *kind)
+    cluster = cluster_size(model.dtype, len(conn), fit=model.device.is_cuda)
+    return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element, cluster)
+
+
+def shear_block(model: Any, block: Block) -> Block:
+    """Elements of a tied block with their shears at points, for output."""
+    name = "shear stress"
+    key = replace(block.key, scheme=name, part=0, law="orthotropic", framed=True)
+    (part,) = key.output_scheme(name) or ()
+    assert part.law is not None
+    parts, rows = [], []
+    for host in block.parts:
+        _, values = part.law(host.body.materials[host.material][1])
+        parts.append(assembly.HostBlock(key, host.body, host.elements, host.material, values))
+        rows.append(np.pad(values, (0, NCOEF - len(values))))
+    data = block_struct(model.dtype)()
+    data.conn, data.is_position, data.count = block.data.conn, block.data.is_position, block.count
+    data.coefficients = model.array("output", np.array(rows)[None], model.types.T)
+    index = np.concatenate([np.full(len(p.elements), k) for k, p in enumerate(parts)])
+    data.material = model.array("output", index, wp.int32)
+    _point_tables(model, data, key, parts)
+    points = len(key.rule.weights)
+    kernels = element_kernels(model.dtype, key.law, block.slots, points, False, None, True)
+    return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster)
+
+
+def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
+    """Tables of elements with tied shears."""
+    T, vec3 = model.types.T, model.types.vec3
+    tables = [
+        assembly.tied_tables(part, members)
+        for part in parts
+        for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
+    ]
+    for name, dtype in (("first", T), ("second", T), ("X_first", vec3), ("X_second", vec3), ("coupling", T)):
+        table = np.concatenate([getattr(t, name) for t in tables])
+        axis = 1 if dtype is vec3 else 2
+        setattr(data, name, model.element_array(np.moveaxis(table, 0, axis), dtype))
+
+
+def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
+    """Gradients, weights, maps and axes at the points of elements."""
+    T, vec3, mat33 = model.types.T, model.types.vec3, model.types.mat33
+    family, rule = elements.get(key.family), key.rule
+    Q = len(rule.weights)
+    points = np.vstack([rule.points, family.vertices])
+    h, w, J0, axes = [], [], [], []
+    for part in parts:
+        for members in assembly.chunks(part.body, part.elements, len(points)):
+            if key.affine:
+                _, _, J, det = assembly.geometry(part.body, members, family.vertices[:1])
+                J0.append(np.linalg.inv(J[:, 0]))
+                w.append(det[:, 0])
+            else:
+                _, ds, J, det = assembly.geometry(part.body, members, points)
+                h.append(assembly.gradients(ds, J))
+                w.append(det[:, :Q] * rule.weights)
+                if key.framed:
+                    axes.append(assembly.orthonormal(J[:, :Q]))
+    if key.affine:
+        _, ds = family.shape(points, np.zeros((1, len(family.node_slots), 3)))
+        table = ds[0][:, :, None, :]
+        data.J0_inv = model.element_array(np.concatenate(J0).reshape(-1, 9).T, T)
+        data.det_J0 = model.array("elements", np.concatenate(w), T)
+        if not any(callable(p.body.materials[p.material][1].density) for p in parts):
+            data.mass = model.array("elements", assembly.parent_mass(family), T)
+            density = [assembly.element_density(p) for p in parts]
+            data.density = model.array("elements", np.concatenate(density) * np.concatenate(w), T)
+        data.weight = model.array("elements", rule.weights[:, None], T)
+    else:
+        table = np.moveaxis(np.concatenate(h), 0, 2)
+        data.weight = model.element_array(np.concatenate(w).T, T)
+    data.gradient = model.element_array(table[:Q], vec3)
+    if key.law not in ANY_J:
+        data.vertex_gradient = model.element_array(table[Q:], vec3)
+    if key.framed:
+        data.frame = model.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)

@@ -1,0 +1,100 @@
+"""Who contributes to which slot, connected components, free groups, and what statics asks of supports."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.common.structs import topology_struct
+from ..kernels.solvers.pcg import groups_struct
+from . import assembly
+
+__all__ = ["check_static_supports", "free_groups", "label_components", "make_topology"]
+
+
+def make_topology(model: Any) -> Any:
+    """The Topology struct: contributions of the elements, mass matrix, prescribed components."""
+    topo = topology_struct(model.dtype)()
+    start, entry = assembly.gather_table([b.connectivity for b in model.blocks], model.slots)
+    topo.start = model.array("topology", start, wp.int32)
+    topo.entry = model.array("topology", entry, wp.int32)
+    topo.mass_start = model.array("mass", model.mass_host.indptr, wp.int32)
+    topo.mass_column = model.array("mass", model.mass_host.indices, wp.int32)
+    topo.mass_value = model.array("mass", model.mass_host.data, model.types.T)
+    topo.free = model.array("slots", model.free_host, model.types.vec3)
+    topo.held = model.array("slots", (model.free_host == 0.0) @ [1, 2, 4], wp.uint8)
+    model.terms.join(topo)
+    return topo
+
+
+def label_components(graph: sp.csr_matrix, groups: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Connected component of each slot: by elements alone, and with what terms tie, given as `groups` of slots."""
+    part = assembly.components_of(graph)
+    if not groups:
+        return part, part
+    ties = sp.lil_matrix((part.max() + 1, part.max() + 1))
+    for slots in groups:
+        parts = np.unique(part[slots])
+        ties[parts[0], parts] = 1.0
+    return part, assembly.components_of(ties.tocsr())[part]
+
+
+def free_groups(model: Any) -> tuple[Any, int]:
+    """Components that nothing holds in some direction, on the device, and their number (DESIGN 5).
+
+    Their translations pass through the mass alone: each solve is corrected by them, so that momentum does not leak.
+    """
+    label, count = model.component, model.component_count
+    free = np.ones((count, 3))
+    for c in range(3):
+        free[np.unique(label[model.free_host[:, c] == 0.0]), c] = 0.0
+    model.terms.hold(free)
+    keep = np.flatnonzero(free.any(axis=1))
+    groups = groups_struct(model.dtype)()
+    if not len(keep):
+        return groups, 0
+    number = np.full(count, -1)
+    number[keep] = np.arange(len(keep))
+    of_slot = number[label]
+    slots = np.flatnonzero((of_slot >= 0) & (model.slot_kind == 0))
+    slots = slots[np.argsort(of_slot[slots], kind="stable")]
+    mass = np.bincount(of_slot[slots], weights=model.lumped_host[slots], minlength=len(keep))
+    start = np.concatenate([[0], np.cumsum(np.bincount(of_slot[slots], minlength=len(keep)))])
+    groups.start = model.array("groups", start, wp.int32)
+    groups.slot = model.array("groups", slots, wp.int32)
+    groups.of_slot = model.array("groups", of_slot, wp.int32)
+    groups.is_position, groups.lumped = model.is_position, model.lumped
+    groups.mass = model.array("groups", mass, model.types.T)
+    groups.free = model.array("groups", free[keep], model.types.vec3)
+    return groups, len(keep)
+
+
+def check_static_supports(model: Any) -> None:
+    """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
+    state = model.state()
+    for label in range(model.component_count):
+        slots = np.flatnonzero(model.component == label)
+        parts, part = np.unique(model.part[slots], return_inverse=True)
+        motions = np.zeros((len(parts), 6, len(slots), 3))
+        for k in range(len(parts)):
+            own = np.flatnonzero(part == k)
+            motions[k][:, own] = assembly.rigid_modes(model.reference[slots[own]], model.slot_kind[slots[own]])
+        modes = motions.reshape(6 * len(parts), -1)
+        modes /= np.linalg.norm(modes, axis=1)[:, None]
+        held = modes[:, (model.free_host[slots] == 0.0).ravel()]
+        columns = (3 * slots[:, None] + np.arange(3)).ravel()
+        for rows in (found for term in model.terms if (found := term.restraints(state, label)) is not None):
+            held = np.hstack([held, (rows[:, columns] @ modes.T).T / model.size])
+        values = np.linalg.svd(held, compute_uv=False) if held.size else np.zeros(0)
+        free = len(modes) - int(np.sum(values > 1e-9))
+        if free:
+            body = next(b for b in model.bodies if b.slot_offset <= slots[0] < b.slot_offset + b.slot_count)
+            raise ModelError(
+                f"body {body.name!r} is not supported: supports and joints leave {free} rigid "
+                f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "
+                "not counted): clamp or drive more nodes, or let a damped dynamic run come to rest"
+            )
