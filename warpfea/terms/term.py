@@ -173,7 +173,7 @@ class Term:
         """
 
     def restraints(self, state: State, component: int) -> Any:
-        """Rows (n, 3 slots), CSR, of directions in which it resists motion of a component, for statics; None without."""
+        """Rows (n, 3 slots), CSR: directions in which it resists motion of a component, for statics; None without."""
         return None
 
     def incidence(self) -> tuple[np.ndarray, np.ndarray, int] | None:
