@@ -11,7 +11,7 @@ import warp as wp
 from warpfea.kernels.common.state import state_kernels
 
 import warpfea as wf
-from warpfea.base.launch import Launcher, labelled
+from warpfea.base.launch import PARTS, Launcher, labelled
 from warpfea.builder.scene import find
 from warpfea.cli import main
 from warpfea.cli.profile import KEYS
