@@ -215,8 +215,10 @@ def damaged(path, tmp_path, how):
             del arrays["total.pcg"]
         elif how == "shape":
             arrays["state.velocity"] = arrays["state.velocity"][:, :-1]
-        elif how == "schema":
-            text = arrays["meta"].tobytes().replace(b'"schema": 1', b'"schema": 9')
+        elif how in ("schema", "old schema"):
+            text = (
+                arrays["meta"].tobytes().replace(b'"schema": 2', b'"schema": 9' if how == "schema" else b'"schema": 1')
+            )
             arrays["meta"] = np.frombuffer(text, dtype=np.uint8)
         np.savez(file, **arrays)
     return file
@@ -235,6 +237,7 @@ def damaged(path, tmp_path, how):
         ("no totals", "totals"),
         ("shape", "velocity"),
         ("schema", "schema 9"),
+        ("old schema", "earlier version"),
     ],
 )
 def test_a_damaged_checkpoint_is_refused(small, tmp_path, how, word):

@@ -16,7 +16,7 @@ from .parser import MATERIAL_HINT
 from .part import mesh_facts
 from .run import check_targets
 from .source import find_scene, is_mesh, progress, resolve
-from .summary import MANY, box_text, mass_text, model_box, model_mass
+from .summary import MANY, box_text, mass_text, model_box
 
 __all__ = ["info", "render", "scenes"]
 
@@ -66,7 +66,7 @@ def info(options: argparse.Namespace) -> int:
         sim = source.simulation(model, progress(options))
         launcher = sim.stepper.launch
         content = {"scene": source.label, "parameters": source.parameters} | model.info()
-        content |= {"mass": model_mass(model), "bounding_box": model_box(model)}
+        content |= {"bounding_box": model_box(model)}
         if is_mesh(options.what):
             content["mesh"] = mesh_facts(model.bodies[0].mesh)
         content["integrator"] = sim.integrator.name

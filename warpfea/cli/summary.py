@@ -14,7 +14,7 @@ from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
 from .source import Source
 
-__all__ = ["KEYS", "SCHEMA", "box_text", "human", "mass_text", "model_box", "model_mass", "summarize"]
+__all__ = ["KEYS", "SCHEMA", "box_text", "human", "mass_text", "model_box", "summarize"]
 
 SCHEMA = 1
 KEYS = (
@@ -87,7 +87,7 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
         "pcg_iterations": int(sim.totals["pcg"].sum()),
         "max_residual": sim.max_residual,
         "rough_steps": int(sim.totals["rough"].sum()),
-        "mass": model_mass(sim.model),
+        "mass": sim.model.mass,
         "bounding_box": model_box(sim.model),
         "energies": {name: float(values[0]) for name, values in energies.items()},
         "probes": probes,
@@ -137,13 +137,6 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
     rows += _joints(sim)
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return table(rows)
-
-
-def model_mass(model: Model) -> float | None:
-    """Mass of all bodies, kg; None where a material has no density."""
-    if any(material.density is None for body in model.bodies for _, material in body.materials):
-        return None
-    return float(model.info()["mass"])
 
 
 def model_box(model: Model) -> list[list[float]]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ModelError
+from ..base.names import did_you_mean
 from .quadrature import Rule
 
 __all__ = ["Family", "Lattice", "Parent", "Part", "Tying", "families", "for_cell", "get", "register"]
@@ -172,7 +173,7 @@ class Family:
             if name not in known:
                 raise ModelError(
                     f"slots = {names!r}: element {self.name} knows {', '.join(map(repr, known))}, and several of them "
-                    "joined by '+'"
+                    f"joined by '+'{did_you_mean(name, known)}"
                 )
             out |= set(known[name])
         return out
@@ -219,6 +220,7 @@ class Family:
         if name not in self.rules:
             raise ModelError(
                 f"quadrature {name!r} is not a rule of element {self.name}; there are {', '.join(self.rules)}"
+                f"{did_you_mean(name, self.rules)}"
             )
         return self.rules[name]
 
@@ -241,7 +243,7 @@ def get(name: str) -> Family:
     """The family `name`. Raises ModelError listing the names."""
     if name in _families:
         return _families[name]
-    raise ModelError(f"element {name!r} is unknown; there are {', '.join(_families)}")
+    raise ModelError(f"element {name!r} is unknown; there are {', '.join(_families)}{did_you_mean(name, _families)}")
 
 
 def for_cell(cell_type: str) -> Family:

@@ -22,6 +22,9 @@ class NodeSet:
     def __len__(self) -> int:
         return len(self.indices)
 
+    def __repr__(self) -> str:
+        return _describe(self, "nodes")
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSet:
@@ -33,6 +36,9 @@ class SurfaceSet:
 
     def __len__(self) -> int:
         return len(self.faces)
+
+    def __repr__(self) -> str:
+        return _describe(self, "faces")
 
     @property
     def nodes(self) -> np.ndarray:
@@ -50,6 +56,9 @@ class ElementSet:
 
     def __len__(self) -> int:
         return len(self.indices)
+
+    def __repr__(self) -> str:
+        return _describe(self, "elements")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,3 +83,13 @@ class MaterialPoint:
     gradients: np.ndarray
     axes: np.ndarray
     element: int = -1
+
+    def __repr__(self) -> str:
+        place = ", ".join(f"{x:.6g}" for x in self.X)
+        return f"MaterialPoint(({place}) m of body {self.body.name!r}, element {self.element})"
+
+
+def _describe(handle: NodeSet | SurfaceSet | ElementSet, what: str) -> str:
+    """A set in one line."""
+    name = f"{handle.name!r}, " if handle.name else ""
+    return f"{type(handle).__name__}({name}{len(handle)} {what} of body {handle.body.name!r})"

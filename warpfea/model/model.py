@@ -22,13 +22,20 @@ from .topology import free_groups, label_components, make_topology
 __all__ = ["Block", "Model", "find_device"]
 
 
+SHOWN = 3
+"""Bodies that a repr lists by name."""
+
+
 class Source(Protocol):
     """What a Model is made from: a ModelBuilder."""
 
-    bodies: list[Body]
     description: Description
     gravity: np.ndarray
     up_axis: str
+
+    @property
+    def bodies(self) -> list[Body]:
+        """In the order they were added."""
 
     def assemble(self, model: Model) -> tuple[Any, Any]:
         """The TermSet of a model, and what evaluates it at a state."""
@@ -83,6 +90,21 @@ class Model:
         self.topology = make_topology(self)
         self._upload_components()
         self.groups, self.group_count = free_groups(self)
+
+    def __repr__(self) -> str:
+        names = ", ".join(repr(body.name) for body in self.bodies)
+        what = names if len(self.bodies) <= SHOWN else f"{len(self.bodies)} bodies"
+        mass = "no density" if self.mass is None else f"{self.mass:.4g} kg"
+        worlds = f", {self.worlds} worlds" if self.worlds > 1 else ""
+        return f"Model({what}, {int(self.free_slots.sum())} unknowns, {mass}, {self.device}, {self.dtype}{worlds})"
+
+    @property
+    def mass(self) -> float | None:
+        """kg; None where a material has no density."""
+        laws = [law for body in self.bodies for _, law in body.materials]
+        if any(law.density is None for law in laws):
+            return None
+        return float(self.lumped_host[self.slot_kind == 0].sum())
 
     # construction
 
@@ -236,7 +258,7 @@ class Model:
             "slots": self.slots,
             "unknowns": int(self.free_slots.sum()),
             "elements": sum(len(body.mesh.cells) for body in self.bodies),
-            "mass": float(self.lumped_host[self.slot_kind == 0].sum()),
+            "mass": self.mass,
             "joints": [
                 {"name": j.name, "kind": j.kind, "rows": len(j.rows), "between": j.between}
                 for j in (self.constraints.joints if self.constraints else ())
@@ -276,7 +298,12 @@ class Model:
         return out
 
     def mass_matrix(self) -> sp.csr_matrix:
-        """Consistent mass, (3 slots, 3 slots) CSR, kg; unknown 3 slot + component."""
+        """Consistent mass, (3 slots, 3 slots) CSR, kg; unknown 3 slot + component.
+
+        Raises:
+            ModelError: a material without a density.
+        """
+        assembly.require_density(self.bodies, "mass_matrix")
         return sp.kron(self.mass_host, sp.identity(3), format="csr")
 
     def internal_force(self, state: State) -> np.ndarray:
@@ -316,7 +343,14 @@ class Model:
         return self.evaluation.constraint_curvature(state, np.asarray(multipliers), np.asarray(direction))
 
     def set_gravity(self, gravity: Any) -> None:
-        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2."""
+        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2.
+
+        Raises:
+            ModelError: wrong shape, a value that is not finite, a material without a density, or a model built without
+                gravity.
+        """
+        if np.any(np.asarray(gravity, dtype=float)):
+            assembly.require_density(self.bodies, "gravity")
         self.terms.dead.set_gravity(gravity)
 
     def set_parameter(self, name: str, values: Any) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..base.errors import ModelError
+from ..base.names import did_you_mean
 from .discretisation import Discretisation, element_functions
 
 __all__ = [
@@ -85,7 +86,8 @@ def select_faces(body: Discretisation, selection: Any) -> np.ndarray:
     if isinstance(selection, str):
         named = named_faces(body)
         if selection not in named:
-            raise ModelError(f"{label}: no surface named {selection!r}; there are: {', '.join(map(repr, named))}")
+            hint = did_you_mean(selection, named)
+            raise ModelError(f"{label}: no surface named {selection!r}; there are: {', '.join(map(repr, named))}{hint}")
         return named[selection]
     if callable(selection):
         mask = np.asarray(selection(face_centroids(body, body.boundary)))

@@ -20,7 +20,8 @@ from .reports import idle_report
 
 __all__ = ["Checkpoint", "load_checkpoint", "read_meta", "save_checkpoint"]
 
-SCHEMA = 1
+SCHEMA = 2
+"""1: constraints were registered with the solver, and the ledger had a column of joints in every model."""
 SUFFIXES = (".npz",)
 
 
@@ -171,5 +172,8 @@ def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise CheckpointError(f"{file}: not a readable checkpoint, such as wf.Checkpoint writes") from error
     if schema != SCHEMA:
-        raise CheckpointError(f"{file}: schema {schema!r} of the checkpoint is unknown, this version reads {SCHEMA}")
+        older = (
+            "is of an earlier version of warpfea and can't be continued by this one" if schema == 1 else "is unknown"
+        )
+        raise CheckpointError(f"{file}: schema {schema!r} of the checkpoint {older}, which reads {SCHEMA}")
     return meta, arrays

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..base.errors import ModelError
+from ..base.names import did_you_mean
 from ..terms.term import At
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
@@ -24,7 +25,8 @@ def get(solver: Any) -> NewtonPCG | Jacobi:
     if isinstance(solver, (NewtonPCG, Jacobi)):
         return solver
     names = ", ".join(repr(name) for name in SOLVERS)
-    raise ModelError(f"solver = {solver!r} is unknown; there are {names}, or options such as wf.NewtonPCG(...)")
+    hint = did_you_mean(solver, SOLVERS) if isinstance(solver, str) else ""
+    raise ModelError(f"solver = {solver!r} is unknown; there are {names}, or options such as wf.NewtonPCG(...){hint}")
 
 
 def make_loop(at: At, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
