@@ -80,6 +80,14 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             merit += mul.merit[world, row] * d
         return wp.matrix_from_rows(tie, squeeze, merit)
 
+    @wp.func
+    def gathered(topo: Topology, contribution: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
+        """Sum of the contributions to a slot, in order."""
+        f = vec3()
+        for k in range(topo.start[slot], topo.start[slot + 1]):
+            f += contribution[world, topo.entry[k]]
+        return f
+
     @wp.kernel(module=module)
     def gather_force(
         topo: Topology,
@@ -91,10 +99,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        f = vec3()
-        for k in range(topo.start[slot], topo.start[slot + 1]):
-            f += contribution[world, topo.entry[k]]
-        out[world, slot] = f
+        out[world, slot] = gathered(topo, contribution, world, slot)
 
     @wp.kernel(module=module)
     def residual(
@@ -112,9 +117,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        f = vec3()
-        for k in range(topo.start[slot], topo.start[slot + 1]):
-            f += contribution[world, topo.entry[k]]
+        f = gathered(topo, contribution, world, slot)
         if wp.static(pooled):
             for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
                 f += balance.pool[world, topo.pool_entry[k]]
@@ -228,9 +231,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return
         share = f64(0.0)
         if slot < out.shape[1]:
-            f = vec3()
-            for k in range(topo.start[slot], topo.start[slot + 1]):
-                f += contribution[world, topo.entry[k]]
+            f = gathered(topo, contribution, world, slot)
             a = vec3()
             for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
                 a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
@@ -257,11 +258,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return
         share = f64(0.0)
         if slot < out.shape[1]:
-            p = p_in[world, slot]
-            f = vec3()
-            for k in range(topo.start[slot], topo.start[slot + 1]):
-                f += contribution[world, topo.entry[k]]
-            share = finish(topo, f, more, p, con, mul, world, slot, out)
+            h = gathered(topo, contribution, world, slot)
+            share = finish(topo, h, more, p_in[world, slot], con, mul, world, slot, out)
         share_of_warp(share, slot, more.warp, world, rows)
 
     @wp.kernel(module=matrix_module)

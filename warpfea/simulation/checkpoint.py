@@ -175,5 +175,5 @@ def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         older = (
             "is of an earlier version of warpfea and can't be continued by this one" if schema == 1 else "is unknown"
         )
-        raise CheckpointError(f"{file}: schema {schema!r} of the checkpoint {older}, which reads {SCHEMA}")
+        raise CheckpointError(f"{file}: schema {schema!r} of the checkpoint {older}; this version reads {SCHEMA}")
     return meta, arrays

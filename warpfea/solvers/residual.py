@@ -206,7 +206,7 @@ class Residual:
             launch(self.gather.gather_force, self.dim, args)
         if hold:
             self.hold_nonpotential(active)
-        if self.terms.traits.stored:
+        if w.term_rows is not None:
             self.reduce(w.term_rows, TERM_ROWS, active, w.newton.term_sums)
         args = [m.topology, w.contribution, w.balance, active, self.con, w.multipliers]
         launch(self.gather.residual, self.dim, args)

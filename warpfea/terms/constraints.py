@@ -320,7 +320,7 @@ class Constraints(Term):
         m, con = self.model, self.tables
         mul = self.evaluate(state, multipliers)
         host = np.tile(direction, (m.worlds, 1, 1))
-        p = wp.array(host.astype(np.dtype(m.dtype)), dtype=m.types.vec3, device=m.device)
+        p: Any = wp.array(host.astype(np.dtype(m.dtype)), dtype=m.types.vec3, device=m.device)
         one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
         every = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
         Launcher(m.device)(self.kernels.product_terms, self.dim, [con.data, mul, p, one, every])

@@ -54,6 +54,7 @@ class Evaluation:
         """Work arrays for the elements' term: the elastic part at displacements u (worlds, slots)."""
         m, B = self.model, u.shape[0]
         least = [wp.full(B, 1e30, dtype=wp.float64, device=m.device) for _ in range(2)]
+        none: Any = None
         work: Any = SimpleNamespace(
             u=u,
             v=u,
@@ -63,7 +64,7 @@ class Evaluation:
             energy_rows=self._zeros((2, B, m.element_count), wp.float64),
             newton=SimpleNamespace(min_J=least[0], domain_J=least[1]),
         )
-        return At(m, work, self.launch, state=None, u_before=None, inertia=False)
+        return At(m, work, self.launch, state=none, u_before=none, inertia=False)
 
     def internal_force(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Elastic force [world, slot, 3], strain energy [world], smallest J [world]."""

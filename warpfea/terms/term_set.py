@@ -211,5 +211,5 @@ class TermSet:
         known = [column.name for kind in KINDS for column in kind.columns if column.name]
         for name in (*known, *ZERO):
             out.setdefault(name, np.zeros(len(ledger)))
-        out["work"] = sum(values for name, values in out.items() if name.startswith("work_"))
+        out["work"] = np.sum([values for name, values in out.items() if name.startswith("work_")], axis=0)
         return out
