@@ -110,8 +110,7 @@ def element_kernels(
             if low < domain_J[world]:
                 wp.atomic_min(domain_J, world, low)
         if lane == 0 and index < block.count * lanes:
-            for i in range(NS):
-                contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+            fn.store(block, f, world, elem, contribution)
             energy[0, world, block.element_offset + elem] = stored
             energy[1, world, block.element_offset + elem] = lost
 
@@ -136,8 +135,7 @@ def element_kernels(
         if wp.static(damping == "rate"):
             V = fn.load(block, v, world, elem)
         f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), world, elem)
-        for i in range(NS):
-            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        fn.store(block, f, world, elem, contribution)
 
     @wp.kernel(module=module)
     def diagonal_blocks(

@@ -24,7 +24,6 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
     stress_module = kernel_module(f"{name}_stress")
     T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
-    NS = fn.slots
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
 
     @wp.kernel(module=history_module)
@@ -74,8 +73,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
             S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
             rate_of_work += fn.weight_of(block, point, elem) * wp.ddot(S, rate)
             f = fn.scatter(block, f, F * S, point, elem)
-        for i in range(NS):
-            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        fn.store(block, f, world, elem, contribution)
         power[world, block.element_offset + elem] = wp.float64(rate_of_work)
 
     @wp.kernel(module=stress_module)

@@ -12,6 +12,7 @@ import warp as wp
 
 from ..common.types import precision
 from . import materials
+from .load import load_functions, local_type
 
 __all__ = ["block_struct", "point_functions"]
 
@@ -53,13 +54,14 @@ def point_functions(
 ) -> _types.SimpleNamespace:
     """Device functions for one kind of element block; the arguments are those of `element_kernels`."""
     p = precision(dtype)
-    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    T, mat33, sym6 = p.T, p.mat33, p.sym
     t = materials.tensors(dtype)
     m = materials.law(law, dtype)
     Block = block_struct(dtype)
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
-    Local = wp.types.matrix(shape=(slots, 3), dtype=T)
+    Local = local_type(dtype, slots)
+    load, store = load_functions(dtype, slots, Block)
     NS = slots
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
 
@@ -80,15 +82,6 @@ def point_functions(
         d[0] = c[LAMBDA_V] * scale
         d[1] = c[ETA] * scale
         return d
-
-    @wp.func
-    def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
-        """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
-        U = Local()
-        first = field[world, block.conn[0, elem]]
-        for i in range(NS):
-            U[i] = field[world, block.conn[i, elem]] - block.is_position[i] * first
-        return U
 
     @wp.func
     def inverse_jacobian(block: Block, elem: int) -> mat33:
@@ -254,7 +247,7 @@ def point_functions(
     return _types.SimpleNamespace(
         types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
         framed=framed, needs_J=law not in materials.ANY_J,
-        coefficients=coefficients, damping_coefficients=damping_coefficients, load=load,
+        coefficients=coefficients, damping_coefficients=damping_coefficients, load=load, store=store,
         inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
         weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
         into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,

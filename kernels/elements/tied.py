@@ -11,6 +11,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_module, precision
+from .load import load_functions, local_type
 from .matrix import UNROLL, panels_of, row_of, rows_type
 
 __all__ = ["tied_kernels", "tied_struct"]
@@ -56,7 +57,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     name = f"tied_{dtype}_{slots}_{ties}_{width}"
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
-    Local = wp.types.matrix(shape=(slots, 3), dtype=T)
+    Local = local_type(dtype, slots)
+    load, store = load_functions(dtype, slots, Block)
     Ties = wp.types.vector(length=ties, dtype=T)
     TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
     NS, NT, W = slots, ties, width
@@ -68,15 +70,6 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
     Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
     rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
-
-    @wp.func
-    def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
-        """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
-        U = Local()
-        first = field[world, block.conn[0, elem]]
-        for i in range(NS):
-            U[i] = field[world, block.conn[i, elem]] - block.is_position[i] * first
-        return U
 
     @wp.func
     def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
@@ -139,8 +132,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             d = s[t] * x2[t]
             for i in range(NS):
                 f[i] = f[i] + block.first[t, i, elem] * d + block.second[t, i, elem] * a
-        for i in range(NS):
-            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        store(block, f, world, elem, contribution)
         energy[0, world, block.element_offset + elem] = wp.float64(T(0.5) * wp.dot(e, s))
         energy[1, world, block.element_offset + elem] = wp.float64(0.0)
 
@@ -173,8 +165,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             dd = ds[t] * x2[t] + s[t] * line(block.second, P, t, elem)
             for i in range(NS):
                 f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
-        for i in range(NS):
-            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+        store(block, f, world, elem, contribution)
 
     @wp.kernel(module=module)
     def diagonal_blocks(

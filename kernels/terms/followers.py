@@ -65,6 +65,12 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
             out += table[point, i, item] * field[world, data.conn[i, item]]
         return out
 
+    @wp.func
+    def clear(data: Follower, world: int, item: int, contribution: wp.array2d(dtype=vec3)):
+        """Zero the entries of an item."""
+        for i in range(data.conn.shape[0]):
+            contribution[world, data.offset + i * data.count + item] = vec3()
+
     @wp.kernel(module=pressure_module)
     def pressure(
         data: Follower,
@@ -77,13 +83,11 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         world, item = wp.tid()
         if active[world] == 0:
             return
-        slots = data.conn.shape[0]
-        for i in range(slots):
-            contribution[world, data.offset + i * data.count + item] = vec3()
+        clear(data, world, item, contribution)
         for q in range(data.weight.shape[0]):
             normal = wp.cross(side(data, data.d_a, u, world, q, item), side(data, data.d_b, u, world, q, item))
             f = (-T(value[world, data.law[item]][0]) * data.weight[q]) * normal
-            for i in range(slots):
+            for i in range(data.conn.shape[0]):
                 k = data.offset + i * data.count + item
                 contribution[world, k] = contribution[world, k] + data.shape[q, i, item] * f
 
@@ -100,9 +104,7 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         world, item = wp.tid()
         if active[world] == 0:
             return
-        slots = data.conn.shape[0]
-        for i in range(slots):
-            contribution[world, data.offset + i * data.count + item] = vec3()
+        clear(data, world, item, contribution)
         for q in range(data.weight.shape[0]):
             a = side(data, data.d_a, u, world, q, item)
             b = side(data, data.d_b, u, world, q, item)
@@ -113,7 +115,7 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
             force = wp.cross(da, b) + wp.cross(a, db)
             left = wp.cross(b, d)
             right = wp.cross(d, a)
-            for i in range(slots):
+            for i in range(data.conn.shape[0]):
                 k = data.offset + i * data.count + item
                 f = data.shape[q, i, item] * force + data.d_a[q, i, item] * left + data.d_b[q, i, item] * right
                 contribution[world, k] = contribution[world, k] + w * f

@@ -1,0 +1,42 @@
+"""Values of an element's slots, and the contributions of an element to them."""
+
+import functools
+
+import warp as wp
+
+from ..common.types import precision
+
+__all__ = ["load_functions", "local_type"]
+
+
+@functools.cache
+def local_type(dtype: str, slots: int):
+    """The values of an element's slots: a matrix of so many rows."""
+    return wp.types.matrix(shape=(slots, 3), dtype=precision(dtype).T)
+
+
+@functools.cache
+def load_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, wp.Function]:
+    """The functions load(block, field, world, elem) and store(block, values, world, elem, contribution).
+
+    Args:
+        Block: struct of the elements, with conn, is_position, contribution_offset and count.
+    """
+    vec3, Local, NS = precision(dtype).vec3, local_type(dtype, slots), slots
+
+    @wp.func
+    def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+        """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
+        U = Local()
+        first = field[world, block.conn[0, elem]]
+        for i in range(NS):
+            U[i] = field[world, block.conn[i, elem]] - block.is_position[i] * first
+        return U
+
+    @wp.func
+    def store(block: Block, f: Local, world: int, elem: int, contribution: wp.array2d(dtype=vec3)):
+        """Forces on the slots of an element, into its entries of the contributions."""
+        for i in range(NS):
+            contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
+
+    return load, store
