@@ -17,7 +17,7 @@ from warpfea.kernels.common.structs import pattern_struct, topology_struct
 from warpfea.kernels.common.traits import Traits
 from warpfea.kernels.common.types import kernel_module, precision
 from warpfea.kernels.elements import materials as laws
-from warpfea.kernels.solvers.newton import control_struct
+from warpfea.kernels.solvers.control import control_struct
 
 import warpfea as wf
 from warpfea import elements

@@ -11,14 +11,8 @@ import warp as wp
 
 from ..common.traits import Traits
 from ..common.types import kernel_module, precision
-from .newton import (
-    FAIL_CONSTRAINT,
-    FAIL_GROWTH,
-    FAIL_JACOBIAN,
-    FAIL_NAN,
-    control_struct,
-    newton_kernels,
-)
+from .control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_NAN, control_struct
+from .newton import newton_kernels
 from .pcg import pcg_struct
 
 __all__ = ["PAIRS", "jacobi_kernels", "jacobi_struct"]

@@ -6,38 +6,22 @@ import types as _types
 import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import kernel_module, precision
+from ..common.types import kernel_module
+from .control import (
+    FAIL_CONSTRAINT,
+    FAIL_CURVATURE,
+    FAIL_ITERATIONS,
+    FAIL_JACOBIAN,
+    FAIL_LINE_SEARCH,
+    FAIL_NAN,
+    control_struct,
+)
+from .vectors import vector_kernels
 
-__all__ = [
-    "COMPONENT_ROWS",
-    "FAIL_CONSTRAINT",
-    "FAIL_CURVATURE",
-    "FAIL_GROWTH",
-    "FAIL_ITERATIONS",
-    "FAIL_JACOBIAN",
-    "FAIL_LINE_SEARCH",
-    "FAIL_NAN",
-    "LANES",
-    "TERM_ROWS",
-    "control_struct",
-    "newton_kernels",
-]
-
-FAIL_ITERATIONS = 1
-FAIL_LINE_SEARCH = 2
-FAIL_JACOBIAN = 3
-FAIL_NAN = 4
-FAIL_CURVATURE = 5
-FAIL_CONSTRAINT = 6
-FAIL_GROWTH = 7
+__all__ = ["newton_kernels"]
 
 ARMIJO = 1.0e-4
 WOLFE = 0.8
-COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
-LANES = 32
-TERM_ROWS = 3
-"""Rows summed per world of what terms store: the potential with what is held in a line search (multipliers, caps), the
-potential with what they would hold next, and its magnitude."""
 NOISE = 100.0  # Phi is blind below this many roundings of its parts
 FLOOR = 16.0
 MAX_SEARCH = 20
@@ -46,72 +30,11 @@ PREDICTED = 1.0e-3
 
 
 @functools.cache
-def control_struct():
-    """What Newton's method knows of each world."""
-
-    @wp.struct
-    class NewtonControl:
-        active: wp.array(dtype=wp.int32)  # iterating
-        searching: wp.array(dtype=wp.int32)  # in a line search
-        failed: wp.array(dtype=wp.int32)  # 0 or a FAIL_ code
-        iterations: wp.array(dtype=wp.int32)  # of this attempt
-        searches: wp.array(dtype=wp.int32)
-        total_iterations: wp.array(dtype=wp.int32)  # of this step
-        alpha: wp.array(dtype=wp.float64)
-        phi: wp.array(dtype=wp.float64)
-        phi_magnitude: wp.array(dtype=wp.float64)
-        slope: wp.array(dtype=wp.float64)  # g.p at the iterate
-        norm: wp.array(dtype=wp.float64)  # |g| in the D^-1 norm
-        relative: wp.array(dtype=wp.float64)  # |g| over the largest force, of the worst component
-        excess: wp.array(dtype=wp.float64)  # largest norm over accepted norm of the components
-        floor_excess: wp.array(dtype=wp.float64)  # the same over what rounding of positions alone may cause
-        solve_norm: wp.array(dtype=wp.float64)  # |g| of the components that are not converged
-        solve_accept: wp.array(dtype=wp.float64)  # smallest accepted norm among them
-        component_sums: wp.array3d(dtype=wp.float64)  # [COMPONENT_ROWS, world, component], with several components
-        quiet: wp.array2d(dtype=wp.int32)  # [world, component] converged
-        reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
-        forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
-        predicted: wp.array(dtype=wp.int32)  # the first iterate is extrapolated
-        reused: wp.array(dtype=wp.int32)  # the operator is of an earlier iterate; 2: and led nowhere
-        min_J: wp.array(dtype=wp.float64)
-        domain_J: wp.array(dtype=wp.float64)  # smallest J of the laws that need J > 0
-        history: wp.array2d(dtype=wp.float64)  # [world, iteration] norm / scale
-        slot_sums: wp.array2d(dtype=wp.float64)  # gather.RESIDUAL_ROWS
-        elem_sums: wp.array2d(dtype=wp.float64)  # strain energy, viscous potential
-        slope_sum: wp.array2d(dtype=wp.float64)
-        follower_sum: wp.array2d(dtype=wp.float64)  # p.K p of the follower loads, 0 without
-        dq_dv: wp.array(dtype=wp.float64)
-        violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m; with constraints
-        term_sums: wp.array2d(dtype=wp.float64)  # [TERM_ROWS, world], with terms that have a potential of their own
-        limit: wp.array(dtype=wp.float64)  # largest step along the direction; with terms that limit it
-        stepped: wp.array(dtype=wp.int32)  # the trial was accepted
-        outer: wp.array(dtype=wp.int32)  # multiplier updates of this step
-        constraint_tol: wp.float64  # m
-        open: wp.array(dtype=wp.float64)  # largest violation over its tolerance; with constraints
-        slack: wp.float64  # norm of PCG over the norm that is judged, across constraints
-        classical: wp.int32  # multipliers change in an outer loop
-        force: wp.array(dtype=wp.float64)  # |g| over the free components, N
-        force_tol: wp.float64  # N; accepted without regard to the size of the forces; 0: never
-        first_forcing: wp.float64
-        fixed_forcing: wp.int32  # all solves go as far as the first, whatever Newton's method needs
-        tol: wp.float64
-        eps: wp.float64
-        rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
-        max_iterations: wp.int32
-        components: wp.int32
-        nonpotential: wp.int32
-
-    return NewtonControl
-
-
-@functools.cache
 def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     """Kernels of the Newton iteration in one precision of the vectors; scalars are float64.
 
     Of the traits "stored", "gated" and "limited" count.
     """
-    p = precision(dtype)
-    T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
     stored, gated, limited = traits.stored, traits.gated, traits.limited
@@ -388,81 +311,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if flags[world] != 0:
             wp.atomic_max(out, 0, 1)
 
-    @wp.kernel(module=module)
-    def component_partial(
-        start: wp.array(dtype=wp.int32),
-        slot: wp.array(dtype=wp.int32),
-        rows: wp.array3d(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        partial: wp.array4d(dtype=f64),
-    ):
-        """Strided partial sums of the residual's norms over the slots of a component."""
-        world, component, lane = wp.tid()
-        if active[world] == 0:
-            return
-        for row in range(COMPONENT_ROWS):
-            source = wp.where(row == 4, 8, row)
-            total = f64(0.0)
-            for k in range(start[component] + lane, start[component + 1], LANES):
-                total += rows[source, world, slot[k]]
-            partial[row, world, component, lane] = total
-
-    @wp.kernel(module=module)
-    def component_sum(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
-        """Sum of the lanes, in order."""
-        row, world, component = wp.tid()
-        if active[world] == 0:
-            return
-        total = f64(0.0)
-        for lane in range(LANES):
-            total += partial[row, world, component, lane]
-        out[row, world, component] = total
-
-    @wp.kernel(module=module)
-    def update_position(
-        q_tilde: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        u: wp.array2d(dtype=vec3),
-    ):
-        """q = q~ + (dq/dv) v."""
-        world, slot = wp.tid()
-        if active[world] != 0:
-            u[world, slot] = q_tilde[world, slot] + T(dq_dv[world]) * v[world, slot]
-
-    @wp.kernel(module=module)
-    def trial_velocity(
-        ctl: Control,
-        base: wp.array2d(dtype=vec3),
-        direction: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-    ):
-        """v = base + alpha p."""
-        world, slot = wp.tid()
-        if ctl.searching[world] != 0:
-            v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
-
-    @wp.kernel(module=module)
-    def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):
-        """target = source in the active worlds."""
-        world, slot = wp.tid()
-        if active[world] != 0:
-            target[world, slot] = source[world, slot]
-
-    @wp.kernel(module=module)
-    def dot_rows(
-        a: wp.array2d(dtype=vec3),
-        b: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        rows: wp.array3d(dtype=f64),
-    ):
-        """a.b per slot."""
-        world, slot = wp.tid()
-        if active[world] != 0:
-            rows[0, world, slot] = f64(wp.dot(a[world, slot], b[world, slot]))
-
+    vectors = vector_kernels(dtype, module)
     return _types.SimpleNamespace(
+        **vars(vectors),
         module=module,
         measure=measure,
         record=record,
@@ -473,10 +324,4 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         judge_trial=judge_trial,
         judge_outer=judge_outer,
         any_set=any_set,
-        component_partial=component_partial,
-        component_sum=component_sum,
-        update_position=update_position,
-        trial_velocity=trial_velocity,
-        copy_active=copy_active,
-        dot_rows=dot_rows,
     )

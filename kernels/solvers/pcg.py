@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.types import kernel_module, precision
-from .newton import control_struct
+from .control import control_struct
 
 __all__ = ["LANES", "groups_struct", "pcg_kernels", "pcg_struct"]
 

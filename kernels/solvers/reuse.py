@@ -13,7 +13,7 @@ import warp as wp
 
 from ..common.types import precision
 from .blocks import block_kernels
-from .newton import control_struct
+from .control import control_struct
 from .pcg import pcg_struct
 
 __all__ = ["reuse_kernels", "reuse_struct"]

@@ -11,8 +11,8 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from ..solvers.newton import control_struct
-from .step import step_struct
+from ..solvers.control import control_struct
+from .control import step_struct
 
 __all__ = ["PREDICTOR_ROWS", "predictor_kernels", "predictor_struct"]
 

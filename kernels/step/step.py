@@ -9,113 +9,14 @@ import types as _types
 
 import warp as wp
 
-from ..common.structs import balance_struct, topology_struct
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
-from ..solvers.newton import control_struct
+from ..solvers.control import control_struct
 from ..solvers.pcg import pcg_struct
+from .control import STATUS, step_struct
+from .ledger import ledger_kernels
 
-__all__ = [
-    "HELD_VISCOUS",
-    "LEDGER",
-    "LEDGER_ROWS",
-    "LOSS",
-    "NUMERICAL",
-    "REPORT",
-    "STATUS",
-    "STORED",
-    "WORK",
-    "booked_struct",
-    "step_kernels",
-    "step_struct",
-]
-
-STATUS = {"running": 0, "failed": 1, "frozen": 2}
-
-REPORT = (
-    "status",
-    "newton",
-    "pcg",
-    "residual",
-    "halvings",
-    "min_J",
-    "time",
-    "failure",
-    "attempt_time",
-    "violation",
-    "outer",
-    "residual_force",
-    "rough",
-)
-"""Columns of the report of a step, [world, column] in float64; probes follow."""
-
-LEDGER = (
-    "kinetic",
-    "strain",
-    "potential",
-    "work_loads",
-    "work_supports",
-    "work_fields",
-    "viscous",
-    "integrator",
-    "ledger_residual",
-    "unbalanced",
-)
-"""Columns of the energy ledger, J, accumulated since the start (the first three: current values); terms add theirs."""
-
-STORED, WORK, LOSS, NUMERICAL, HELD_VISCOUS = range(5)
-"""What a term books per substep: what it stores now; work done on the model; loss; a part of the integrator's; viscous
-loss of a force that counts among the dead loads."""
-
-LEDGER_ROWS = 10
-
-
-@functools.cache
-def step_struct():
-    """What the step loop knows of each world."""
-
-    @wp.struct
-    class StepControl:
-        status: wp.array(dtype=wp.int32)  # STATUS
-        running: wp.array(dtype=wp.int32)  # this step is not finished
-        level: wp.array(dtype=wp.int32)
-        part: wp.array(dtype=wp.int32)  # substeps of the level that are done
-        halvings: wp.array(dtype=wp.int32)
-        refused: wp.array(dtype=wp.int32)  # in this attempt
-        accepted: wp.array(dtype=wp.int32)
-        first_refusal: wp.array(dtype=wp.int32)
-        time: wp.array(dtype=wp.float64)  # s, state
-        new_time: wp.array(dtype=wp.float64)  # end of the attempt
-        step_start: wp.array(dtype=wp.float64)
-        h: wp.array(dtype=wp.float64)
-        previous_h: wp.array(dtype=wp.float64)  # state of multistep schemes; 0 before the first step
-        previous_end: wp.array(dtype=wp.float64)  # time that the step before ended at
-        dt: wp.array(dtype=wp.float64)
-        a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1}
-        a1: wp.array(dtype=wp.float64)
-        dq_dv: wp.array(dtype=wp.float64)  # beta h
-        mass_factor: wp.array(dtype=wp.float64)  # 1/(beta h), 0 in statics
-        ramp: wp.array(dtype=wp.float64)  # factor of constant loads
-        gravity: wp.array(dtype=wp.vec3d)
-        any_running: wp.array(dtype=wp.int32)
-        max_halvings: wp.int32
-        total_J: wp.array(dtype=wp.float64)
-        ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
-
-    return StepControl
-
-
-@functools.cache
-def booked_struct():
-    """What terms book of a substep."""
-
-    @wp.struct
-    class Booked:
-        kind: wp.array(dtype=wp.int32)  # [row] STORED, WORK, ...
-        column: wp.array(dtype=wp.int32)  # [row] of the ledger, -1: none
-        sums: wp.array2d(dtype=wp.float64)  # [row, world] J
-
-    return Booked
+__all__ = ["step_kernels"]
 
 
 @functools.cache
@@ -136,9 +37,7 @@ def step_kernels(
     f64 = wp.float64
     Step = step_struct()
     Newton = control_struct()
-    Topology, Balance = topology_struct(dtype), balance_struct(dtype)
     PCG = pcg_struct()
-    Booked = booked_struct()
     nonpotential, gated = traits.nonpotential, traits.gated
     variant = traits.suffix("nonpotential", "gated")
     module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}{variant}")
@@ -313,109 +212,6 @@ def step_kernels(
             v_n[world, slot] = v[world, slot]
 
     @wp.kernel(module=module)
-    def ledger_rows(
-        step: Step,
-        topo: Topology,
-        balance: Balance,
-        lumped: wp.array(dtype=T),
-        u_n: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-    ):
-        """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq,
-        nonpotential.dq, inertia.dq, gravity.u."""
-        world, slot = wp.tid()
-        if step.accepted[world] == 0:
-            return
-        Mv = vec3()
-        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            Mv += topo.mass_value[k] * balance.v[world, topo.mass_column[k]]
-        dq = balance.u[world, slot] - u_n[world, slot]
-        a = balance.inertia[world, slot]
-        dv = balance.v[world, slot] - v_n[world, slot]
-        f = topo.free[slot]
-        held = vec3(T(1.0) - f[0], T(1.0) - f[1], T(1.0) - f[2])
-        weight = lumped[slot] * vec3(step.gravity[world])
-        loads = balance.dead[world, slot]
-        balance.rows[0, world, slot] = f64(0.5) * step.dq_dv[world] * f64(wp.dot(dv, a))
-        balance.rows[1, world, slot] = f64(wp.dot(balance.internal[world, slot], dq))
-        balance.rows[2, world, slot] = f64(wp.dot(loads, dq))
-        balance.rows[3, world, slot] = f64(wp.dot(weight, dq))
-        balance.rows[4, world, slot] = f64(wp.dot(wp.cw_mul(balance.g[world, slot], held), dq))
-        balance.rows[5, world, slot] = f64(0.5) * f64(wp.dot(balance.v[world, slot], Mv))
-        balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(balance.g[world, slot], f), dq))
-        balance.rows[7, world, slot] = f64(0.0)
-        if wp.static(nonpotential):
-            balance.rows[7, world, slot] = f64(wp.dot(balance.nonpotential[world, slot], dq))
-        balance.rows[8, world, slot] = f64(wp.dot(a, dq))
-        balance.rows[9, world, slot] = f64(wp.dot(weight, balance.u[world, slot]))
-
-    @wp.kernel(module=module)
-    def ledger_update(
-        step: Step,
-        newton: Newton,
-        sums: wp.array2d(dtype=f64),
-        booked: Booked,
-        ledger: wp.array2d(dtype=f64),
-    ):
-        """Add a substep to the ledger; the integrator's part from its own formula, never as the remainder.
-
-        The force of a term does the work f.dq on a substep. What it stores and loses of that is booked; the rest is the
-        integrator's.
-        """
-        world = wp.tid()
-        if step.accepted[world] == 0:
-            return
-        kinetic = sums[5, world]
-        strain = newton.elem_sums[0, world]
-        change_K = kinetic - ledger[world, 0]
-        change_W = strain - ledger[world, 1]
-        implicit = f64(2.0) * newton.elem_sums[1, world] * (step.h[world] / step.dq_dv[world])
-        held = f64(0.0)
-        for k in range(booked.kind.shape[0]):
-            if booked.kind[k] == HELD_VISCOUS:
-                held += booked.sums[k, world]
-        viscous = implicit + held
-        loads = sums[2, world] + held - sums[3, world]
-        numerical = sums[1, world] - change_W - implicit
-        if wp.static(multistep):
-            numerical += sums[8, world] - change_K
-        else:
-            numerical += sums[0, world]
-        work = f64(0.0)
-        stored = f64(0.0)
-        lost = f64(0.0)
-        for k in range(booked.kind.shape[0]):
-            amount = booked.sums[k, world]
-            column = booked.column[k]
-            if booked.kind[k] == STORED:
-                change = amount - ledger[world, column]
-                stored += change
-                numerical -= change
-                ledger[world, column] = amount
-            elif booked.kind[k] == WORK:
-                work += amount
-                ledger[world, column] = ledger[world, column] + amount
-            elif booked.kind[k] == LOSS:
-                lost += amount
-                numerical -= amount
-                ledger[world, column] = ledger[world, column] + amount
-            elif booked.kind[k] == NUMERICAL:
-                numerical += amount
-        step.ledger_time[world] = step.time[world]
-        ledger[world, 0] = kinetic
-        ledger[world, 1] = strain
-        ledger[world, 2] = -sums[9, world]
-        ledger[world, 3] = ledger[world, 3] + loads
-        ledger[world, 4] = ledger[world, 4] + sums[4, world]
-        ledger[world, 5] = ledger[world, 5] + sums[7, world]
-        ledger[world, 6] = ledger[world, 6] + viscous
-        ledger[world, 7] = ledger[world, 7] + numerical
-        balance = change_K + change_W - sums[3, world] + viscous + numerical + stored + lost
-        balance -= loads + sums[4, world] + sums[7, world] + work
-        ledger[world, 8] = ledger[world, 8] + balance
-        ledger[world, 9] = ledger[world, 9] + sums[6, world]
-
-    @wp.kernel(module=module)
     def write_report(step: Step, newton: Newton, pcg: PCG, report: wp.array2d(dtype=f64)):
         """The one array that the host reads after a step; columns as `REPORT`."""
         world = wp.tid()
@@ -469,8 +265,7 @@ def step_kernels(
         end_attempt=end_attempt,
         failed_now=failed_now,
         commit=commit,
-        ledger_rows=ledger_rows,
-        ledger_update=ledger_update,
+        **vars(ledger_kernels(dtype, multistep, nonpotential, module)),
         write_report=write_report,
         probe_values=probe_values,
     )

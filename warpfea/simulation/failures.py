@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ConstraintError, ConvergenceError
-from ..kernels.solvers.newton import (
+from ..kernels.solvers.control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
     FAIL_GROWTH,

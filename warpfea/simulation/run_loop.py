@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from ..kernels.step.step import STATUS
+from ..kernels.step.control import STATUS
 
 __all__ = ["interruptible", "run_steps", "step_bar"]
 

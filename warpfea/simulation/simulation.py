@@ -13,7 +13,7 @@ from .. import solvers
 from ..base.console import compile_bar, quiet_warp
 from ..base.errors import ConstraintError, ConvergenceError, ModelError
 from ..base.names import did_you_mean, listing
-from ..kernels.step.step import REPORT, STATUS
+from ..kernels.step.control import REPORT, STATUS
 from ..kernels.terms.constraints import JOINT_COLUMNS
 from ..model.assembly import require_density
 from ..model.handles import NodeSet

@@ -13,7 +13,9 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
-from ..kernels.step.step import LEDGER_ROWS, REPORT, step_kernels
+from ..kernels.step.control import REPORT
+from ..kernels.step.ledger import LEDGER_ROWS
+from ..kernels.step.step import step_kernels
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_loop
 from ..terms.term import At, Term

@@ -10,7 +10,8 @@ import warp as wp
 from ..base.launch import labelled
 from ..kernels.common.reduce import CHUNK, reduce_kernels
 from ..kernels.common.structs import additions_struct
-from ..kernels.solvers.newton import COMPONENT_ROWS, LANES, TERM_ROWS, newton_kernels
+from ..kernels.solvers.control import COMPONENT_ROWS, LANES, TERM_ROWS
+from ..kernels.solvers.newton import newton_kernels
 from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements

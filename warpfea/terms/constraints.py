@@ -18,8 +18,8 @@ import warp as wp
 
 from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
+from ..kernels.solvers.control import TERM_ROWS
 from ..kernels.solvers.deflation import deflation_kernels
-from ..kernels.solvers.newton import TERM_ROWS
 from ..kernels.solvers.reuse import reuse_kernels
 from ..kernels.terms.constraint_blocks import constraint_block_kernels
 from ..kernels.terms.constraints import JOINT_COLUMNS, multiplier_struct

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.common.traits import Traits
-from ..kernels.step.step import HELD_VISCOUS, LOSS, NUMERICAL, STORED, WORK
+from ..kernels.step.ledger import HELD_VISCOUS, LOSS, NUMERICAL, STORED, WORK
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher

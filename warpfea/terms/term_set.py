@@ -11,7 +11,8 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import PARTS
 from ..kernels.common.traits import Traits
-from ..kernels.step.step import LEDGER, REPORT, booked_struct
+from ..kernels.step.control import REPORT
+from ..kernels.step.ledger import LEDGER, booked_struct
 from ..model import assembly
 from .body_forces import BodyForces
 from .constraints import Constraints

@@ -11,11 +11,12 @@ from ..base.errors import ModelError
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
-from ..kernels.solvers.newton import COMPONENT_ROWS, LANES, TERM_ROWS, control_struct
+from ..kernels.solvers.control import COMPONENT_ROWS, LANES, TERM_ROWS, control_struct
 from ..kernels.solvers.pcg import LANES as GROUP_LANES
 from ..kernels.solvers.pcg import pcg_struct
+from ..kernels.step.control import step_struct
 from ..kernels.step.gather import RESIDUAL_ROWS
-from ..kernels.step.step import LEDGER_ROWS, step_struct
+from ..kernels.step.ledger import LEDGER_ROWS
 from ..kernels.terms.constraints import multiplier_struct
 
 if TYPE_CHECKING:

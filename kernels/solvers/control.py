@@ -1,0 +1,92 @@
+"""What Newton's method knows of each world, and why it may fail."""
+
+import functools
+
+import warp as wp
+
+__all__ = [
+    "COMPONENT_ROWS",
+    "FAIL_CONSTRAINT",
+    "FAIL_CURVATURE",
+    "FAIL_GROWTH",
+    "FAIL_ITERATIONS",
+    "FAIL_JACOBIAN",
+    "FAIL_LINE_SEARCH",
+    "FAIL_NAN",
+    "LANES",
+    "TERM_ROWS",
+    "control_struct",
+]
+
+FAIL_ITERATIONS = 1
+FAIL_LINE_SEARCH = 2
+FAIL_JACOBIAN = 3
+FAIL_NAN = 4
+FAIL_CURVATURE = 5
+FAIL_CONSTRAINT = 6
+FAIL_GROWTH = 7
+
+COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
+LANES = 32
+TERM_ROWS = 3
+"""Rows summed per world of what terms store: the potential with what is held in a line search (multipliers, caps), the
+potential with what they would hold next, and its magnitude."""
+
+
+@functools.cache
+def control_struct():
+    """What Newton's method knows of each world."""
+
+    @wp.struct
+    class NewtonControl:
+        active: wp.array(dtype=wp.int32)  # iterating
+        searching: wp.array(dtype=wp.int32)  # in a line search
+        failed: wp.array(dtype=wp.int32)  # 0 or a FAIL_ code
+        iterations: wp.array(dtype=wp.int32)  # of this attempt
+        searches: wp.array(dtype=wp.int32)
+        total_iterations: wp.array(dtype=wp.int32)  # of this step
+        alpha: wp.array(dtype=wp.float64)
+        phi: wp.array(dtype=wp.float64)
+        phi_magnitude: wp.array(dtype=wp.float64)
+        slope: wp.array(dtype=wp.float64)  # g.p at the iterate
+        norm: wp.array(dtype=wp.float64)  # |g| in the D^-1 norm
+        relative: wp.array(dtype=wp.float64)  # |g| over the largest force, of the worst component
+        excess: wp.array(dtype=wp.float64)  # largest norm over accepted norm of the components
+        floor_excess: wp.array(dtype=wp.float64)  # the same over what rounding of positions alone may cause
+        solve_norm: wp.array(dtype=wp.float64)  # |g| of the components that are not converged
+        solve_accept: wp.array(dtype=wp.float64)  # smallest accepted norm among them
+        component_sums: wp.array3d(dtype=wp.float64)  # [COMPONENT_ROWS, world, component], with several components
+        quiet: wp.array2d(dtype=wp.int32)  # [world, component] converged
+        reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
+        forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
+        predicted: wp.array(dtype=wp.int32)  # the first iterate is extrapolated
+        reused: wp.array(dtype=wp.int32)  # the operator is of an earlier iterate; 2: and led nowhere
+        min_J: wp.array(dtype=wp.float64)
+        domain_J: wp.array(dtype=wp.float64)  # smallest J of the laws that need J > 0
+        history: wp.array2d(dtype=wp.float64)  # [world, iteration] norm / scale
+        slot_sums: wp.array2d(dtype=wp.float64)  # gather.RESIDUAL_ROWS
+        elem_sums: wp.array2d(dtype=wp.float64)  # strain energy, viscous potential
+        slope_sum: wp.array2d(dtype=wp.float64)
+        follower_sum: wp.array2d(dtype=wp.float64)  # p.K p of the follower loads, 0 without
+        dq_dv: wp.array(dtype=wp.float64)
+        violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m; with constraints
+        term_sums: wp.array2d(dtype=wp.float64)  # [TERM_ROWS, world], with terms that have a potential of their own
+        limit: wp.array(dtype=wp.float64)  # largest step along the direction; with terms that limit it
+        stepped: wp.array(dtype=wp.int32)  # the trial was accepted
+        outer: wp.array(dtype=wp.int32)  # multiplier updates of this step
+        constraint_tol: wp.float64  # m
+        open: wp.array(dtype=wp.float64)  # largest violation over its tolerance; with constraints
+        slack: wp.float64  # norm of PCG over the norm that is judged, across constraints
+        classical: wp.int32  # multipliers change in an outer loop
+        force: wp.array(dtype=wp.float64)  # |g| over the free components, N
+        force_tol: wp.float64  # N; accepted without regard to the size of the forces; 0: never
+        first_forcing: wp.float64
+        fixed_forcing: wp.int32  # all solves go as far as the first, whatever Newton's method needs
+        tol: wp.float64
+        eps: wp.float64
+        rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
+        max_iterations: wp.int32
+        components: wp.int32
+        nonpotential: wp.int32
+
+    return NewtonControl

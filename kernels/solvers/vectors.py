@@ -1,0 +1,103 @@
+"""Kernels of Newton's method on vectors [world, slot]: iterates, dot products, sums over components."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import precision
+from .control import COMPONENT_ROWS, LANES, control_struct
+
+__all__ = ["vector_kernels"]
+
+
+@functools.cache
+def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
+    """Kernels in a module of Newton's method, in one precision of the vectors."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Control = control_struct()
+
+    @wp.kernel(module=module)
+    def component_partial(
+        start: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        rows: wp.array3d(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        partial: wp.array4d(dtype=f64),
+    ):
+        """Strided partial sums of the residual's norms over the slots of a component."""
+        world, component, lane = wp.tid()
+        if active[world] == 0:
+            return
+        for row in range(COMPONENT_ROWS):
+            source = wp.where(row == 4, 8, row)
+            total = f64(0.0)
+            for k in range(start[component] + lane, start[component + 1], LANES):
+                total += rows[source, world, slot[k]]
+            partial[row, world, component, lane] = total
+
+    @wp.kernel(module=module)
+    def component_sum(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
+        """Sum of the lanes, in order."""
+        row, world, component = wp.tid()
+        if active[world] == 0:
+            return
+        total = f64(0.0)
+        for lane in range(LANES):
+            total += partial[row, world, component, lane]
+        out[row, world, component] = total
+
+    @wp.kernel(module=module)
+    def update_position(
+        q_tilde: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        dq_dv: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        u: wp.array2d(dtype=vec3),
+    ):
+        """q = q~ + (dq/dv) v."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            u[world, slot] = q_tilde[world, slot] + T(dq_dv[world]) * v[world, slot]
+
+    @wp.kernel(module=module)
+    def trial_velocity(
+        ctl: Control,
+        base: wp.array2d(dtype=vec3),
+        direction: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+    ):
+        """v = base + alpha p."""
+        world, slot = wp.tid()
+        if ctl.searching[world] != 0:
+            v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
+
+    @wp.kernel(module=module)
+    def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):
+        """target = source in the active worlds."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            target[world, slot] = source[world, slot]
+
+    @wp.kernel(module=module)
+    def dot_rows(
+        a: wp.array2d(dtype=vec3),
+        b: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """a.b per slot."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            rows[0, world, slot] = f64(wp.dot(a[world, slot], b[world, slot]))
+
+    return _types.SimpleNamespace(
+        component_partial=component_partial,
+        component_sum=component_sum,
+        update_position=update_position,
+        trial_velocity=trial_velocity,
+        copy_active=copy_active,
+        dot_rows=dot_rows,
+    )

@@ -1,0 +1,61 @@
+"""What the step loop knows of each world, and what it reports."""
+
+import functools
+
+import warp as wp
+
+__all__ = ["REPORT", "STATUS", "step_struct"]
+
+STATUS = {"running": 0, "failed": 1, "frozen": 2}
+
+REPORT = (
+    "status",
+    "newton",
+    "pcg",
+    "residual",
+    "halvings",
+    "min_J",
+    "time",
+    "failure",
+    "attempt_time",
+    "violation",
+    "outer",
+    "residual_force",
+    "rough",
+)
+"""Columns of the report of a step, [world, column] in float64; probes follow."""
+
+
+@functools.cache
+def step_struct():
+    """What the step loop knows of each world."""
+
+    @wp.struct
+    class StepControl:
+        status: wp.array(dtype=wp.int32)  # STATUS
+        running: wp.array(dtype=wp.int32)  # this step is not finished
+        level: wp.array(dtype=wp.int32)
+        part: wp.array(dtype=wp.int32)  # substeps of the level that are done
+        halvings: wp.array(dtype=wp.int32)
+        refused: wp.array(dtype=wp.int32)  # in this attempt
+        accepted: wp.array(dtype=wp.int32)
+        first_refusal: wp.array(dtype=wp.int32)
+        time: wp.array(dtype=wp.float64)  # s, state
+        new_time: wp.array(dtype=wp.float64)  # end of the attempt
+        step_start: wp.array(dtype=wp.float64)
+        h: wp.array(dtype=wp.float64)
+        previous_h: wp.array(dtype=wp.float64)  # state of multistep schemes; 0 before the first step
+        previous_end: wp.array(dtype=wp.float64)  # time that the step before ended at
+        dt: wp.array(dtype=wp.float64)
+        a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1}
+        a1: wp.array(dtype=wp.float64)
+        dq_dv: wp.array(dtype=wp.float64)  # beta h
+        mass_factor: wp.array(dtype=wp.float64)  # 1/(beta h), 0 in statics
+        ramp: wp.array(dtype=wp.float64)  # factor of constant loads
+        gravity: wp.array(dtype=wp.vec3d)
+        any_running: wp.array(dtype=wp.int32)
+        max_halvings: wp.int32
+        total_J: wp.array(dtype=wp.float64)
+        ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
+
+    return StepControl
