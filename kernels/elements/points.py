@@ -32,7 +32,6 @@ def block_struct(dtype: str):
         shape: wp.array3d(dtype=T)  # [point, local, elem or 0] s_i at the points of the mass rule (field loads)
         field_weight: wp.array2d(dtype=T)  # [point, elem] rho w at those points
         J0_inv: wp.array2d(dtype=T)  # [3 row + column, elem], affine only
-        vertex_J0_inv: wp.array2d(dtype=mat33)
         weight: wp.array2d(dtype=T)  # [point, elem] W det J0; affine: [point, 0] W
         det_J0: wp.array(dtype=T)  # [elem], affine only
         mass: wp.array2d(dtype=T)  # [local, local] int s_i s_j over the parent; affine only

@@ -16,7 +16,6 @@ __all__ = [
     "conical_tet",
     "conical_triangle",
     "square_rule",
-    "tet_rule",
     "triangle_6",
 ]
 
@@ -102,11 +101,6 @@ TET_RULES: dict[str, Rule] = {
     "tet8": _tet8(),
     "tet14": _tet14(),
 }
-
-
-def tet_rule(name: str) -> Rule:
-    """The tetrahedron rule `name` of TET_RULES. Raises KeyError."""
-    return TET_RULES[name]
 
 
 def _gauss(n: int, alpha: int) -> tuple[np.ndarray, np.ndarray]:
