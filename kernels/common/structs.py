@@ -63,7 +63,7 @@ def balance_struct(dtype: str):
         internal: wp.array2d(dtype=vec3)
         g: wp.array2d(dtype=vec3)  # the residual
         gradient: wp.array2d(dtype=vec3)  # of the augmented potential: what the Newton step is solved for
-        pool: wp.array2d(dtype=vec3)  # [world, entry] forces of pooled terms
+        pool_force: wp.array2d(dtype=vec3)  # [world, entry] forces of pooled terms
         rows: wp.array3d(dtype=wp.float64)  # [row, world, slot] to be summed
         mass_factor: wp.array(dtype=wp.float64)  # [world]
         dq_dv: wp.array(dtype=wp.float64)
@@ -73,12 +73,12 @@ def balance_struct(dtype: str):
 
 @functools.cache
 def additions_struct(dtype: str):
-    """What a product needs besides the elements' part: factors, tangents of follower loads and of pooled terms."""
+    """What a product needs besides the elements' part: factors, and tangents of the terms."""
     vec3 = precision(dtype).vec3
 
     @wp.struct
     class Additions:
-        start: wp.array(dtype=wp.int32)  # of follower loads: [slot + 1]
+        start: wp.array(dtype=wp.int32)  # of forces without a potential: [slot + 1]
         entry: wp.array(dtype=wp.int32)  # indices into their contributions
         contribution: wp.array2d(dtype=vec3)
         pool_start: wp.array(dtype=wp.int32)  # as of Topology; with pooled terms

@@ -11,6 +11,7 @@ __all__ = [
     "FAIL_GROWTH",
     "FAIL_ITERATIONS",
     "FAIL_JACOBIAN",
+    "FAIL_LIMIT",
     "FAIL_LINE_SEARCH",
     "FAIL_NAN",
     "LANES",
@@ -25,6 +26,7 @@ FAIL_NAN = 4
 FAIL_CURVATURE = 5
 FAIL_CONSTRAINT = 6
 FAIL_GROWTH = 7
+FAIL_LIMIT = 8
 
 COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
 LANES = 32
@@ -67,7 +69,7 @@ def control_struct():
         slot_sums: wp.array2d(dtype=wp.float64)  # gather.RESIDUAL_ROWS
         elem_sums: wp.array2d(dtype=wp.float64)  # strain energy, viscous potential
         slope_sum: wp.array2d(dtype=wp.float64)
-        follower_sum: wp.array2d(dtype=wp.float64)  # p.K p of the follower loads, 0 without
+        tangent_sum: wp.array2d(dtype=wp.float64)  # p.K p of the forces without a potential, 0 without
         dq_dv: wp.array(dtype=wp.float64)
         violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m; with constraints
         term_sums: wp.array2d(dtype=wp.float64)  # [TERM_ROWS, world], with terms that have a potential of their own

@@ -11,7 +11,7 @@ import warp as wp
 
 from ..common.traits import Traits
 from ..common.types import kernel_module, precision
-from .control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_NAN, control_struct
+from .control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_NAN, control_struct
 from .newton import newton_kernels
 from .pcg import pcg_struct
 
@@ -61,12 +61,20 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         """End a world's iterations where it has converged or failed, or where they are used up."""
         record(ctl, world)
         finite = wp.isfinite(ctl.norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
+        if wp.static(traits.stored):
+            finite = finite and wp.isfinite(ctl.term_sums[0, world])
+        barred = False
+        if wp.static(traits.limited):
+            barred = ctl.iterations[world] > 0 and not ctl.limit[world] > f64(0.0)
         if ctl.domain_J[world] <= f64(0.0):
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_JACOBIAN
         elif not finite:
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_NAN
+        elif barred:
+            ctl.active[world] = 0
+            ctl.failed[world] = FAIL_LIMIT
         elif ctl.excess[world] <= f64(1.0):
             ctl.active[world] = 0
         elif ctl.iterations[world] >= ctl.max_iterations:
@@ -293,9 +301,12 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.kernel(module=module)
     def advance(ctl: Newton, move: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3)):
-        """v += p."""
+        """v += p, shortened where a term limits it."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
+            if wp.static(traits.limited):
+                share = wp.clamp(ctl.limit[world], f64(0.0), f64(1.0))
+                move[world, slot] = T(share) * move[world, slot]
             v[world, slot] = v[world, slot] + move[world, slot]
 
     @wp.kernel(module=module)

@@ -12,6 +12,7 @@ from .control import (
     FAIL_CURVATURE,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
+    FAIL_LIMIT,
     FAIL_LINE_SEARCH,
     FAIL_NAN,
     control_struct,
@@ -216,8 +217,13 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if wp.static(gated):
             if ctl.classical == 0:
                 ctl.outer[world] = ctl.outer[world] + 1
+        barred = False
+        if wp.static(limited):
+            barred = not ctl.limit[world] > f64(0.0)
         if not wp.isfinite(slope):
             fail(ctl, world, FAIL_NAN)
+        elif barred:
+            fail(ctl, world, FAIL_LIMIT)
         elif slope >= f64(0.0):
             if ctl.reused[world] != 0:
                 ctl.alpha[world] = f64(0.0)
@@ -232,8 +238,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return
         alpha = ctl.alpha[world]
         old_norm = ctl.norm[world]
-        # follower loads are held in the search with their symmetric tangent: Phi is then as curved as H says
-        bend = ctl.dq_dv[world] * ctl.follower_sum[0, world]
+        # forces held in the search are held with their symmetric tangent: Phi is then as curved as H says
+        bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
         phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
         norm = wp.sqrt(ctl.slot_sums[0, world])
         change = phi - ctl.phi[world]
@@ -251,7 +257,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if ctl.reused[world] != 0 and ctl.iterations[world] == 0 and not norm <= f64(0.5) * old_norm:
             good = False  # a step must not begin worse than with an operator of its own
             ctl.searches[world] = REUSED_SEARCH
-        stands = alpha == f64(0.0)
+        stands = alpha == f64(0.0) and ctl.reused[world] != 0
         if good or stands:
             ctl.searching[world] = 0
             measure(ctl, world)

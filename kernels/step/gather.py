@@ -118,9 +118,12 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if active[world] == 0:
             return
         f = gathered(topo, contribution, world, slot)
+        own = f
         if wp.static(pooled):
+            pushed = vec3()
             for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
-                f += balance.pool[world, topo.pool_entry[k]]
+                pushed += balance.pool_force[world, topo.pool_entry[k]]
+            f += pushed
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             j = topo.mass_column[k]
@@ -144,6 +147,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             descent += vec3(tie[2])
             for k in range(3):
                 magnitude[k] = magnitude[k] + T(wp.abs(tie[0][k]))
+        if wp.static(pooled):  # what a body is squeezed between cancels its own forces: each alone is a scale
+            for k in range(3):
+                magnitude[k] = magnitude[k] + wp.abs(pushed[k])
         balance.inertia[world, slot] = a
         balance.internal[world, slot] = f
         balance.g[world, slot] = residual_force
@@ -154,8 +160,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         work = wp.dot(held, vs)
         balance.rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
         # a held, stressed body without loads has no other force than its reactions: a small part of them is its scale
-        reaction = f - wp.cw_mul(f, free)
-        balance.rows[1, world, slot] = weighted(wp.cw_mul(f, free), D) + REACTION * weighted(reaction, D)
+        reaction = own - wp.cw_mul(own, free)
+        balance.rows[1, world, slot] = weighted(wp.cw_mul(own, free), D) + REACTION * weighted(reaction, D)
         balance.rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
         balance.rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
         balance.rows[4, world, slot] = f64(kinetic - work)

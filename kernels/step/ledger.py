@@ -50,6 +50,7 @@ def booked_struct():
     @wp.struct
     class Booked:
         kind: wp.array(dtype=wp.int32)  # [row] STORED, WORK, ...
+        nonpotential: wp.array(dtype=wp.int32)  # [row] 1: of a force whose work is among that of fields
         column: wp.array(dtype=wp.int32)  # [row] of the ledger, -1: none
         sums: wp.array2d(dtype=wp.float64)  # [row, world] J
 
@@ -115,7 +116,7 @@ def ledger_kernels(dtype: str, multistep: bool, nonpotential: bool, module: wp.M
         """Add a substep to the ledger; the integrator's part from its own formula, never as the remainder.
 
         The force of a term does the work f.dq on a substep. What it stores and loses of that is booked; the rest is the
-        integrator's.
+        integrator's, and of a force without a potential the work of fields.
         """
         world = wp.tid()
         if step.accepted[world] == 0:
@@ -137,6 +138,7 @@ def ledger_kernels(dtype: str, multistep: bool, nonpotential: bool, module: wp.M
         else:
             numerical += sums[0, world]
         work = f64(0.0)
+        fields = sums[7, world]
         stored = f64(0.0)
         lost = f64(0.0)
         for k in range(booked.kind.shape[0]):
@@ -145,14 +147,22 @@ def ledger_kernels(dtype: str, multistep: bool, nonpotential: bool, module: wp.M
             if booked.kind[k] == STORED:
                 change = amount - ledger[world, column]
                 stored += change
-                numerical -= change
+                if booked.nonpotential[k] != 0:
+                    fields += change
+                else:
+                    numerical -= change
                 ledger[world, column] = amount
             elif booked.kind[k] == WORK:
                 work += amount
+                if booked.nonpotential[k] != 0:
+                    fields -= amount
                 ledger[world, column] = ledger[world, column] + amount
             elif booked.kind[k] == LOSS:
                 lost += amount
-                numerical -= amount
+                if booked.nonpotential[k] != 0:
+                    fields += amount
+                else:
+                    numerical -= amount
                 ledger[world, column] = ledger[world, column] + amount
             elif booked.kind[k] == NUMERICAL:
                 numerical += amount
@@ -162,11 +172,11 @@ def ledger_kernels(dtype: str, multistep: bool, nonpotential: bool, module: wp.M
         ledger[world, 2] = -sums[9, world]
         ledger[world, 3] = ledger[world, 3] + loads
         ledger[world, 4] = ledger[world, 4] + sums[4, world]
-        ledger[world, 5] = ledger[world, 5] + sums[7, world]
+        ledger[world, 5] = ledger[world, 5] + fields
         ledger[world, 6] = ledger[world, 6] + viscous
         ledger[world, 7] = ledger[world, 7] + numerical
         balance = change_K + change_W - sums[3, world] + viscous + numerical + stored + lost
-        balance -= loads + sums[4, world] + sums[7, world] + work
+        balance -= loads + sums[4, world] + fields + work
         ledger[world, 8] = ledger[world, 8] + balance
         ledger[world, 9] = ledger[world, 9] + sums[6, world]
 

@@ -22,7 +22,6 @@ __all__ = [
     "DISTANCE",
     "DOT",
     "JOINT_COLUMNS",
-    "SUM_ROWS",
     "TURN",
     "constraint_functions",
     "constraint_kernels",
@@ -38,7 +37,6 @@ JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
 MOST_TURN = 1.0
 """rad that a driven angle may change by in a substep: from further off, a body may be crushed instead of turned."""
-SUM_ROWS = 3
 """Rows summed per world with an evaluation: the augmented potential with the multipliers held, with the new ones, and
 its magnitude."""
 
@@ -100,7 +98,7 @@ def multiplier_struct():
         excess: wp.array2d(dtype=wp.float64)  # rho c
         stiffness: wp.array2d(dtype=wp.float64)  # rho, N/m
         product: wp.array2d(dtype=wp.vec3d)  # [world, term] contributions to H p
-        rows: wp.array3d(dtype=wp.float64)  # [SUM_ROWS, world, row]
+        rows: wp.array3d(dtype=wp.float64)  # [TERM_ROWS, world, row]
         violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m
         block: wp.array2d(dtype=wp.mat33d)  # [world, block] sum w w D^-1
         matrix: wp.array2d(dtype=wp.float64)  # [world, entry] (1 / (dq/dv rho) + J D^-1 J^T)^-1

@@ -11,6 +11,7 @@ import warp as wp
 
 from ..kernels.common.lanes import WARP
 from .console import quiet_warp
+from .errors import ModelError
 
 __all__ = ["PARTS", "Launcher", "Recorder", "kernel_name", "labelled"]
 
@@ -81,7 +82,8 @@ class Launcher:
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
         """Launches within belong to part `name`; the innermost counts."""
-        assert name in self.parts, name
+        if name not in self.parts:
+            raise ModelError(f"part {name!r} is unknown; there are {', '.join(self.parts)}, and `parts` of terms")
         outer, self.label = self.label, name
         try:
             yield

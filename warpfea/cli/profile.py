@@ -14,7 +14,6 @@ from ..base.writer import write_whole
 from ..simulation.simulation import Simulation
 from ..studies.profile.profiling import WARM_UP, KernelTime, Profile
 from ..studies.profile.profiling import profile as measure
-from ..terms.term_set import all_parts
 from . import DONE
 from .run import check_targets
 from .source import Source, progress, resolve
@@ -154,7 +153,7 @@ def _human(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
         ["copy", f"{number(c['copy_GBps'], 3)} GB/s, read and written, for a large array"],
     ]
     parts = [["part", *HEADER, ""]]
-    parts += [[name, *_cells(k, found), all_parts().get(name, "")] for name, k in found.parts.items()]
+    parts += [[name, *_cells(k, found), found.about.get(name, "")] for name, k in found.parts.items()]
     gap, share = found.between_ms, 100.0 * found.between_ms / found.total_ms
     cells = [number(gap, 3), f"{share:.1f} %"] if gap > 0.0 else ["-", "-"]
     parts.append(["between", *cells, "", "", "", "", BETWEEN])

@@ -54,6 +54,7 @@ class State:
         self.specs: dict[str, ArraySpec] = {}
         self._arrays: dict[str, wp.array] = {}
         self.sealed = False
+        self.asked: list[str] = []  # names in the order of `register`
 
     def __getattr__(self, name: str) -> wp.array:
         arrays = self.__dict__.get("_arrays", {})
@@ -68,6 +69,7 @@ class State:
             ModelError: the name is taken by an array of another kind, or rows are no multiple of 4 bytes.
         """
         spec = ArraySpec(name, dtype, tuple(shape), initial)
+        self.asked.append(name)
         if name in self.specs:
             old = self.specs[name]
             if (old.dtype, old.shape) != (spec.dtype, spec.shape):

@@ -87,14 +87,21 @@ def check_static_supports(model: Any) -> None:
         modes /= np.linalg.norm(modes, axis=1)[:, None]
         held = modes[:, (model.free_host[slots] == 0.0).ravel()]
         columns = (3 * slots[:, None] + np.arange(3)).ravel()
-        for rows in (found for term in model.terms if (found := term.restraints(state, label)) is not None):
+        for term in model.terms:
+            rows = term.restraints(state, label)
+            if rows is None:
+                continue
+            if rows.shape[1:] != (3 * model.slots,):
+                raise ModelError(
+                    f"term {term.name!r}: restraints gave {rows.shape}; expected (rows, {3 * model.slots}), CSR"
+                )
             held = np.hstack([held, (rows[:, columns] @ modes.T).T / model.size])
         values = np.linalg.svd(held, compute_uv=False) if held.size else np.zeros(0)
         free = len(modes) - int(np.sum(values > 1e-9))
         if free:
             body = next(b for b in model.bodies if b.slot_offset <= slots[0] < b.slot_offset + b.slot_count)
             raise ModelError(
-                f"body {body.name!r} is not supported: supports and joints leave {free} rigid "
+                f"body {body.name!r} is not supported: supports, joints and terms leave {free} rigid "
                 f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "
                 "not counted): clamp or drive more nodes, or let a damped dynamic run come to rest"
             )

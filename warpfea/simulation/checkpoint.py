@@ -125,6 +125,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     try:
         sim.state.load(state)
         sim.stepper.forget()
+        sim.stepper.start_terms()
     except CheckpointError as error:
         raise CheckpointError(f"{file}: {error}") from None
     sim.totals = {name: np.array(a) for name, a in totals.items()}

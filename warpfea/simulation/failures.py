@@ -13,6 +13,7 @@ from ..kernels.solvers.control import (
     FAIL_GROWTH,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
+    FAIL_LIMIT,
     FAIL_LINE_SEARCH,
     FAIL_NAN,
 )
@@ -30,6 +31,7 @@ REASONS = {
     FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
     FAIL_NAN: "a force or energy was not finite",
     FAIL_CURVATURE: "no descent direction was found",
+    FAIL_LIMIT: "a term allowed no step along Newton's direction",
     FAIL_GROWTH: "the residual grew more than tenfold",
 }
 OPEN = 1e-4

@@ -96,7 +96,11 @@ class Results:
             return np.linalg.norm(self.displacements(body), axis=2)
         if name != "von_mises":
             term, _ = self.model.terms.fields[name]
-            return term.sample(name, body, self.state)
+            values = np.asarray(term.sample(name, body, self.state))
+            expected = (self.model.worlds, len(body.mesh.points))
+            if values.shape != expected:
+                raise ModelError(f"term {term.name!r}: sample({name!r}) gave {values.shape}; expected {expected}")
+            return values
         samples = von_mises(self._stress(name, body))
         return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
 

@@ -296,7 +296,7 @@ class Simulation(Results):
         self.state.load(values)
         self.stepper.forget(mask)
         self._stepped[mask] = False
-        self.stepper.start_terms()
+        self.stepper.start_terms(mask)
         if self.model.constraints:
             check_closed(self, mask)
         if self.stepper.ledger:

@@ -18,6 +18,7 @@ from ..kernels.step.ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_loop
+from ..terms.checks import check_measured
 from ..terms.term import At, Term
 from ..terms.workspace import Workspace
 from .integrators import Integrator
@@ -72,9 +73,7 @@ class Stepper:
         self.v_before = state.previous_velocity if integrator.multistep else state.velocity
         self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger)
         self.at = At(model, self.work, self.launch, state, self.u_before, inertia=not integrator.static)
-        for term in self.terms:
-            term.register(self.at)
-            term.allocate(self.work, self.at)
+        self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol)
         self.newton.register(state)
         self.predictor: Predictor | None = None
@@ -110,13 +109,14 @@ class Stepper:
             w.step.ledger_time = state.ledger_time
             self.booked = self.terms.booked(w)
 
-    def start_terms(self) -> None:
-        """The state was set: the terms follow it."""
+    def start_terms(self, mask: np.ndarray | None = None) -> None:
+        """The state of the chosen worlds was set: the terms follow it."""
         following = [term for term in self.terms if type(term).start is not Term.start]
         if not following:
             return
         m, w, state = self.model, self.work, self.state
-        active = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
+        flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
+        active = wp.array(flags, dtype=wp.int32, device=m.device)
         w.step.new_time.assign(state.time)
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
         self._laws(active)
@@ -139,7 +139,9 @@ class Stepper:
         ledger = self.state.ledger.numpy()
         ledger[mask, :3] = fresh[mask, :3]
         for term in self.terms:
-            for name, values in term.measure(self.at).items():
+            measured = term.measure(self.at)
+            check_measured(term, measured, m.worlds)
+            for name, values in measured.items():
                 ledger[mask, columns.index(name)] = values[mask]
         self.state.ledger.assign(ledger)
         self.state.ledger_time.assign(self.state.time)

@@ -16,7 +16,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.common.structs import pattern_struct
 from ..kernels.elements.matrix import panels_of, rows_type
-from ..kernels.solvers.blocks import assembly_kernels, block_kernels
+from ..kernels.solvers.blocks import assembly_kernels
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -117,7 +117,6 @@ class Assembled:
         if name not in model.cache:
             model.cache[name] = [self._contributions(parts[0][0]) for parts in self.runs]
         self.contributions: list[tuple[wp.array, wp.array]] = model.cache[name]
-        self.common = block_kernels(model.dtype)
         S = max(self._size(block) for block in model.blocks)
         points = 0 if self.whole else max(5 * block.points * block.count for block in model.blocks)
         self.lines = work.array("element gradients", (model.worlds, points), model.types.vec3)

@@ -189,9 +189,16 @@ class JacobiLoop(NewtonLoop):
         w, k, launch = self.work, self.own, self.launch
         active = w.newton.active
         self._find_move(active)
+        if self.limited:
+            launch(self.kernels.free_step, self.model.worlds, [w.newton])
+        for term in self.terms:
+            if term.traits.limited:  # the others aim at multipliers, which Newton's method alone predicts
+                term.aim(self.at, active)
         launch(k.advance, self.dim, [w.newton, w.direction, w.v])
         self.residual.evaluate(active)
         launch(k.judge, self.model.worlds, [w.newton, self.control])
+        if self.terms.traits.stored:
+            self._each("adopt", active)
         self._any(active, self.iterating)
 
     @labelled("vectors")

@@ -239,7 +239,7 @@ class NewtonLoop:
     def _update_multipliers(self) -> None:
         """lambda += rho c where a constraint is violated, and the inner solve again, from the velocity at hand."""
         w = self.work
-        self.terms.constraints.update(self.at, w.newton.stepped)
+        self._each("outer", w.newton.stepped)
         self.residual.evaluate(w.newton.active, hold=True)
         self._solve()
         self._judge_outer()
@@ -250,7 +250,7 @@ class NewtonLoop:
         self.residual.linearise(active)
         self.pcg.solve(active)
         self.residual.hold_nonpotential(active)
-        self.residual.follower_curvature(active)
+        self.residual.tangent_curvature(active)
         if self.limited:
             launch(k.free_step, self.model.worlds, [w.newton])
         self._each("aim", active)

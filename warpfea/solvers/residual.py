@@ -124,11 +124,6 @@ class Residual:
         out.mass_factor, out.dq_dv, out.warp = w.step.mass_factor, w.step.dq_dv, w.warp
         return out
 
-    @property
-    def block_kernels(self) -> list[Any]:
-        """Kernels of the blocks of elements."""
-        return self.elements.kernels(self.at)
-
     def modules(self) -> set[wp.Module]:
         """Modules of the gather, and of the matrix where there is one; those of the terms are theirs."""
         out = {self.gather.module}
@@ -267,8 +262,8 @@ class Residual:
             launch(total, (m.worlds, launch.padded(m.slots)), args)
 
     @labelled("loads")
-    def follower_curvature(self, active: wp.array) -> None:
-        """p.K p of the follower loads along the direction p, into the Newton control."""
+    def tangent_curvature(self, active: wp.array) -> None:
+        """p.K p of the forces without a potential along the direction p, into the Newton control."""
         w, launch = self.work, self.launch
         if not self.terms.traits.tangent:
             return
@@ -278,4 +273,4 @@ class Residual:
         args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather.gather_force, self.dim, args)
         launch(self.newton.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
-        self.reduce(w.rows, 1, active, w.newton.follower_sum)
+        self.reduce(w.rows, 1, active, w.newton.tangent_sum)

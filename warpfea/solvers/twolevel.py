@@ -156,7 +156,8 @@ class TwoLevel:
         self.reuse.register(state)
         for term in self.terms:
             kept = Kept([], [], [])
-            for name, array in term.keep(self.at):
+            for key, array in term.keep(self.at):
+                name = f"{term.name}_{key}".replace(" ", "_")
                 kept.live.append(array)
                 kept.place.append(self.work.array(f"preconditioner {name}", array.shape, array.dtype))
                 kept.state.append(state.register(f"preconditioner_{name}", array.dtype, array.shape[1:]))

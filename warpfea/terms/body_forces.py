@@ -11,7 +11,6 @@ import warp as wp
 
 from .. import elements as families
 from ..elements import Rule
-from ..kernels.common.traits import Traits
 from ..kernels.terms.loads import body_force_kernel
 from ..model import assembly
 from ..model.description import BodyForce
@@ -44,7 +43,6 @@ class BodyForces(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.traits = Traits(nonpotential=True)
         self.parts_of_fields: list[FieldPart] = []
 
     @classmethod

@@ -52,7 +52,7 @@ class Constraints(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.traits = Traits(ties=True, stored=True, gated=True)
+        self.traits = Traits(ties=True, gated=True)
         self.tables = ConstraintTables(model, model.description.joints)
         self.kernels = self.tables.kernels
         self.rows = self.tables.count
@@ -196,10 +196,10 @@ class Constraints(Term):
     def adopt(self, at: At, flags: wp.array) -> None:
         """With every Newton step; the classical method does it in its outer loop."""
         if not at.options.classical:
-            self.update(at, flags)
+            self.outer(at, flags)
 
     @part("constraints")
-    def update(self, at: At, flags: wp.array) -> None:
+    def outer(self, at: At, flags: wp.array) -> None:
         """Take over the multipliers of the trial."""
         at.launch(self.kernels.adopt, self.dim, [flags, at.work.multipliers])
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.common.traits import Traits
 from ..kernels.solvers.direct import direct_kernels, followed_struct
 from ..kernels.terms.followers import follower_struct, moment_kernels, pressure_kernels
 from ..laws import TimeLaw
@@ -42,7 +41,6 @@ class Followers(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.traits = Traits(nonpotential=True, tangent=True)
         self.items: list[FollowerPart] = []
         self._entries = 0
 
@@ -110,6 +108,9 @@ class Followers(Term):
         for item in self.items:
             args = [item.data, w.u, w.law_value, active, p, w.nonpotential_tangent]
             at.launch(item.product, (m.worlds, item.count), args)
+
+    def hold(self, free: np.ndarray) -> None:
+        """Nothing: pressures and moments are the same after a translation."""
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
         if not projected:

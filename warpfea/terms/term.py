@@ -121,13 +121,17 @@ class Term:
 
     Attributes:
         name: unique.
-        potential: it has one; else its force is held dead inside a line search.
-        traits: what it asks of the kernels of a step, see Traits.
+        potential: it has one; else its force is held dead inside a line search, and its work counts as that of fields
+            as far as no column books it.
+        traits: what it asks of the kernels of a step. `limited` is a term's to declare; `ties` and `gated` belong to
+            constraints; the others follow from connectivity, rows and whether it overrides `product`.
+        connectivity: arrays (items, slots of an item) of the model's slots that it contributes to.
         columns: what it books, see Column; energies() has a column by each name.
         fields: scalars at nodes, by name.
         parts: parts of a profile that its launches name, with a line about each.
         report_columns: columns of the report of a step.
-        rows: rows [TERM_ROWS, world, row] of its potential in work.term_rows.
+        rows: rows [TERM_ROWS, world, row] of its potential in work.term_rows, see `Workspace.rows_of`.
+        booked_rows: length of the rows of `book`, where they are longer than there are slots, elements or `rows`.
         penalty: its blocks are added to the matrix after D was taken from it.
         offset, row_offset, report_offset: its places in the pools, the rows and the report, set by the TermSet.
     """
@@ -143,7 +147,7 @@ class Term:
         self.model = model
         self.traits = Traits()
         self.offset = self.row_offset = self.report_offset = 0
-        self.rows = self.report_columns = 0
+        self.rows = self.report_columns = self.booked_rows = 0
         self.connectivity: list[np.ndarray] = []
 
     @classmethod
@@ -166,11 +170,15 @@ class Term:
         """Make what needs the components, and number time laws; sets `connectivity`, `rows`, `report_columns`."""
 
     def hold(self, free: np.ndarray) -> None:
-        """Clear directions (components, 3) in which it ties a component to the ground.
+        """Clear directions (components, 3) in which it ties a component to the ground, or to another component.
 
         Translations of a free component pass through the elements and the mass alone. Where a term resists them, a
-        solve can't be corrected by them.
+        solve can't be corrected by them: by default those of all components that a tangent of this term touches. A
+        term whose forces on each component are in balance at any translation clears nothing.
         """
+        if self.potential or type(self).product is not Term.product:
+            for conn in self.connectivity:
+                free[np.unique(self.model.component[conn])] = 0.0
 
     def restraints(self, state: State, component: int) -> Any:
         """Rows (n, 3 slots), CSR: directions in which it resists motion of a component, for statics; None without."""
@@ -181,7 +189,16 @@ class Term:
         return None
 
     def hash(self, h: Any) -> None:
-        """Feed what defines it into a hash."""
+        """Feed what defines it into a hash, so that a checkpoint of another term is refused.
+
+        By default the attributes that are numbers, texts and numpy arrays; name, columns and connectivity are fed
+        already.
+        """
+        for name, value in sorted(vars(self).items()):
+            if isinstance(value, np.ndarray):
+                h.update(name.encode() + np.ascontiguousarray(value).tobytes())
+            elif isinstance(value, (bool, int, float, complex, str, np.generic)):
+                h.update(f"{name} {value!r}".encode())
 
     # for one simulation
 
@@ -199,7 +216,7 @@ class Term:
         return ()
 
     def start(self, at: At, active: wp.array) -> None:
-        """The state was set: bring up to it what follows it. Time laws and work.u are at the state."""
+        """The state of active worlds was set: bring up to it what follows it. Time laws and work.u are at the state."""
 
     # in a step, in this order
 
@@ -213,10 +230,13 @@ class Term:
         """D of the first iterate is known, and so are penalties."""
 
     def force(self, at: At, active: wp.array) -> None:
-        """Forces and rows of the potential at work.u, work.v."""
+        """Forces and rows of the potential at work.u, work.v; in statics work.v is the increment of a load step, m."""
 
     def aim(self, at: At, active: wp.array) -> None:
-        """work.direction is the Newton direction. A term that limits the step lowers work.newton.limit, to above 0."""
+        """work.direction is the Newton direction. A term that limits the step lowers work.newton.limit.
+
+        0 or less: no step is allowed, and the attempt is given up and halved.
+        """
 
     def adopt(self, at: At, flags: wp.array) -> None:
         """A trial was accepted in the flagged worlds: hold its multipliers, caps, ... in the next search."""
@@ -224,8 +244,14 @@ class Term:
     def follow(self, at: At, active: wp.array) -> None:
         """There is a new iterate, and a linear solve to come."""
 
+    def outer(self, at: At, flags: wp.array) -> None:
+        """The inner solve of a classical multiplier method is done in the flagged worlds: change multipliers."""
+
     def book(self, at: At, accepted: wp.array) -> wp.array | None:
-        """Rows [column, world, item] whose sums are booked, J; the state is still that before the substep."""
+        """Rows [column, world, item] in float64 whose sums are booked, J; the state is still that before the substep.
+
+        None: the sums of the last substep stand.
+        """
         return None
 
     def commit(self, at: At, accepted: wp.array) -> None:
@@ -241,10 +267,13 @@ class Term:
     # in a linear solve
 
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        """The derivative of the force along p."""
+        """The derivative of the force along p, a change of the positions, m; velocities change by p/(dq/dv)."""
 
     def diagonal(self, at: At, active: wp.array) -> None:
-        """3x3 blocks on the diagonal, positive, into the pool."""
+        """3x3 blocks on the diagonal, positive, into the pool.
+
+        For the solvers that work with blocks of every iterate; the others take them from `blocks`.
+        """
 
     def keep(self, at: At) -> list[tuple[str, wp.array]]:
         """Names and arrays [world, ...] beside the displacements that `blocks(projected=True)` is a function of.
@@ -263,7 +292,8 @@ class Term:
     ) -> None:  # fmt: skip
         """out += (dq/dv) K, with the pattern of `matrix` (see solvers.assembled.Assembled), from the arrays of `keep`.
 
-        `projected`: only what is positive for sure.
+        `projected`: only what is positive for sure. A term that is stiff and leaves this out costs iterations: neither
+        D nor the preconditioner knows of it then.
         """
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:

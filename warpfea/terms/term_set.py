@@ -14,7 +14,9 @@ from ..kernels.common.traits import Traits
 from ..kernels.step.control import REPORT
 from ..kernels.step.ledger import LEDGER, booked_struct
 from ..model import assembly
+from ..model.state import MEMORY
 from .body_forces import BodyForces
+from .checks import check_columns, check_made, check_names, check_rows, check_stored, check_tables, derived_traits
 from .constraints import Constraints
 from .damping import Damping
 from .dead_loads import DeadLoads
@@ -26,6 +28,7 @@ from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
     from ..model.model import Model
+    from .workspace import Workspace
 
 __all__ = ["KINDS", "TermSet", "all_parts"]
 
@@ -33,6 +36,11 @@ KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyFo
 """The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
 LATER = ("contact", "friction", "per-world parameters")
 """Features of later versions, which `info` lists as left out."""
+STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
+         "previous_velocity", "previous_step", "previous_end")  # fmt: skip
+"""Arrays of the state that are no term's."""
+FIELDS = ("von_mises", "displacement")
+"""Fields of every model, see simulation.results."""
 ZERO = ("contact", "friction")
 """Columns of energies() of later versions."""
 
@@ -60,14 +68,37 @@ class TermSet:
         self.model = model
         self.laws, self.supports = TimeLaws(model), Supports(model)
         makers = [kind.of for kind in KINDS] + list(more or ())
-        self.all: list[Term] = [term for make in makers if (term := make(model)) is not None]
-        names = [term.name for term in self.all]
-        for name in names:
-            if names.count(name) > 1:
-                raise ModelError(f"two terms have the name {name!r}; give each its own")
+        self.all: list[Term] = []
+        for make in makers:
+            term = make(model)
+            if term is not None:
+                check_made(term, make, model)
+                self.all.append(term)
         self.dead = self.find(DeadLoads)
-        self.traits = Traits(*map(any, zip(*(term.traits for term in self.all))))
         self.side_topology: Any = None
+        self._check()
+
+    def _check(self) -> None:
+        """ModelError where terms that were added claim a name that is taken, or what is not theirs."""
+        first = [f"name {term.name!r}" for term in self.all]
+        for name in first:
+            if first.count(name) > 1:
+                raise ModelError(f"two terms have the {name}; give each its own")
+        added = self.added
+        for term in self.all:
+            check_columns(term, own=term not in added)
+        for term in added:
+            for trait in ("ties", "gated"):
+                if getattr(term.traits, trait):
+                    raise ModelError(f"term {term.name!r} declares the trait {trait!r}, which belongs to constraints")
+        check_stored(self.all)
+        check_names(self.all, FIELDS, "a field", lambda term: term.fields)
+        check_names(self.all, tuple(PARTS), "a part of profiles", lambda term: term.parts)
+
+    @property
+    def added(self) -> list[Term]:
+        """Terms that do not come with warpfea."""
+        return [term for term in self.all if type(term) not in KINDS]
 
     @property
     def later(self) -> tuple[str, ...]:
@@ -99,14 +130,14 @@ class TermSet:
 
     def build(self) -> None:
         """Make the terms' tables, once the model knows its components, and their places in the pools."""
-        dead, rest = self.all[:2], self.all[2:]
-        for term in dead:
+        for term in self.all:
+            term.offset = self._entries(self.all, term.potential)
             term.build(self.laws)
-        self.supports.build(self.laws)
-        for term in rest:
-            term.offset = self._entries(rest, term.potential)
-            term.build(self.laws)
+            check_tables(term, self.model)
+            if term is self.dead:  # in this order time laws are numbered
+                self.supports.build(self.laws)
         self.laws.upload()
+        self.traits = Traits(*map(any, zip(*(derived_traits(term) for term in self.all))))
         self.side_entries, self.pool_entries = self._entries(self.all, False), self._entries(self.all, True)
         self.rows = 0
         column = len(REPORT) + 6 * len(self.model.description.probes)
@@ -160,6 +191,11 @@ class TermSet:
         self.laws.hash(h)
         self.supports.hash(h)
         for term in self.all:
+            if term in self.added:
+                columns = [(column.name, column.kind) for column in term.columns]
+                h.update(f"term {term.name} {type(term).__qualname__} {columns} {term.rows}".encode())
+                for conn in term.connectivity:
+                    h.update(np.ascontiguousarray(conn).tobytes())
             term.hash(h)
 
     @property
@@ -174,6 +210,19 @@ class TermSet:
 
     # for one simulation
 
+    def allocate(self, work: Workspace, at: At) -> None:
+        """Let the terms register history and make scratch."""
+        owner: dict[str, str] = {}
+        for term in self.all:
+            before = len(at.state.asked)
+            term.register(at)
+            for name in at.state.asked[before:]:
+                if name in owner or name in STATE or name.startswith(MEMORY):
+                    taken = f"term {owner[name]!r}" if name in owner else "the state itself"
+                    raise ModelError(f"term {term.name!r}: the state's array {name!r} is that of {taken}; rename it")
+                owner[name] = term.name
+            term.allocate(work, at)
+
     @property
     def booking(self) -> list[Term]:
         """Terms that book rows of the ledger."""
@@ -185,6 +234,8 @@ class TermSet:
         out = booked_struct()()
         device = self.model.device
         out.kind = wp.array([c.kind for c in columns], dtype=wp.int32, device=device)
+        held = [int(not term.potential) for term in self.booking for _ in term.columns]
+        out.nonpotential = wp.array(held, dtype=wp.int32, device=device)
         numbers = [self.ledger.index(c.name) if c.name else -1 for c in columns]
         out.column = wp.array(numbers, dtype=wp.int32, device=device)
         out.sums = work.booked
@@ -196,6 +247,7 @@ class TermSet:
         for term in self.booking:
             rows, count = term.book(at, accepted), len(term.columns)
             if rows is not None:
+                check_rows(term, rows, self.model.worlds, at.work.longest)
                 reduce(rows, count, accepted, at.work.booked[first : first + count])
             first += count
 

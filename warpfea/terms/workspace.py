@@ -62,7 +62,7 @@ class Workspace:
             self.array("nonpotential_tangent", side, vec3) if traits.tangent else self.nonpotential_contribution
         )
         pool = (B, terms.pool_entries) if traits.pooled else (1, 1)
-        self.pool = self.pool_force = self.array("pool_force", pool, vec3) if traits.pooled else none
+        self.pool_force = self.array("pool_force", pool, vec3) if traits.pooled else none
         self.pool_product = self.array("pool_product", pool, vec3) if traits.pooled else none
         self.pool_block = self.array("pool_block", pool, model.types.sym) if traits.pooled else self.block_contribution
         rows = (TERM_ROWS, B, terms.rows) if traits.stored else (1, 1, 1)
@@ -77,9 +77,11 @@ class Workspace:
         self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
-        longest = max(n, model.element_count, terms.rows)
+        longest = max(n, model.element_count, terms.rows, *(term.booked_rows for term in terms))
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
-        self.partial = self.array("partial", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, chunks), wp.float64)
+        self.longest = chunks * CHUNK  # items of a row that can be summed
+        most = max(RESIDUAL_ROWS, LEDGER_ROWS, *(len(term.columns) for term in terms))
+        self.partial = self.array("partial", (most, B, chunks), wp.float64)
         self.law_value = self.array("law_value", (B, max(terms.laws.count, 1)), wp.vec3d)
         self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
@@ -109,7 +111,8 @@ class Workspace:
 
     def rows_of(self, term: Any) -> wp.array:
         """The rows of a term's potential, [TERM_ROWS, world, row]."""
-        assert self.term_rows is not None
+        if self.term_rows is None or not term.rows:
+            raise ModelError(f"term {term.name!r} has no rows of a potential: build must set `rows`, one per item")
         first, last = term.row_offset, term.row_offset + term.rows
         whole = last - first == self.term_rows.shape[2]
         return self.term_rows if whole else self.term_rows[:, :, first:last]
@@ -134,7 +137,7 @@ class Workspace:
         special = {
             "elem_sums": (2, worlds),
             "slope_sum": (1, worlds),
-            "follower_sum": (1, worlds),
+            "tangent_sum": (1, worlds),
             "any_active": (1,),
             "any_running": (1,),
         } | shapes

@@ -17,7 +17,7 @@ import gc
 import statistics
 import time as clock
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,7 @@ class Profile:
         newton, pcg: iterations per step.
         copy_GBps: bytes read and written per second, 1e9, by a copy of a large array on the device.
         empty_launch_us: time of an empty kernel, taken off each launch, us.
+        about: a line about each part.
     """
 
     step_ms: tuple[float, ...]
@@ -76,6 +77,7 @@ class Profile:
     pcg: float
     copy_GBps: float
     empty_launch_us: float
+    about: dict[str, str] = field(default_factory=dict)
 
     @property
     def parts(self) -> dict[str, KernelTime]:
@@ -280,6 +282,7 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
         pcg=done.pcg,
         copy_GBps=copy_bandwidth(sim.model.device),
         empty_launch_us=1e6 * empty,
+        about=dict(sim.stepper.launch.parts),
     )
 
 

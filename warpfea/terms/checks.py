@@ -1,0 +1,172 @@
+"""What is wrong with a term, told by name before a kernel writes where it must not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..kernels.common.traits import Traits
+from ..kernels.step.ledger import HELD_VISCOUS, LEDGER, LOSS, NUMERICAL, STORED, WORK
+from .term import Term
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = [
+    "check_columns",
+    "check_made",
+    "check_measured",
+    "check_names",
+    "check_rows",
+    "check_stored",
+    "check_tables",
+    "derived_traits",
+    "stored_columns",
+]
+
+KINDS = {STORED: "STORED", WORK: "WORK", LOSS: "LOSS", NUMERICAL: "NUMERICAL", HELD_VISCOUS: "HELD_VISCOUS"}
+RESERVED = ("work",)
+"""Keys of energies() that are sums of columns."""
+
+
+def check_made(term: Any, make: Any, model: Model) -> None:
+    """ModelError unless what a maker made is a term with a name."""
+    if not isinstance(term, Term):
+        raise ModelError(f"add_term: {make!r} returned {term!r}; expected a warpfea.terms.Term, or None")
+    if not isinstance(getattr(term, "name", None), str) or not term.name:
+        raise ModelError(f"term {type(term).__name__}: `name` must be a text, such as name = 'contact'")
+    if not hasattr(term, "connectivity"):
+        raise ModelError(f"term {term.name!r}: its __init__ must call super().__init__(model)")
+    if term.model is not model:
+        raise ModelError(f"term {term.name!r} was made for another model: make one in the function given to add_term")
+
+
+def check_names(terms: Sequence[Term], taken: Sequence[str], what: str, names: Any) -> None:
+    """ModelError where two terms give the same name, or one that is taken; `names` is a function of a term."""
+    owner: dict[str, Term] = {}
+    for term in terms:
+        for name in names(term):
+            if name in taken:
+                raise ModelError(f"term {term.name!r}: {what} {name!r} is taken; give it a name of its own")
+            if name in owner:
+                raise ModelError(f"terms {owner[name].name!r} and {term.name!r} both have {what} {name!r}")
+            owner[name] = term
+
+
+def derived_traits(term: Term) -> Traits:
+    """Traits of a term, from its tables and from what it overrides; ModelError where what it declares contradicts."""
+    kind = type(term)
+    declared = {"pooled": term.potential, "nonpotential": not term.potential, "tangent": not term.potential}
+    for name, possible in declared.items():
+        if getattr(term.traits, name) and not (possible and term.connectivity):
+            why = "it sets no connectivity" if possible else f"its potential is {term.potential}"
+            raise ModelError(f"term {term.name!r} declares the trait {name!r}, but {why}")
+    if term.traits.tangent and kind.product is Term.product:
+        raise ModelError(f"term {term.name!r} declares the trait 'tangent', but does not override product")
+    if term.traits.stored and term.connectivity and not term.rows:
+        raise ModelError(f"term {term.name!r} declares the trait 'stored', but sets no rows")
+    entries = any(conn.size for conn in term.connectivity)
+    tangent = entries and not term.potential and kind.product is not Term.product
+    return term.traits._replace(
+        pooled=entries and term.potential,
+        nonpotential=entries and not term.potential,
+        tangent=tangent,
+        stored=term.rows > 0,
+    )
+
+
+def check_tables(term: Term, model: Model) -> None:
+    """ModelError unless connectivity and rows of a built term are sound."""
+    for k, conn in enumerate(_arrays(term)):
+        where = f"term {term.name!r}, connectivity[{k}]"
+        if not (isinstance(conn, np.ndarray) and conn.ndim == 2 and np.issubdtype(conn.dtype, np.integer)):
+            found = f"{conn.dtype}{list(conn.shape)}" if isinstance(conn, np.ndarray) else repr(conn)
+            raise ModelError(f"{where}: expected an array of ints (items, slots of an item), got {found}")
+        if conn.size and not (conn.min() >= 0 and conn.max() < model.slots):
+            raise ModelError(f"{where}: slots {conn.min()} to {conn.max()} are not within 0 to {model.slots - 1}")
+    for name in ("rows", "report_columns", "booked_rows"):
+        value = getattr(term, name)
+        if not isinstance(value, (int, np.integer)) or value < 0:
+            raise ModelError(f"term {term.name!r}: {name} = {value!r} must be a whole number, 0 or more")
+
+
+def _arrays(term: Term) -> Sequence[Any]:
+    if not isinstance(term.connectivity, (list, tuple)):
+        raise ModelError(f"term {term.name!r}: connectivity must be a list of arrays, got {term.connectivity!r}")
+    return term.connectivity
+
+
+def check_stored(terms: Sequence[Term]) -> None:
+    """ModelError where a column of stored energy is booked twice: it holds what is there now, and can't add up."""
+    every = [(column.name, term.name) for term in terms for column in term.columns if column.name]
+    for name in (name for term in terms for name in stored_columns(term)):
+        owners = [owner for other, owner in every if other == name]
+        if len(owners) > 1:
+            raise ModelError(f"column {name!r} of stored energy is booked twice, by {owners[0]!r} and {owners[1]!r}")
+
+
+def stored_columns(term: Term) -> list[str]:
+    """Names of the columns that tell what it stores."""
+    return [column.name for column in term.columns if column.kind == STORED]
+
+
+def check_columns(term: Term, *, own: bool) -> None:
+    """ModelError unless the columns of the ledger that a term books are sound; `own`: it comes with warpfea."""
+    kind = type(term)
+    if term.columns and kind.book is Term.book:
+        raise ModelError(f"term {term.name!r} has columns, but does not override book")
+    for column in term.columns:
+        where = f"term {term.name!r}, column {column.name!r}"
+        if column.kind not in KINDS:
+            raise ModelError(f"{where}: kind {column.kind!r} is none of {', '.join(KINDS.values())}")
+        if column.kind in (STORED, WORK, LOSS) and not column.name:
+            raise ModelError(f"{where}: {KINDS[column.kind]} needs a name, the column of energies()")
+        if column.kind == STORED and kind.measure is Term.measure:
+            raise ModelError(
+                f"{where}: what is stored at a state must be known where the ledger begins anew: override measure"
+            )
+        if own:
+            continue
+        if column.kind == HELD_VISCOUS:
+            raise ModelError(f"{where}: HELD_VISCOUS is for damping among the dead loads")
+        if column.name in (*LEDGER, *RESERVED):
+            raise ModelError(f"{where}: the ledger has a column of its own by this name")
+        if column.kind == WORK and not column.name.startswith("work_"):
+            raise ModelError(f"{where}: name columns of work work_..., they count in energies()['work']")
+        if column.name.startswith("work_") and column.kind != WORK:
+            raise ModelError(f"{where}: columns named work_... count in energies()['work'], this one is no work")
+
+
+def check_measured(term: Term, values: Any, worlds: int) -> None:
+    """ModelError unless what `measure` returned has the columns of stored energy."""
+    if not isinstance(values, dict) or set(values) != set(stored_columns(term)):
+        values = values if isinstance(values, dict) else [repr(values)]
+        raise ModelError(
+            f"term {term.name!r}: measure gave {sorted(values)}; its columns of stored energy are "
+            f"{stored_columns(term)}"
+        )
+    for name, amounts in values.items():
+        if np.shape(amounts) != (worlds,):
+            raise ModelError(f"term {term.name!r}: measure gave {np.shape(amounts)} for {name!r}; expected ({worlds},)")
+
+
+def check_rows(term: Term, rows: Any, worlds: int, longest: int) -> None:
+    """ModelError unless what `book` returned are rows (columns, worlds, items) in float64."""
+    import warp as wp
+
+    where = f"term {term.name!r}: book returned"
+    if not isinstance(rows, wp.array):
+        raise ModelError(f"{where} {type(rows).__name__}; expected a warp array or None")
+    count = len(term.columns)
+    if rows.ndim != 3 or rows.dtype != wp.float64 or rows.shape[0] < count or rows.shape[1] != worlds:
+        raise ModelError(
+            f"{where} {rows.dtype.__name__}{list(rows.shape)}; expected float64[{count}, {worlds}, items]: a row per "
+            "column and world"
+        )
+    if rows.shape[2] > longest:
+        raise ModelError(
+            f"{where} {rows.shape[2]} items a row; at most {longest} can be summed unless build sets booked_rows"
+        )
