@@ -116,6 +116,8 @@ _LATER = {
     "Capsule": "contact",
     "Cylinder": "contact",
     "TriMesh": "contact",
+    "Control": "controls between steps",
+    "GeneralizedAlpha": "generalised-alpha steps",
 }
 
 

@@ -353,6 +353,10 @@ class Model:
             assembly.require_density(self.bodies, "gravity")
         self.terms.dead.set_gravity(gravity)
 
+    def contact_force(self, state: State) -> np.ndarray:
+        """Contact is not part of this version."""
+        raise NotImplementedError("contact_force: contact is not part of this version")
+
     def set_parameter(self, name: str, values: Any) -> None:
         """Per-world material parameters are not part of this version."""
         raise NotImplementedError("set_parameter: per-world material parameters are not part of this version")

@@ -405,9 +405,18 @@ class Simulation(Results):
             f"got {joint!r}; it has: {listing(names)}{did_you_mean(joint, names) if isinstance(joint, str) else ''}"
         )
 
-    def contact_report(self, *pair: Any) -> Any:
+    def contact_record(self, contact: Any) -> Any:
         """Contact is not part of this version."""
-        raise NotImplementedError("contact_report: contact is not part of this version")
+        raise NotImplementedError("contact_record: contact is not part of this version")
+
+    def contact_force(self, contact: Any) -> Any:
+        """Contact is not part of this version."""
+        raise NotImplementedError("contact_force: contact is not part of this version")
+
+    @property
+    def controls(self) -> Any:
+        """Controls are not part of this version."""
+        raise NotImplementedError("controls: values that a caller writes between steps are not part of this version")
 
     def resume(self, path: Any) -> None:
         """Continue from a checkpoint, bit for bit. Raises CheckpointError if it is of another model."""

@@ -116,7 +116,7 @@ class Stepper:
             return
         m, w, state = self.model, self.work, self.state
         flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
-        active = wp.array(flags, dtype=wp.int32, device=m.device)
+        active: wp.array = wp.array(flags, dtype=wp.int32, device=m.device)
         w.step.new_time.assign(state.time)
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
         self._laws(active)

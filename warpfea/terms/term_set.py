@@ -41,7 +41,7 @@ STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", 
 """Arrays of the state that are no term's."""
 FIELDS = ("von_mises", "displacement")
 """Fields of every model, see simulation.results."""
-ZERO = ("contact", "friction")
+ZERO = ("contact", "contact_loss", "friction", "collider_work")
 """Columns of energies() of later versions."""
 
 
