@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pathlib
 import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,8 +17,11 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.base.console import compile_bar, quiet_warp
-from warpfea.base.errors import OutputError
+from warpfea.base.errors import OutputError, UsageError
 from warpfea.base.names import did_you_mean
+from warpfea.cli import main
+from warpfea.cli.part import _load
+from warpfea.cli.summary import human, summarize
 from warpfea.outputs import reel, usd
 from warpfea.outputs.frames import time_of
 from warpfea.outputs.usd import validate_usd
@@ -312,6 +317,8 @@ def test_a_group_of_another_kind_is_said_so():
         ("displacment", ["von_mises", "displacement"], "; did you mean 'displacement'?"),
         ("--materail", ["--material", "--clamp"], "; did you mean '--material'?"),
         ("top", ["x-", "x+"], ""),
+        ("--foo", ["--tol", "--json"], ""),
+        ("rnu", ["run", "info"], "; did you mean 'run'?"),
         ("a", [], ""),
         (3, ["4"], ""),
     ],
@@ -607,3 +614,179 @@ def test_reprs_are_one_informative_line():
     for thing in (b, sim, static, many, body):
         assert "\n" not in repr(thing)
         assert len(repr(thing)) < 200
+
+
+# what is refused, and what a summary says
+
+LITTLE = ["cantilever", "--device", "cpu", "--set", "cells=2", "--dt", "0.002"]
+
+
+def command(capfd, *words):
+    """Exit code, stdout and stderr of a command."""
+    capfd.readouterr()
+    code = main([str(word) for word in words])
+    out, err = capfd.readouterr()
+    return code, out, err
+
+
+def sheet(path):
+    """A mesh of quads in a file."""
+    import meshio
+
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    meshio.write(path, meshio.Mesh(points, [("quad", np.array([[0, 1, 2, 3]]))]))
+    return path
+
+
+def test_an_element_turned_inside_out_is_told(tmp_path, capfd):
+    path = tmp_path / "a.json"
+    code, out, _ = command(capfd, "run", *LITTLE, "--t-end", "0.004", "--json", path)
+    assert code == 0
+    assert 0.5 < json.loads(path.read_text())["min_J"] < 1.0
+    assert "inside out" not in out
+    sim = simulation()
+    assert sim.min_J == np.inf
+    steps = [sim.step().min_J[0] for _ in range(2)]
+    assert sim.min_J == min(steps)
+    crushed = bar(wf.SVK(E=10.0, nu=0.3, density=1000.0), gravity=(-300.0, 0, 0))[0].finalize(device="cpu")
+    sim = wf.Simulation(crushed, dt=2e-3)
+    sim.run(0.1, on_step=lambda s: s.min_J > 0)
+    assert sim.min_J <= 0
+    source = SimpleNamespace(label="bar", parameters={})
+    summary = summarize(source, sim, status="done", wall_s=0.0)
+    assert f"an element turned inside out: J = {sim.min_J:.3g}; take a finer mesh" in human(summary, sim, [])
+
+
+def test_what_was_not_written_is_not_listed(tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, file in {"--png": "a.png", "--gif": "a.gif", "--usd": "a.usdc"}.items():
+        code, out, err = command(capfd, "run", *LITTLE, "--t-end", "0.004", name, file, "--field", "foo")
+        assert (code, out) == (2, "")
+        assert "--field foo: is unknown; there are von_mises, displacement, none" in err
+    (tmp_path / "old.png").write_text("older")
+
+    def fail(*_):
+        raise OutputError("old.png: can't be written")
+
+    monkeypatch.setattr(wf.PNGWriter, "close", fail)
+    words = ["--png", "old.png", "--checkpoint", "c.npz", "--json", "a.json"]
+    code, out, _ = command(capfd, "run", *LITTLE, "--t-end", "0.004", *words)
+    assert code == 4
+    wrote = out[out.index("wrote") :]
+    assert "old.png" not in wrote
+    assert "c.npz" in wrote
+    assert "a.json" in wrote
+
+
+def test_an_end_that_no_step_reaches_is_refused():
+    for t_end, text in {5e-4: "at most half a step", 1e-3: "at most half a step", -1.0: "lies in the past"}.items():
+        sim = simulation()
+        with pytest.raises(wf.ModelError, match=text):
+            sim.run(t_end)
+        assert sim.steps == 0
+    sim.run(5e-3)  # two and a half steps: the even number of them
+    assert sim.steps == 2
+    sim.run(4e-3)
+    sim.run(4.5e-3)  # as close as whole steps come
+    assert sim.steps == 2
+    with pytest.raises(wf.ModelError, match=r"t_end = 0.001 s lies in the past: the simulation is at t = 0.004 s"):
+        sim.run(1e-3)
+    sim.reset()
+    with pytest.raises(wf.ModelError, match="at most half a step"):
+        sim.run(5e-4)
+
+
+def test_the_summary_says_where_the_run_ended_instead(capfd):
+    code, out, _ = command(capfd, "run", *LITTLE, "--t-end", "0.005")
+    assert code == 0
+    assert "ended at t = 0.004 s, the whole steps nearest to t_end = 0.005 s" in out
+    assert "ended at" not in command(capfd, "run", *LITTLE, "--t-end", "0.004")[1]
+
+
+def test_the_summary_says_that_rounding_set_the_limit():
+    sim = wf.Simulation(bar()[0].finalize(device="cpu", dtype="float32"), dt=2e-3)
+    sim.step()
+    summary = summarize(SimpleNamespace(label="bar", parameters={}), sim, status="done", wall_s=0.0)
+    for residual, told in ((1e-6, False), (0.1, True)):
+        sim.max_residual = summary["max_residual"] = residual
+        assert ("(at the limit of rounding)" in human(summary, sim, [])) == told
+    summary["steps"] = 0
+    assert "residual up to" not in human(summary, sim, [])
+    assert "no step was accepted" in human(summary, sim, [])
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--png-time", "0.002"], "--png-time is for a picture: give --png too"),
+        (["--png-time", "0.5", "--png", "a.png"], "--png-time 0.5: the run lasts from 0 to t = 0.004 s"),
+        (["--every", "5"], "--every is for checkpoints: give --checkpoint too"),
+        (["--fps", "5", "--gif", "a.gif"], "--fps is for animations: give --usd or --vtu too"),
+        (["--speed", "5", "--usd", "a.usdc"], "--speed is for an animation: give --gif too"),
+        (["--usd", "a.usdc", "--usd", "b.usdc"], "--usd is given twice"),
+        (["--t-end", "1e-3"], "--t-end 0.001: no step would be done"),
+        (["--foo", "1"], "unrecognized arguments: --foo 1 ("),
+    ],
+)
+def test_options_without_effect_are_refused(tmp_path, capfd, monkeypatch, words, text):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = command(capfd, "run", *LITTLE, "--t-end", "0.004", *words)
+    assert (code, out) == (2, "")
+    assert text in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mesh_of_a_surface_is_one_of_a_shell(tmp_path, capfd):
+    code, out, _ = command(capfd, "info", sheet(tmp_path / "quad.vtu"))
+    assert code == 0
+    assert "add_shell" in out
+    assert "--material" not in out
+
+
+def test_falling_is_told_of_what_falls(tmp_path, capfd):
+    words = [written(tmp_path)[0], "--material", "svk:E=1e7,nu=0.3,density=1000", "--device", "cpu"]
+    assert "falls freely" in command(capfd, "info", *words)[2]
+    assert command(capfd, "info", *words, "--gravity", "0,0,0")[2] == ""
+    assert "falls freely" not in command(capfd, "run", *words, "--static")[2]
+
+
+def test_words_of_the_command_line(tmp_path, capfd):
+    folder = tmp_path / "dir.msh"
+    folder.mkdir()
+    for words in (["info", folder], ["run", folder, "--material", "svk:E=1e7,nu=0.3"]):
+        assert f"{folder}: is a folder, not a file" in command(capfd, *words)[2]
+    for name in ("stress", "sweep"):
+        code, _, err = command(capfd, name, "--help")
+        assert code == 2
+        assert "is not part of this version" in err
+    _, _, err = command(capfd, "fly")
+    assert "sweep" not in err
+    assert "stress" not in err
+    with pytest.raises(UsageError, match=r"'nan' is not a finite number$"):
+        _load("x+:nan", "--pressure", 1)
+
+
+def test_an_error_in_a_scene_file_has_its_line(tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "err.py").write_text("x = 1\ny = x / 0\n")
+    code, _, err = command(capfd, "run", "err.py")
+    assert code == 2
+    assert "err.py:2: ZeroDivisionError: division by zero" in err
+
+
+def test_a_refused_step_says_what_to_try():
+    b, body = bar()
+    b.add_traction(body.surface("x+"), (0, 0, -1e30))
+    model, solver = b.finalize(device="cpu"), wf.NewtonPCG(max_halvings=0)
+    with pytest.raises(wf.ConvergenceError, match=r"; try a smaller dt$"):
+        wf.Simulation(model, dt=2e-3, solver=solver).step()
+    with pytest.raises(wf.ConvergenceError, match=r"; try more load steps$"):
+        wf.solve_static(model, load_steps=1, solver=solver)
+
+
+def test_ctrl_c_while_a_command_is_read_is_no_traceback(capfd, monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warpfea.cli.parser.parse", interrupt)
+    assert command(capfd, "scenes") == (130, "", "warpfea: interrupted\n")

@@ -9,17 +9,22 @@ __all__ = ["did_you_mean", "listing"]
 
 CUTOFF = 0.6
 """Similarity, 0 to 1, from which a known name is offered."""
+SHORT, SHORT_CUTOFF = 5, 0.75
+"""Length up to which a name is short, and its cutoff: a letter in common says less of it."""
 
 
 def did_you_mean(name: object, known: Iterable[object]) -> str:
     """The text "; did you mean 'x'?" with the known name closest to `name`, or nothing where none is close.
 
-    Upper and lower case, and hyphens for underscores, count as the same.
+    Upper and lower case, and hyphens for underscores, count as the same; hyphens in front don't count. A short name is
+    also close to one with its letters in another order.
     """
+    wanted = _plain(str(name))
     plain: dict[str, str] = {}
     for text in map(str, known):
         plain.setdefault(_plain(text), text)
-    found = difflib.get_close_matches(_plain(str(name)), plain, n=1, cutoff=CUTOFF)
+    found = difflib.get_close_matches(wanted, plain, n=1, cutoff=SHORT_CUTOFF if len(wanted) <= SHORT else CUTOFF)
+    found = found or [text for text in plain if sorted(text) == sorted(wanted)]
     return f"; did you mean {plain[found[0]]!r}?" if found else ""
 
 
@@ -29,4 +34,4 @@ def listing(known: Iterable[object]) -> str:
 
 
 def _plain(text: str) -> str:
-    return text.casefold().replace("-", "_")
+    return text.casefold().lstrip("-").replace("-", "_")

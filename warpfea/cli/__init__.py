@@ -19,11 +19,11 @@ DONE, DEFECT, BAD_INPUT, NOT_CONVERGED, OUTPUT_FAILED, INTERRUPTED = 0, 1, 2, 3,
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv` (by default sys.argv[1:]), return the exit code. Raises with --debug only."""
-    from . import parser
-
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     try:
+        from . import parser  # here, so that Ctrl-C ends it as it ends the rest
+
         try:
             arguments = parser.parse(words)
         except SystemExit as leave:  # --help and --version

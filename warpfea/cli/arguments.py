@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import pathlib
 import re
 from typing import Any, NoReturn
 
@@ -11,12 +12,14 @@ from ..base.errors import UsageError
 from ..base.names import did_you_mean
 
 __all__ = [
+    "Once",
     "Parser",
     "add_general",
     "call",
     "color_range",
     "count",
     "counts",
+    "existing",
     "numbers",
     "pair",
     "positive",
@@ -38,6 +41,24 @@ class Parser(argparse.ArgumentParser):
         if choice:
             message += did_you_mean(choice[1], re.findall(r"[\w-]+", choice[2]))
         raise UsageError(f"{message} ({self.prog} --help tells more)")
+
+
+class Once(argparse.Action):
+    """Stores the value of an option that makes a file: given twice, one of the two files would be missing."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """Store the value. UsageError if there is one."""
+        if getattr(namespace, self.dest) is not None:
+            parser.error(f"{option} is given twice")
+        setattr(namespace, self.dest, values)
+
+
+def existing(text: str) -> pathlib.Path:
+    """The path of a file that is there. UsageError."""
+    path = pathlib.Path(text)
+    if not path.is_file():
+        raise UsageError(f"{path}: is a folder, not a file" if path.is_dir() else f"{path}: no such file")
+    return path
 
 
 def positive(text: str) -> float:
@@ -75,7 +96,8 @@ def numbers(text: str, size: int) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if len(values) != size or not all(map(math.isfinite, values)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not {size} finite numbers with commas")
+        expected = "a finite number" if size == 1 else f"{size} finite numbers with commas"
+        raise argparse.ArgumentTypeError(f"{text!r} is not {expected}")
     return values
 
 

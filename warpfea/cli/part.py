@@ -18,7 +18,7 @@ from ..base.names import did_you_mean
 from ..builder.builder import ModelBuilder
 from ..builder.scene import Scene
 from ..model.bodies import Body
-from .arguments import numbers
+from .arguments import existing, numbers
 from .parser import MATERIAL_HINT
 
 __all__ = ["OPTIONS", "mesh_facts", "parse_material", "part_scene"]
@@ -34,9 +34,7 @@ DAMPING = ("eta", "lambda_v", "form")
 
 def part_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]:
     """The scene of a mesh file, and the parameters that its summary names. UsageError, ModelError, MeshError."""
-    path = pathlib.Path(options.what)
-    if not path.is_file():
-        raise UsageError(f"{path}: no such file")
+    path = existing(options.what)
     if options.set:
         raise UsageError(f"--set {options.set[0]}: a mesh file has no parameters; --set is for scenes")
     laws = [parse_material(text) for text in options.material]
@@ -51,7 +49,7 @@ def part_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
         body = b.add_solid(mesh, material=_materials(path, mesh, laws), quadrature=options.quadrature)
         for group in options.clamp:
             b.clamp(body.nodes(group))
-        if not options.clamp:
+        if not options.clamp and any(gravity) and not getattr(options, "static", False):
             print(f"warpfea: warning: no --clamp: body {body.name!r} falls freely", file=sys.stderr)
         for group, value in tractions:
             b.add_traction(body.surface(group), value)

@@ -11,9 +11,12 @@ from typing import Any
 
 from ..base.console import quiet_warp, write_json
 from ..base.errors import ConstraintError, ConvergenceError, OutputError, UsageError
+from ..base.names import did_you_mean
 from ..base.writer import Output, check_folder, check_target
+from ..model.model import Model
 from ..simulation.checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
 from ..simulation.checkpoint import Checkpoint, load_checkpoint, read_meta
+from ..simulation.results import FIELDS
 from ..simulation.run_loop import interruptible
 from ..simulation.simulation import Simulation
 from ..simulation.statics import run_static
@@ -31,6 +34,8 @@ TARGETS: dict[str, Sequence[str]] = {
     "checkpoint": CHECKPOINT_SUFFIXES,
 }
 
+EVERY = 100
+"""Steps between checkpoints."""
 STATIC_SPEED = 0.5
 """Of the load per second of an animation of --static."""
 
@@ -44,9 +49,13 @@ def run(options: argparse.Namespace) -> int:
     began = clock.perf_counter()
     source = resolve(options, saved)
     t_end = options.t_end or source.scene.t_end
+    _check_times(options, source, t_end)
     outputs = make_outputs(options, source, t_end)
+    before = {file: _mark(file) for file in _files(options).values()}
     with quiet_warp():
-        sim = source.simulation(source.model(), progress(options))
+        model = source.model()
+        _check_field(options.field, model)
+        sim = source.simulation(model, progress(options))
         if options.resume:
             load_checkpoint(sim, options.resume)
             now = float(sim.time.max())
@@ -70,22 +79,30 @@ def run(options: argparse.Namespace) -> int:
             raise
         finally:
             with interruptible():  # all is done but the report: Ctrl-C does not take it away
-                _report(options, source, sim, status, clock.perf_counter() - began)
+                summary = summarize(source, sim, status=status, wall_s=clock.perf_counter() - began)
+                _report(options, sim, summary, before, t_end if status == "done" else None)
     return DONE
 
 
-def _report(options: argparse.Namespace, source: Source, sim: Simulation, status: str, wall_s: float) -> None:
-    """Write the summary, and print it. An output that fails here does not hide what ended the run."""
-    summary = summarize(source, sim, status=status, wall_s=wall_s)
-    wrote = _written(options) if status != "output failed" else []
+def _report(
+    options: argparse.Namespace,
+    sim: Simulation,
+    summary: dict[str, Any],
+    before: dict[pathlib.Path, Any],
+    t_end: float | None,
+) -> None:
+    """Write the summary, and print it. An output that fails here does not hide what ended the run.
+
+    `before` are the marks of the outputs before the run, `t_end` as of `human`.
+    """
     if options.json:
         try:
             write_json(options.json, summary)
         except OutputError:
-            if status == "done":
+            if summary["status"] == "done":
                 raise
     if not options.quiet and options.json != "-":
-        print(human(summary, sim, wrote))
+        print(human(summary, sim, _written(options, before), t_end))
         sys.stdout.flush()
 
 
@@ -121,16 +138,47 @@ def _check_kind(options: argparse.Namespace) -> None:
         raise UsageError(f"--solver {options.solver} is for a motion; --static needs newton-pcg")
 
 
+USES = {
+    "field": ("pictures", ("png", "gif", "usd")),
+    "range": ("pictures", ("png", "gif", "usd")),
+    "view": ("pictures", ("png", "gif")),
+    "png_time": ("a picture", ("png",)),
+    "fps": ("animations", ("usd", "vtu")),
+    "speed": ("an animation", ("gif",)),
+    "every": ("checkpoints", ("checkpoint",)),
+}
+"""What an option is for, and the outputs of which one must be given."""
+
+
 def _check_look(options: argparse.Namespace) -> None:
-    """UsageError for options of pictures where none is drawn, and for one that can't go on after --resume."""
-    for name, uses in {"field": ("png", "gif", "usd"), "range": ("png", "gif", "usd"), "view": ("png", "gif")}.items():
+    """UsageError for options of outputs that are not written, and for one that can't go on after --resume."""
+    for name, (what, uses) in USES.items():
         if getattr(options, name) is not None and not any(getattr(options, use) for use in uses):
-            raise UsageError(f"--{name} is for pictures: give {' or '.join(f'--{use}' for use in uses)} too")
+            option, outputs = name.replace("_", "-"), " or ".join(f"--{use}" for use in uses)
+            raise UsageError(f"--{option} is for {what}: give {outputs} too")
     if options.resume and options.gif and pathlib.Path(options.gif).exists():
         raise UsageError(
             f"--gif {options.gif}: is there, and a GIF can't be gone on with after --resume; give another name, or "
             "draw the whole motion of --usd with warpfea render"
         )
+
+
+def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> None:
+    """UsageError for an end before the first step, and for a picture of what is not reached."""
+    if not (options.static or options.resume) and t_end <= 0.5 * source.dt:
+        raise UsageError(
+            f"--t-end {t_end:g}: no step would be done, for it is at most half a step of dt = {source.dt:g} s; "
+            "give a smaller --dt or a later --t-end"
+        )
+    if options.png_time is not None and not 0.0 <= options.png_time <= t_end * (1.0 + 1e-9):
+        raise UsageError(f"--png-time {options.png_time:g}: the run lasts from 0 to t = {t_end:g} s")
+
+
+def _check_field(name: str | None, model: Model) -> None:
+    """UsageError unless --field is a field of the model or none."""
+    known = [*FIELDS, *model.terms.fields, "none"]
+    if name is not None and name not in known:
+        raise UsageError(f"--field {name}: is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
 
 
 def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> list[Output]:
@@ -165,17 +213,33 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
         speed = options.speed or (STATIC_SPEED if options.static else source.scene.speed)
         out.append(GIFWriter(options.gif, speed=speed, progress=progress(options), **look))
     if options.checkpoint:
-        out.append(Checkpoint(options.checkpoint, every=options.every))
+        out.append(Checkpoint(options.checkpoint, every=options.every or EVERY))
     return out
 
 
-def _written(options: argparse.Namespace) -> list[str]:
-    """The files that are there, with what is known of them."""
+def _files(options: argparse.Namespace) -> dict[str, pathlib.Path]:
+    """The file that tells whether an output was written, by option; of a series its list."""
+    names = ("usd", "vtu", "png", "gif", "checkpoint", "json")
+    files = {name: pathlib.Path(getattr(options, name)) for name in names if getattr(options, name) not in (None, "-")}
+    if "vtu" in files:
+        files["vtu"] /= f"{files['vtu'].resolve().name}.pvd"
+    return files
+
+
+def _mark(file: pathlib.Path) -> tuple[int, int] | None:
+    """What changes when a file is written; writers put a new file in the place of an old one. None: there is none."""
+    try:
+        stat = file.stat()
+    except OSError:
+        return None
+    return stat.st_ino, stat.st_mtime_ns
+
+
+def _written(options: argparse.Namespace, before: dict[pathlib.Path, Any]) -> list[str]:
+    """The outputs that this run has written, with what is known of them; `before` are the marks from before it."""
     notes: dict[str, Any] = {"usd": "validated, for usdview, Blender, Omniverse", "vtu": "for ParaView"}
-    names = [name for name in ("usd", "vtu", "png", "gif", "checkpoint", "json") if getattr(options, name)]
     texts = []
-    for name in names:
-        value = getattr(options, name)
-        if value != "-":
-            texts.append(f"{value}" + (f"  ({notes[name]})" if name in notes else ""))
+    for name, file in _files(options).items():
+        if _mark(file) not in (None, before[file]):
+            texts.append(f"{getattr(options, name)}" + (f"  ({notes[name]})" if name in notes else ""))
     return texts

@@ -10,12 +10,13 @@ from typing import Any
 from .. import mesh as meshes
 from ..base.console import number, plain, quiet_warp, size, table, write_json
 from ..base.errors import UsageError
-from ..builder.scene import Scene, find, load_file, names
+from ..builder.scene import Scene, find, names
 from . import DONE
+from .arguments import existing
 from .parser import MATERIAL_HINT
 from .part import mesh_facts
 from .run import check_targets
-from .source import find_scene, is_mesh, progress, resolve
+from .source import find_scene, is_mesh, load, progress, resolve
 from .summary import MANY, box_text, mass_text, model_box
 
 __all__ = ["info", "render", "scenes"]
@@ -27,7 +28,7 @@ def scenes(options: argparse.Namespace) -> int:
     if what is None:
         found = [find(name) for name in names()]
     elif what.endswith(".py"):
-        found = list(load_file(what).values())
+        found = list(load(what).values())
     else:
         print(_one_scene(find_scene(what)))
         return DONE
@@ -85,16 +86,16 @@ def info(options: argparse.Namespace) -> int:
 
 def _mesh_info(options: argparse.Namespace) -> int:
     """What a mesh file holds, without a material."""
-    path = pathlib.Path(options.what)
-    if not path.is_file():
-        raise UsageError(f"{path}: no such file")
-    facts = mesh_facts(meshes.read(path, scale=options.scale or 1.0))
+    facts = mesh_facts(meshes.read(existing(options.what), scale=options.scale or 1.0))
     if options.json:
         write_json(options.json, plain({"scene": options.what, "mesh": facts}))
     if options.json != "-":
         print(table([["mesh", options.what], *_mesh_rows(facts)]))
         if not options.quiet:
-            print(f"\nwith --material {MATERIAL_HINT.removeprefix('e.g. ')} also what a simulation of it costs")
+            more = f"with --material {MATERIAL_HINT.removeprefix('e.g. ')} also what a simulation of it costs"
+            if facts["cells"] == "quad":
+                more = "a mesh of a surface is one of a shell; it is simulated from Python, with add_shell"
+            print(f"\n{more}")
     return DONE
 
 
@@ -176,9 +177,7 @@ def render(options: argparse.Namespace) -> int:
     suffix = pathlib.Path(options.output).suffix.lower()
     if suffix not in (".png", ".gif"):
         raise UsageError(f"--output {options.output}: the file name must end in .png or .gif")
-    source = pathlib.Path(options.file)
-    if not source.is_file():
-        raise UsageError(f"{source}: no such file")
+    source = existing(options.file)
     extra: dict[str, Any] = {"color_range": options.range}
     if options.view:
         extra["view"] = options.view

@@ -17,9 +17,10 @@ from ..model.model import Model
 from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
+from .arguments import existing
 from .part import OPTIONS, part_scene
 
-__all__ = ["Source", "find_scene", "is_mesh", "progress", "resolve"]
+__all__ = ["Source", "find_scene", "is_mesh", "load", "progress", "resolve"]
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".step", ".stp", ".iges", ".igs", ".brep", ".geo", ".3mf")
 """Formats of surfaces and shapes, which hold no elements."""
@@ -83,6 +84,12 @@ def is_mesh(what: str) -> bool:
     return pathlib.Path(what).suffix.lower() in FORMATS
 
 
+def load(file: str) -> dict[str, Scene[Any]]:
+    """The scenes of a file by name; an error in it is a ModelError with file and line."""
+    # absolute: Python knows the file's code by that path, and so its lines are found
+    return load_file(existing(file).absolute())
+
+
 def find_scene(what: str) -> Scene[Any]:
     """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
     file, colon, name = what.rpartition(":")
@@ -91,7 +98,7 @@ def find_scene(what: str) -> Scene[Any]:
     if not file.endswith(".py"):
         _check_suffix(what)
         return find(what)
-    found = load_file(file)
+    found = load(file)
     if not name:
         if len(found) > 1:
             raise UsageError(f"{file} holds several scenes, give {file}:NAME with one of {', '.join(found)}")

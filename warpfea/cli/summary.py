@@ -34,6 +34,7 @@ KEYS = (
     "newton_iterations",
     "pcg_iterations",
     "max_residual",
+    "min_J",
     "rough_steps",
     "mass",
     "bounding_box",
@@ -47,6 +48,8 @@ MANY = 12
 """Joints that are listed one by one."""
 WORST = 4
 """Joints listed of more."""
+NO_J = 1e30
+"""What a step reports for the smallest J where no element has one."""
 
 
 def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) -> dict[str, Any]:
@@ -55,7 +58,8 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     `analysis` is "dynamic" or "static"; `t_end` the time that was reached, of statics `load` the part of the load, 0 to
     1, with `steps` load steps; `mass` is null where a density is missing, `bounding_box` that of the reference;
     `wall_s` are the seconds from building to the closing of files, `compile_s` those of them in which the simulation
-    was made; `rough_steps` are those accepted short of the tolerance (Jacobi); energies and probes are the last values,
+    was made; `min_J` is the smallest det F of any step that this process did, null where there is none; `rough_steps`
+    are those accepted short of the tolerance (Jacobi); energies and probes are the last values,
     of statics the strain energy alone; `violation` is the largest of the constraints in any step, m.
     """
     probes = {}
@@ -86,6 +90,7 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
         "newton_iterations": int(sim.totals["newton"].sum()),
         "pcg_iterations": int(sim.totals["pcg"].sum()),
         "max_residual": sim.max_residual,
+        "min_J": sim.min_J if sim.min_J < NO_J else None,
         "rough_steps": int(sim.totals["rough"].sum()),
         "mass": sim.model.mass,
         "bounding_box": model_box(sim.model),
@@ -99,8 +104,8 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     return {name: plain(value) for name, value in content.items()}
 
 
-def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str:
-    """The summary as a table."""
+def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end: float | None = None) -> str:
+    """The summary as a table; `t_end` is the time that was asked for, s, of a run that is done."""
     s, info = summary, sim.model.info()
     steps = max(s["steps"], 1)
     done = f"{s['status']}, static, at {number(100.0 * (s['load'] or 0.0))} % of the load, {s['steps']} load steps"
@@ -113,12 +118,14 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
         ["device", f"{s['device']}, {s['dtype']}, {sim.integrator.name}"],
         ["status", done],
         ["time", f"{s['wall_s']:.1f} s, of which {s['compile_s']:.1f} s for kernels and set-up"],
-        [
-            "iterations",
-            f"{_counts(s, sim)} per step, residual up to {_text(s['max_residual'], 2)}"
-            + (f", violation up to {_text(s['violation'], 2)} m" if sim.model.constraints else ""),
-        ],
+        ["iterations", _iterations(s, sim)],
     ]
+    if t_end is not None and s["t_end"] is not None and abs(s["t_end"] - t_end) > 1e-9 * abs(t_end):
+        end = f"ended at t = {number(s['t_end'], 6)} s, the whole steps nearest to t_end = {number(t_end, 6)} s"
+        rows.insert(5, ["", end])
+    if s["min_J"] is not None and s["min_J"] <= 0.0:
+        text = f"an element turned inside out: J = {number(s['min_J'], 3)}; "
+        rows.append(["WARNING", text + "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"])
     if s["rough_steps"]:
         reached = s["steps"] - s["rough_steps"]
         tol = number(sim.solver.tolerance(s["dtype"]))
@@ -153,6 +160,16 @@ def box_text(box: Sequence[Sequence[float]]) -> str:
 def mass_text(mass: float | None) -> str:
     """A mass for reading."""
     return "no density" if mass is None else f"{number(mass)} kg"
+
+
+def _iterations(s: dict[str, Any], sim: Simulation) -> str:
+    """Iterations, and what is left of the equations."""
+    if s["steps"] == 0:
+        return "no step was accepted"
+    text = f"{_counts(s, sim)} per step, residual up to {_text(s['max_residual'], 2)}"
+    if s["dtype"] == "float32" and not s["rough_steps"] and sim.max_residual > sim.solver.tolerance(s["dtype"]):
+        text += " (at the limit of rounding)"
+    return text + (f", violation up to {_text(s['violation'], 2)} m" if sim.model.constraints else "")
 
 
 def _counts(s: dict[str, Any], sim: Simulation) -> str:

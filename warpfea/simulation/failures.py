@@ -54,13 +54,14 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
     reason = REASONS.get(code, "unknown reason")
+    hint = "; try more load steps" if sim.integrator.static else "; try a smaller dt"
     direct = sim.stepper.newton.direct
     if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
-        reason = "H is singular (a body or mechanism that nothing holds?)"
+        reason, hint = "H is singular (a body or mechanism that nothing holds?)", ""
     return ConvergenceError(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
-        f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}",
+        f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}",
         time=time, world=world, residuals=history, element=element, state=sim.state,
     )  # fmt: skip
 

@@ -121,6 +121,7 @@ class Simulation(Results):
         self.last: StepReport | None = None
         self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough")}
         self.max_residual = 0.0
+        self.min_J = math.inf
         self.max_violation = 0.0
         self._load: np.ndarray | None = None
         self._stepped = np.zeros(model.worlds, dtype=bool)
@@ -210,6 +211,7 @@ class Simulation(Results):
         if good.any():
             self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
             self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
+            self.min_J = min(self.min_J, float(self.last.min_J[good].min()))
         if self._recorded:
             if not self.record:
                 self._history.clear()
@@ -254,12 +256,13 @@ class Simulation(Results):
         """Step until t_end (s), writing outputs. Ctrl-C ends after the step in hand, with valid files.
 
         Args:
-            t_end: end time, s; a last step that would overshoot by less than half a step is not taken.
+            t_end: end time, s; the number of steps is rounded to the nearest, so the end may differ by half a step.
             outputs: writers (USDWriter, VTUWriter, Checkpoint, ...).
             on_step: called after each step; ends the run when it returns False.
             progress: show a bar on stderr; by default when stderr is a terminal.
 
         Raises:
+            ModelError: t_end lies in the past, or is so close to the start that no step would be done.
             ConvergenceError, ConstraintError, OutputError: the outputs hold what came before.
             KeyboardInterrupt: after Ctrl-C, once outputs are closed; not when no step was left to do.
         """
@@ -269,7 +272,13 @@ class Simulation(Results):
             raise ModelError(f"run: outputs must be a list of writers such as USDWriter(path), got {outputs!r}")
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
-        total = max(0, round((t_end - now) / self._dt))
+        total = round((t_end - now) / self._dt)
+        if total < 0:
+            raise ModelError(f"t_end = {t_end:g} s lies in the past: the simulation is at t = {now:.6g} s")
+        # who has stepped may be as close to t_end as whole steps come; a start is not
+        if total == 0 and t_end != now and (self.steps == 0 or now == 0.0):
+            away = f"t_end = {t_end:g} s is at most half a step from the start at t = {now:g} s"
+            raise ModelError(f"{away}, so no step would be done; take dt < {self._dt:g} s or a later t_end")
         run_steps(self, total, t_end, outputs, on_step, progress)
         if self.last is None:
             self.last = idle_report(self)
