@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from warpfea.base.errors import OutputError
+from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.colormap import TABLE, map_colors, to_linear, to_srgb
 from warpfea.outputs.frames import FrameClock, Surface, grid_offsets, vertex_normals
 from warpfea.outputs.raycaster import Camera, Renderer, nice_number, smooth_corners
@@ -153,7 +153,7 @@ def test_frame_clock():
     assert coarse.code(0.04) == 4.0
     assert coarse.code(0.045) == pytest.approx(4.5)
     for bad in (0.0, -1.0, np.inf, np.nan):
-        with pytest.raises(OutputError, match="frames per second"):
+        with pytest.raises(ModelError, match="frames per second"):
             FrameClock(bad)
 
 
@@ -497,16 +497,22 @@ def test_render_usd(tmp_path, usd_run):
     for source, out, text in (
         (tmp_path / "none.usdc", picture, "no such file"),
         (tmp_path / "empty.usda", picture, "no mesh"),
-        (tmp_path / "text.usda", picture, "not a readable USD file"),
-        (near, tmp_path / "o.jpeg", "must end in"),
-        (near, tmp_path / "nowhere" / "o.png", "nowhere"),
+        (tmp_path / "text.usda", picture, "can't be read as USD"),
+        (picture, movie, r"can't be read as USD \(it is no USD file\)"),
     ):
-        with pytest.raises(OutputError, match=text):
+        with pytest.raises(ModelError, match=text):
             render_usd(source, out)
-    with pytest.raises(OutputError, match="fields: displacement, von_mises"):
-        render_usd(near, picture, field="heat")
-    with pytest.raises(OutputError, match="outside 0"):
-        render_usd(near, picture, time=7.0)
+    for out, text in ((tmp_path / "o.jpeg", "must end in"), (tmp_path / "nowhere" / "o.png", "nowhere")):
+        with pytest.raises(OutputError, match=text):
+            render_usd(near, out)
+    for options, text in (
+        ({"field": "heat"}, "fields: displacement, von_mises"),
+        ({"time": 7.0}, "outside 0"),
+        ({"size": (0, 10)}, "pixels"),
+        ({"view": (0, 95)}, "view"),
+    ):
+        with pytest.raises(ModelError, match=text):
+            render_usd(near, picture, **options)
 
 
 def test_renderer_far_from_the_origin():
@@ -543,7 +549,7 @@ def renderer_pictures(renderer, states, colors, camera):
 def test_camera_frames_all_points():
     rng = np.random.default_rng(3)
     points = rng.normal(size=(500, 3)) * [5.0, 0.2, 1.0] + FAR
-    for view in ((-65, 20), (10, 0), (120, 80), (0, 90)):
+    for view in ((-65, 20), (10, 0), (120, 80), (0, 90), (45, -90), (30, 89.9)):
         camera = Camera.framing(points, view=view, margins=(0.05, 0.2, 0.1, 0.1))
         forward, right, up = camera.axes()
         local = points - camera.eye
@@ -557,6 +563,15 @@ def test_camera_frames_all_points():
         assert y.min() > 0.095
         assert y.max() < 0.905
         assert max(np.ptp(x) / 0.75, np.ptp(y) / 0.8) > 0.97
+    for x, y, z in ((0.1, 0.05, 5.0), (5.0, 0.2, 1.0)):  # looked at along the longest side too
+        box = np.array(list(itertools.product((-x, x), (-y, y), (-z, z))))
+        for view in ((0, 90), (0, 89), (90, 0), (-65, 20)):
+            camera = Camera.framing(box, view=view)
+            forward, right, up = camera.axes()
+            local = box - camera.eye
+            tangent = np.tan(np.radians(camera.fov / 2)) * (local @ forward)
+            assert np.abs(local @ right / tangent / (16 / 9) + camera.center[0]).max() < 0.881
+            assert np.abs(local @ up / tangent + camera.center[1]).max() < 0.841
     assert [nice_number(x) for x in (1.0, 0.3, 49.0, 50.0)] == pytest.approx([1.0, 0.2, 20.0, 50.0])
 
 
@@ -608,10 +623,18 @@ def test_bad_targets(tmp_path):
             writer.open(StubSim(worlds=1))
     with pytest.raises(OutputError, match="color_range"):
         USDWriter(tmp_path / "o.usdc", color_range=(1.0, 1.0))
-    with pytest.raises(OutputError, match="pixels"):
-        PNGWriter(tmp_path / "o.png", size=(0, 10))
-    with pytest.raises(OutputError, match="50 frames"):
-        GIFWriter(tmp_path / "o.gif", fps=60)
+    for bad in ((0, 10), 3, "ab", (100.5, 100), (100, 100, 100)):
+        with pytest.raises(ModelError, match=r"size: .*pixels"):
+            PNGWriter(tmp_path / "o.png", size=bad)
+    for bad in (3, (1, 2, 3), "ab", (0, 91), (np.nan, 0)):
+        with pytest.raises(ModelError, match="view"):
+            PNGWriter(tmp_path / "o.png", view=bad)
+    for bad in (60, 0, "x"):
+        with pytest.raises(ModelError, match="50 frames"):
+            GIFWriter(tmp_path / "o.gif", fps=bad)
+    for options, text in (({"fps": "x"}, "fps"), ({"color": 3}, "color"), ({"fields": "von_mises"}, "fields")):
+        with pytest.raises(ModelError, match=text):
+            USDWriter(tmp_path / "o.usdc", **options)
     assert left_over(tmp_path) == ["file"]
 
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.errors import OutputError
+from warpfea.base.checks import is_number
+from warpfea.base.errors import ModelError, OutputError
 
 __all__ = [
     "FrameClock",
@@ -89,8 +90,8 @@ class FrameClock:
     """
 
     def __init__(self, fps: float) -> None:
-        if not (np.isfinite(fps) and fps > 0):
-            raise OutputError(f"frames per second must be positive and finite, got {fps!r}")
+        if not (is_number(fps) and fps > 0):
+            raise ModelError(f"fps: frames per second must be positive and finite, got {fps!r}")
         self.fps = float(fps)
         self.last = -np.inf
         self._next = -np.inf

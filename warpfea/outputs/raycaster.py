@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from warpfea.base.console import quiet_warp
-from warpfea.base.errors import OutputError
+from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.colormap import to_linear, to_srgb
 from warpfea.outputs.frames import scatter_rows, unit_rows
 
-__all__ = ["VIEW", "Camera", "Renderer", "nice_number"]
+__all__ = ["VIEW", "Camera", "Renderer", "check_view", "nice_number"]
 
 Floats = npt.NDArray[np.floating[Any]]
 Image = npt.NDArray[np.uint8]
@@ -55,28 +55,50 @@ class Camera:
     ) -> Camera:
         """The camera at (azimuth, elevation) degrees that shows all `points` (P, 3).
 
-        `margins` (left, right, bottom, top) are the shares of the picture kept free.
+        `margins` (left, right, bottom, top) are the shares of the picture kept free. ModelError for a `view` that is
+        not two finite numbers, or an elevation beyond +-90.
         """
+        view = check_view(view)
         low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
         size = max(0.5 * float(np.linalg.norm(high - low)), 1e-9)
-        azimuth, elevation = np.radians(view)
+        # straight down or up the vertical leaves the picture's right side open: a hair off it, the azimuth tells
+        azimuth, elevation = np.radians((view[0], np.clip(view[1], -89.999, 89.999)))
         back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         left, right_, bottom, top = margins
         share = np.array([1.0 - left - right_, 1.0 - bottom - top])
         tangent = np.tan(np.radians(0.5 * fov)) * np.array([aspect, 1.0])
         center = (left - right_, bottom - top)
-        target, distance = 0.5 * (low + high), 2.0 * size
-        for _ in range(30):  # move sideways to centre what is seen, then to the distance where it just fits
-            camera = cls(target + distance * back, target, fov, center, size)
-            forward, right, up = camera.axes()
-            local = (points - camera.eye) @ np.stack([right, up, forward], axis=1)
-            depth = np.maximum(local[:, 2], 0.05 * size)
-            seen = local[:, :2] / depth[:, None] / tangent
-            mid, half = 0.5 * (seen.max(axis=0) + seen.min(axis=0)), 0.5 * np.ptp(seen, axis=0)
-            move = mid * tangent * distance
-            target = target + right * move[0] + up * move[1]
-            distance = max(distance * float(np.clip((half / share).max(), 0.5, 2.0)), 1.02 * size)
+        middle = 0.5 * (low + high)
+        forward, right, up = cls(middle + back, middle).axes()
+        local = (points - middle) @ np.stack([right, up, forward], axis=1)
+        distance = 1.02 * size
+        for side, slope in zip(local[:, :2].T, tangent * share):  # all |side - eye| <= slope (depth + distance)
+            reach = (side - slope * local[:, 2]).max() - (side + slope * local[:, 2]).min()
+            distance = max(distance, 0.5 * float(reach) / slope)
+        offset = [_centre(side, local[:, 2] + distance) for side in local[:, :2].T]
+        target = middle + right * offset[0] + up * offset[1]
         return cls(target + distance * back, target, fov, center, size)
+
+
+def check_view(view: Any) -> tuple[float, float]:
+    """(azimuth, elevation) degrees. ModelError unless it is two finite numbers, the elevation within +-90."""
+    try:
+        azimuth, elevation = map(float, view)
+    except (TypeError, ValueError):
+        azimuth = elevation = np.nan
+    if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
+        raise ModelError(f"view must be (azimuth, elevation) in degrees, the elevation within +-90, got {view!r}")
+    return azimuth, elevation
+
+
+def _centre(side: Floats, depth: Floats) -> float:
+    """Where the eye stands along one axis so that the points (P,) reach as far to both sides of the picture."""
+    low, high = float(side.min()), float(side.max())
+    for _ in range(60):  # what is seen moves one way as the eye moves: halve
+        eye = 0.5 * (low + high)
+        seen = (side - eye) / depth
+        low, high = (eye, high) if seen.max() + seen.min() > 0.0 else (low, eye)
+    return 0.5 * (low + high)
 
 
 class Renderer:

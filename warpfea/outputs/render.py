@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.errors import OutputError
+from warpfea.base.checks import is_count, is_number
+from warpfea.base.errors import ModelError
 from warpfea.base.names import did_you_mean
 from warpfea.base.writer import Output, check_target
 from warpfea.outputs.frames import (
@@ -25,7 +26,7 @@ from warpfea.outputs.frames import (
     is_static,
     time_of,
 )
-from warpfea.outputs.raycaster import VIEW, Camera, Renderer
+from warpfea.outputs.raycaster import VIEW, Camera, Renderer, check_view
 from warpfea.outputs.reel import Frame, Reel
 from warpfea.outputs.usd_check import in_words
 
@@ -34,11 +35,15 @@ __all__ = ["Camera", "GIFWriter", "PNGWriter", "Renderer", "render_usd"]
 Floats = npt.NDArray[np.floating[Any]]
 
 
-def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
-    width, height = map(int, size)
-    if not (32 <= width <= 8192 and 32 <= height <= 8192):
-        raise OutputError(f"a picture must have 32 to 8192 pixels each way, got {size!r}")
-    return width, height
+def _checked_size(size: Any) -> tuple[int, int]:
+    try:
+        width, height = size
+        known = all(32 <= k <= 8192 and k == int(k) for k in (width, height))
+    except (TypeError, ValueError):
+        known = False
+    if not known:
+        raise ModelError(f"size: a picture must have (width, height) of 32 to 8192 pixels each way, got {size!r}")
+    return int(width), int(height)
 
 
 class _Drawing(Output):
@@ -58,7 +63,9 @@ class _Drawing(Output):
         ground: bool,
     ) -> None:
         self.path = pathlib.Path(path)
-        self.field, self.size, self.view = field, _checked_size(size), view
+        if not isinstance(field, (str, type(None))):
+            raise ModelError(f"field must be the name of a field, or None for grey, got {field!r}")
+        self.field, self.size, self.view = field, _checked_size(size), check_view(view)
         self.color_range, self.spacing, self.ground = check_colors(color_range), spacing, ground
         self._reel: Reel | None = None
 
@@ -100,7 +107,8 @@ class PNGWriter(_Drawing):
         color_range: (low, high) of the colours, by default the extremes of what is drawn.
         spacing: of worlds (m). ground: whether to draw the ground, at the lowest point.
 
-    OutputError: bad size, suffix or folder (at `open`), a file that can't be written (at `close`).
+    ModelError: a bad size, view or field. OutputError: a bad colour range, a bad suffix or folder (at `open`), a file
+    that can't be written (at `close`).
     """
 
     suffix = ".png"
@@ -204,13 +212,13 @@ class GIFWriter(_Drawing):
 
 
 def check_rates(fps: float, speed: float, max_frames: int) -> None:
-    """OutputError for values that an animation can't have."""
-    if not 0 < fps <= 50:
-        raise OutputError(f"a GIF plays up to 50 frames per second, got fps={fps!r}")
-    if not (np.isfinite(speed) and speed > 0):
-        raise OutputError(f"speed must be positive and finite, got {speed!r}")
-    if max_frames < 2:
-        raise OutputError(f"max_frames must be at least 2, got {max_frames!r}")
+    """ModelError for values that an animation can't have."""
+    if not (is_number(fps) and 0 < fps <= 50):
+        raise ModelError(f"a GIF plays up to 50 frames per second, got fps={fps!r}")
+    if not (is_number(speed) and speed > 0):
+        raise ModelError(f"speed must be positive and finite, got {speed!r}")
+    if not (is_count(max_frames) and max_frames >= 2):
+        raise ModelError(f"max_frames must be at least 2, got {max_frames!r}")
 
 
 def render_usd(
@@ -237,13 +245,16 @@ def render_usd(
         color_range: (low, high) of the colours; None: those of the file, or the extremes of the run.
         size: (width, height), default (960, 540) for PNG and (640, 360) for GIF.
 
-    OutputError: missing or unreadable file, not written by warpfea, no mesh, no such field, unknown suffix.
+    Raises:
+        ModelError: an option out of range, a file that is missing or not one of warpfea, no such field or time.
+        OutputError: `out` can't be written, or has an unknown suffix.
     """
     target = check_target(out, (".png", ".gif"))
     animated = target.suffix.lower() == ".gif"
     size = _checked_size(size or ((640, 360) if animated else (960, 540)))
     check_rates(fps, speed, max_frames)
     color_range = check_colors(color_range)
+    view = check_view(view)
     source = _Source(pathlib.Path(path))
     if animated:
         count = int(np.floor((source.end - source.start) * fps / speed * (1 + 1e-9))) + 1
@@ -256,7 +267,7 @@ def render_usd(
         at = source.end if time is None else float(time)
         slack = 1e-6 * max(1.0, source.end - source.start)
         if not source.start - slack <= at <= source.end + slack:
-            raise OutputError(f"{path}: time {at:g} s lies outside {source.start:g} .. {source.end:g} s")
+            raise ModelError(f"{path}: time {at:g} s lies outside {source.start:g} .. {source.end:g} s")
         times = np.array([at])
     reel = source.reel(field, times)
     reel.shown = color_range or reel.shown
@@ -275,18 +286,18 @@ class _Source:
 
         self.path = path
         if not path.is_file():
-            raise OutputError(f"{path}: no such file")
+            raise ModelError(f"{path}: no such file")
         try:
             self.stage = Usd.Stage.Open(str(path))
         except Tf.ErrorException as error:
-            raise OutputError(f"{path}: not a readable USD file ({in_words(error)})") from error
+            raise ModelError(f"{path}: can't be read as USD ({in_words(error)})") from error
         self.meshes = [UsdGeom.Mesh(prim) for prim in self.stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
         if not self.meshes:
-            raise OutputError(f"{path}: holds no mesh")
+            raise ModelError(f"{path}: holds no mesh")
         root = self.stage.GetDefaultPrim()
         self.about: Any = root.GetCustomDataByKey("warpfea") if root else None
         if not self.about:
-            raise OutputError(f"{path}: was not written by warpfea")
+            raise ModelError(f"{path}: was not written by warpfea")
         self.rate = self.stage.GetTimeCodesPerSecond()
         self.start, self.end = (
             self.stage.GetStartTimeCode() / self.rate,
@@ -301,12 +312,12 @@ class _Source:
         if name is not None and name not in self.about["fields"]:
             have = ", ".join(self.about["fields"]) or "none"
             hint = did_you_mean(name, self.about["fields"])
-            raise OutputError(f"{self.path}: has no field {name!r}; fields: {have}{hint}")
+            raise ModelError(f"{self.path}: has no field {name!r}; fields: {have}{hint}")
         triangles, first = [], 0
         for mesh in self.meshes:
             counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
             if (counts != 3).any():
-                raise OutputError(f"{self.path}: {mesh.GetPath()} has faces that are not triangles")
+                raise ModelError(f"{self.path}: {mesh.GetPath()} has faces that are not triangles")
             triangles.append(np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) + first)
             first += len(mesh.GetPointsAttr().Get(self.start * self.rate))
         start = self._points(self.start)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.errors import OutputError
+from warpfea.base.errors import ModelError, OutputError
 from warpfea.base.writer import Output, check_target, temporary_beside
 from warpfea.outputs.colormap import map_colors
 from warpfea.outputs.frames import (
@@ -62,8 +62,12 @@ class USDWriter(Output):
             settings and end at the present time.
 
     Frames go into the layer as they come, and binary layers to disk every 32 MB. The state at `close` is always the
-    last frame. OutputError: bad suffix or folder, or a file that can't be extended (at `open`), positions that are not
-    finite (at `write`), a file that does not validate (at `close`; the target is then left as it was).
+    last frame.
+
+    Raises:
+        ModelError: a bad `fps`, `fields` or `color`.
+        OutputError: bad suffix or folder, or a file that can't be extended (at `open`), positions that are not finite
+            (at `write`), a file that does not validate (at `close`; the target is then left as it was).
     """
 
     def __init__(
@@ -80,6 +84,10 @@ class USDWriter(Output):
         self.path = pathlib.Path(path)
         self.fps = FrameClock(fps).fps
         self.color = color
+        if isinstance(fields, str) or not all(isinstance(name, str) for name in fields):
+            raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {fields!r}")
+        if not isinstance(color, (str, type(None))):
+            raise ModelError(f"color must be the name of a field, or None for grey, got {color!r}")
         self.fields = list(dict.fromkeys([*fields, *([color] if color else [])]))
         self.color_range = check_colors(color_range)
         self.spacing = spacing
@@ -100,15 +108,17 @@ class USDWriter(Output):
         self._box = (np.full(3, np.inf), np.full(3, -np.inf))
         self._unsaved = 0
         self._temporary = temporary_beside(target)
+        going_on = self.extend and target.is_file()
         try:
-            if self.extend and target.is_file():
+            if going_on:
                 self._take_up(sim, target)
                 return
             self._stage = stage = Usd.Stage.CreateNew(str(self._temporary))
         except (OSError, Tf.ErrorException) as error:
             self.abort()
             reason = in_words(error) if isinstance(error, Tf.ErrorException) else error.strerror
-            raise OutputError(f"{target}: can't be written ({reason})") from error
+            what = "read or continued" if going_on else "written"
+            raise OutputError(f"{target}: can't be {what} ({reason})") from error
         except OutputError:
             self.abort()
             raise

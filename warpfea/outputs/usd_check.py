@@ -14,6 +14,8 @@ __all__ = ["in_words", "validate_usd"]
 def in_words(error: Exception) -> str:
     """What USD says went wrong, without the places in its source."""
     texts = re.findall(r" : '(.*)'\s*$", str(error), re.MULTILINE)
+    if texts and texts[0].startswith("Cannot determine file format"):
+        return "it is no USD file"
     return texts[0] if texts else "USD gives no reason"
 
 
