@@ -110,7 +110,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
-        """dP = dF S + F dS. With dF = d h_j^T, dP h_i is the integrand of Eq. (35) times d."""
+        """The tangent: dP = dF S + F dS. With dF = d h_j^T, dP h_i is the integrand of Eq. (35) times d."""
         F = t.identity() + G
         S = t.isotropic(t.green(G), c[0], c[1])
         dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[0], c[1])

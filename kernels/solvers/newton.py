@@ -43,7 +43,13 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
-        """Phi of Eq. (18) at the trial, over dq/dv, with what terms hold in the search."""
+        """Phi of Eq. (18) at the trial, over dq/dv, with what terms hold in the search.
+
+        Phi = 1/2 (v - v~).M (v - v~) c_M - f_held.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv), whose derivative by v
+        is the residual, Eq. (17). Of the sums over a world: inertia and the forces held, f_held (dead loads, and forces
+        without a potential as the search began), are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc, J, are
+        elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is term_sums[0].
+        """
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
         if wp.static(stored):
             energy += ctl.term_sums[0, world]
