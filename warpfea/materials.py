@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -85,6 +86,14 @@ class Material:
     law: ClassVar[str]
     density: Any = field(default=None, kw_only=True)
     damping: KelvinVoigt | None = field(default=None, kw_only=True)
+
+    def __new__(cls, *_: Any, **options: Any) -> Self:
+        """ModelError where E or nu is given to a law that takes other constants: its from_E_nu is meant."""
+        taken = inspect.signature(cls.__init__).parameters
+        if hasattr(cls, "from_E_nu") and not {"E", "nu"} & set(taken) and {"E", "nu"} & set(options):
+            name = cls.__name__
+            raise ModelError(f"{name}: E and nu are not its constants; {name}.from_E_nu(E=, nu=) takes them")
+        return super().__new__(cls)
 
     def coefficients(self) -> tuple[float, float, float]:
         """Device coefficients of the law."""

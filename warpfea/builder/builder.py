@@ -406,7 +406,7 @@ class ModelBuilder:
     # the end
 
     def finalize(self, *, device: Any = None, dtype: str = "float64", worlds: int = 1) -> Model:
-        """Make the constant Model of what was described; Warp starts quietly.
+        """Make the constant Model of what was described so far; what is added later is for the next `finalize`.
 
         Args:
             device: Warp device, e.g. "cpu" or "cuda:0"; by default CUDA where there is one, else the CPU.
@@ -418,10 +418,10 @@ class ModelBuilder:
                 no density.
 
         Warns:
-            MeshWarning: a body is larger than a kilometre, heavier than 1e7 kg, or as small as dust: a wrong unit?
+            MeshWarning: a size, mass or density that a wrong unit is likely to have made.
         """
         if np.any(self.gravity):
-            require_density(self.bodies, "gravity")
+            require_density(self.bodies, "gravity needs, and any motion")  # no "or gravity=(0, 0, 0)": motion is next
         for force in self.description.body_forces:
             require_density(force.bodies, "add_body_force")
         with quiet_warp():

@@ -31,6 +31,8 @@ SIZES = (1e-6, 1e3)
 """Least and largest plausible size of a body, m: the longest side of its box."""
 MASSES = (1e-12, 1e7)
 """Least and largest plausible mass of a body, kg: a grain of dust, and more than a steel tower of 300 m."""
+DENSITIES = (1.0, 3e4)
+"""Least and largest plausible density, kg/m^3: an aerogel, and more than osmium."""
 HANDLES: dict[type, str] = {
     Body: "the body",
     NodeSet: "nodes (body.nodes)",
@@ -65,8 +67,9 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
 
 
 def warn_implausible(model: Any) -> None:
-    """Warn (MeshWarning) of bodies of a size or mass that a wrong unit of length is likely to have made."""
+    """Warn (MeshWarning) of a size, mass or density that a wrong unit is likely to have made."""
     for body in model.bodies:
+        _warn_of_densities(body)
         low, high = body.mesh.bounding_box()
         size = float(np.max(high - low))
         mass = None
@@ -79,9 +82,27 @@ def warn_implausible(model: Any) -> None:
         what = f"is {size:.3g} m long" + ("" if mass is None else f" and weighs {mass:.3g} kg")
         hint = "lengths are in metres, density in kg/m^3"
         if body.mesh.path is not None:
-            unit = "; a mesh in mm needs scale=1e-3" if large else "; was it scaled twice?"
-            hint = f"is {body.mesh.label} in metres{unit}"
+            hint = f"was {body.mesh.label} scaled twice? Its lengths are read in metres"
+            if large:
+                hint = f"is {body.mesh.label} in mm? Then give scale=1e-3 (--scale 1e-3); it is read in metres"
         warnings.warn(f"body {body.name!r} {what}: {hint}", MeshWarning, stacklevel=3)
+
+
+def _warn_of_densities(body: Body) -> None:
+    for group, material in body.materials:
+        if material.density is None:
+            continue
+        values = material.density(body.mesh.points) if callable(material.density) else material.density
+        low, high = float(np.min(values)), float(np.max(values))
+        if DENSITIES[0] <= low and high <= DENSITIES[1]:
+            continue
+        law = type(material).__name__ + (f" of group {group!r}" if group else "")
+        odd = low if low < DENSITIES[0] else high
+        warnings.warn(
+            f"body {body.name!r}: the density of {law} is {odd:.3g} kg/m^3. Is it in another unit? Steel has 7850",
+            MeshWarning,
+            stacklevel=4,
+        )
 
 
 def vector(value: Any, what: str) -> np.ndarray:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["FIELDS", "Results"]
 
+SHOWN = 5
+"""Bodies that a message names."""
+
 FIELDS = {"von_mises": FieldSpec("von Mises stress", "Pa"), "displacement": FieldSpec("displacement", "m")}
 """Scalar fields of every model; terms have their own."""
 
@@ -29,6 +32,18 @@ class Results:
     model: Model
     state: State
 
+    def check_body(self, body: Any, what: str) -> None:
+        """Raise ModelError unless `body` is the handle of a body of this model; the text begins with `what`."""
+        if not isinstance(body, Body):
+            names = ", ".join(repr(b.name) for b in self.model.bodies[:SHOWN])
+            names += f" and {len(self.model.bodies) - SHOWN} more" if len(self.model.bodies) > SHOWN else ""
+            raise ModelError(
+                f"{what}: expected a body, by the handle that add_solid, add_beam or add_shell returned (of {names}), "
+                f"got {body!r}"
+            )
+        if body not in self.model.bodies:
+            raise ModelError(f"{what}: body {body.name!r} is not of this model")
+
     def _rows(self, body: Body, values: np.ndarray) -> np.ndarray:
         """Slot values to mesh nodes, (B, nodes, 3); nodes that no element uses get 0."""
         out = np.zeros((self.model.worlds, len(body.mesh.points), 3))
@@ -37,15 +52,18 @@ class Results:
         return out
 
     def displacements(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m, in the mesh file's node order."""
+        """(B, nodes, 3) m, in the mesh file's node order. ModelError if the body is not of this model."""
+        self.check_body(body, "displacements")
         return self._rows(body, self.state.displacement.numpy())
 
     def positions(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m."""
+        """(B, nodes, 3) m. ModelError if the body is not of this model."""
+        self.check_body(body, "positions")
         return body.mesh.points + self.displacements(body)
 
     def velocities(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m/s."""
+        """(B, nodes, 3) m/s. ModelError if the body is not of this model."""
+        self.check_body(body, "velocities")
         return self._rows(body, self.state.velocity.numpy())
 
     def placed(self, body: Body, weights: Any) -> np.ndarray:
@@ -89,8 +107,7 @@ class Results:
 
         The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
         """
-        if not isinstance(body, Body):
-            raise ModelError(f"field: expected field(name, body), got field({name!r}, {body!r})")
+        self.check_body(body, f"field({name!r}, body)")
         self.check_field(name)
         if name == "displacement":
             return np.linalg.norm(self.displacements(body), axis=2)
@@ -114,6 +131,7 @@ class Results:
 
         Of a beam or shell, F turns the node's axes (body.node_axes) into the present ones.
         """
+        self.check_body(body, "node_gradients")
         if not body.family.has_gradients:
             raise ModelError(f"body {body.name!r}: element {body.family.name} has no gradients at its nodes")
         out = np.full((self.model.worlds, len(body.mesh.points), 3, 3), np.nan)

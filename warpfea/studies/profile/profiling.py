@@ -24,6 +24,7 @@ import numpy as np
 import warp as wp
 
 from ...base.checks import is_count
+from ...base.console import quiet_warp
 from ...base.errors import ModelError
 from ...base.launch import PARTS, kernel_name
 from ...kernels.common.probe import probe_kernels
@@ -331,8 +332,9 @@ def _empty_launch(device: Any) -> float:
     """Seconds that an empty launch takes by the recorder's means: the median of single ones."""
     device = wp.get_device(device)
     flags = wp.zeros(1, dtype=wp.int32, device=device)
-    command = wp.launch(probe_kernels().empty, dim=1, inputs=[flags], device=device, record_cmd=True)
-    command.launch()
+    with quiet_warp():  # its module is loaded now
+        command = wp.launch(probe_kernels().empty, dim=1, inputs=[flags], device=device, record_cmd=True)
+        command.launch()
     if device.is_cuda:
         wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
         for _ in range(EMPTY_LAUNCHES):
