@@ -120,10 +120,10 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         f = gathered(topo, contribution, world, slot)
         own = f
         if wp.static(pooled):
-            pushed = vec3()
+            of_pool = vec3()
             for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
-                pushed += balance.pool_force[world, topo.pool_entry[k]]
-            f += pushed
+                of_pool += balance.pool_force[world, topo.pool_entry[k]]
+            f += of_pool
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             j = topo.mass_column[k]
@@ -149,7 +149,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 magnitude[k] = magnitude[k] + T(wp.abs(tie[0][k]))
         if wp.static(pooled):  # what a body is squeezed between cancels its own forces: each alone is a scale
             for k in range(3):
-                magnitude[k] = magnitude[k] + wp.abs(pushed[k])
+                magnitude[k] = magnitude[k] + wp.abs(of_pool[k])
         balance.inertia[world, slot] = a
         balance.internal[world, slot] = f
         balance.g[world, slot] = residual_force
