@@ -36,6 +36,8 @@ def test_results_are_of_bodies_of_the_model():
             ask(other)
         with pytest.raises(wf.ModelError, match=f"{name}.*expected a body, by the handle .*'bar'.*got 'bar'"):
             ask("bar")
+    with pytest.raises(wf.ModelError, match="reaction: body 'bar' is not of this model"):
+        sim.reaction(other.nodes("x-"))
     assert sim.positions(body).shape == (1, len(body.mesh.points), 3)
 
 

@@ -116,6 +116,8 @@ STUDY_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "steps": ("--steps", {"type": count, "metavar": "N", "help": "steps of each run"}),
     "joints": ("--joints", {"type": counts, "metavar": "N,N,...", "help": "joints per chain (default 10,100,1000)"}),
     "sizes": ("--sizes", {"type": counts, "metavar": "N,N,...", "help": "unknowns (default 100,300,1000,3000,10000)"}),
+    "before": ("--before", {"metavar": "FOLDER", "help": "checkout of the other version"}),
+    "bench": ("--bench", {"default": "--cpu", "metavar": "WORDS", "help": "options of warpfea bench (default --cpu)"}),
     "repeat": (
         "--repeat",
         {"type": count, "default": 3, "metavar": "N", "help": "runs; the median counts (default 3)"},

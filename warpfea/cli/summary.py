@@ -58,7 +58,7 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     `analysis` is "dynamic" or "static"; `t_end` the time that was reached, of statics `load` the part of the load, 0 to
     1, with `steps` load steps; `mass` is null where a density is missing, `bounding_box` that of the reference;
     `wall_s` are the seconds from building to the closing of files, `compile_s` those of them in which the simulation
-    was made; `min_J` is the smallest det F of any step that this process did, null where there is none; `rough_steps`
+    was made; `min_J` is the smallest det F of any step, null where there is none; `rough_steps`
     are those accepted short of the tolerance (Jacobi); energies and probes are the last values,
     of statics the strain energy alone; `violation` is the largest of the constraints in any step, m.
     """

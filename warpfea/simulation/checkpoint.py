@@ -7,6 +7,7 @@ goes on bit for bit as it would have gone on undisturbed.
 from __future__ import annotations
 
 import json
+import math
 import os
 import pathlib
 import zipfile
@@ -83,6 +84,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "steps": sim.steps,
         "max_residual": sim.max_residual,
         "max_violation": sim.max_violation,
+        "min_J": sim.min_J if math.isfinite(sim.min_J) else None,
         "probes": [probe.name for probe in sim.model.probes],
     }
     arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
@@ -132,6 +134,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     sim.steps = int(meta["steps"])
     sim.max_residual = float(meta["max_residual"])
     sim.max_violation = float(meta.get("max_violation", 0.0))
+    sim.min_J = math.inf if meta.get("min_J") is None else float(meta["min_J"])
     sim._history = list(history)
     sim.last = idle_report(sim)
 

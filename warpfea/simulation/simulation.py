@@ -351,6 +351,7 @@ class Simulation(Results):
         """
         if not isinstance(nodes, NodeSet):
             raise ModelError(f"reaction: expected nodes (body.nodes), got {nodes!r}")
+        self.check_body(nodes.body, "reaction")
         g = self.stepper.work.g.numpy() * (1.0 - self.model.free_host)
         first = nodes.body.node_slot[nodes.indices]
         rows = nodes.body.slot_offset + first[first >= 0]

@@ -135,6 +135,16 @@ _ENTRIES = (
         results=("device_agreement.json",),
     ),
     Entry(
+        name="versions",
+        module="versions",
+        summary="run times of two versions, alternated",
+        about="Runs `warpfea bench` with the package of another checkout and with this one in turns, and compares the "
+        "medians of ms per step and the iterations, row by row.",
+        options=("before", "bench", "repeat"),
+        example="--before ../before --bench '--cpu --limit 5' --repeat 5 --out tests/results/versions_cpu.json",
+        results=("versions_cpu.json", "versions_h200.json"),
+    ),
+    Entry(
         name="peer-meshes",
         module="bench.peer_meshes",
         summary="make the unstructured meshes of `warpfea bench --peer` with Gmsh",
