@@ -131,3 +131,22 @@ def test_data_that_lies_in_the_checkout_alone_is_named(monkeypatch, capsys, tmp_
     err = capsys.readouterr().err
     assert "chrono_3243_3443.json" in err
     assert "checkout" in err
+
+
+def test_versions_compares_medians():
+    from warpfea.studies.reports.versions import merge
+
+    def runs(*times):
+        return [[{"label": "a", "unknowns": 3, "ms_per_step": ms, "newton_per_step": 2.0}] for ms in times]
+
+    (row,) = merge(runs(1.0, 9.0, 2.0), runs(3.0, 2.5, 0.1))
+    assert row["label"] == "a 3"
+    assert (row["before"], row["now"], row["ratio"]) == (2.0, 2.5, 1.25)
+    assert row["before_ms"] == [1.0, 9.0, 2.0]
+    assert row["newton_per_step"] == [2.0, 2.0]
+    assert list(merge(runs(1.0), [[]])) == []
+
+
+def test_versions_wants_a_checkout(tmp_path, capsys):
+    assert main(["study", "versions", "--before", str(tmp_path)]) == 2
+    assert "--before" in capsys.readouterr().err

@@ -136,13 +136,12 @@ _ENTRIES = (
     ),
     Entry(
         name="versions",
-        module="versions",
+        module="reports.versions",
         summary="run times of two versions, alternated",
         about="Runs `warpfea bench` with the package of another checkout and with this one in turns, and compares the "
         "medians of ms per step and the iterations, row by row.",
         options=("before", "bench", "repeat"),
         example="--before ../before --bench '--cpu --limit 5' --repeat 5 --out tests/results/versions_cpu.json",
-        results=("versions_cpu.json", "versions_h200.json"),
     ),
     Entry(
         name="peer-meshes",

@@ -17,12 +17,12 @@ import tempfile
 from collections.abc import Iterator
 from typing import Any
 
-from ..base.errors import UsageError
-from .reports.parts import Rows, check_out, run_tables
+from ...base.errors import UsageError
+from .parts import Rows, check_out, run_tables
 
 __all__ = ["merge", "run"]
 
-HERE = pathlib.Path(__file__).resolve().parents[2]
+HERE = pathlib.Path(__file__).resolve().parents[3]
 COUNTS = ("newton_per_step", "pcg_per_step")
 
 
