@@ -107,7 +107,7 @@ class Results:
 
         The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
         """
-        self.check_body(body, f"field({name!r}, body)")
+        self.check_body(body, "field(name, body)")
         self.check_field(name)
         if name == "displacement":
             return np.linalg.norm(self.displacements(body), axis=2)

@@ -124,6 +124,11 @@ class Residual:
         out.mass_factor, out.dq_dv, out.warp = w.step.mass_factor, w.step.dq_dv, w.warp
         return out
 
+    @property
+    def block_kernels(self) -> list[Any]:
+        """Kernels of the blocks of elements."""
+        return self.elements.kernels(self.at)
+
     def modules(self) -> set[wp.Module]:
         """Modules of the gather, and of the matrix where there is one; those of the terms are theirs."""
         out = {self.gather.module}
