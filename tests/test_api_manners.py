@@ -51,12 +51,11 @@ def test_laws_name_the_way_by_E_and_nu():
 
 
 def test_units_that_look_wrong_are_asked_about():
-    for density, text in ((7.85e-9, r"7\.85e-09 kg/m\^3. Is it in another unit"), (1e6, "1e[+]06 kg")):
-        with pytest.warns(wf.MeshWarning, match=f"the density of SVK is {text}"):
-            builder(density)[0].finalize(device="cpu")
+    with pytest.warns(wf.MeshWarning, match=r"the density of SVK is 7\.85e-09 kg/m\^3. Is it in another unit"):
+        builder(7.85e-9)[0].finalize(device="cpu")
     with pytest.warns(wf.MeshWarning, match="lengths are in metres"):
         builder(size=(2e3, 0.2, 0.2))[0].finalize(device="cpu")
-    for density in (1.0, 3e4, np.array([1.0, 20.0] * 6), lambda X: 1000.0 + X[:, 0]):
+    for density in (1.0, 1e6, np.array([1.0, 20.0] * 6), lambda X: 1000.0 + X[:, 0]):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             builder(density)[0].finalize(device="cpu")
