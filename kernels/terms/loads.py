@@ -201,8 +201,8 @@ def law_function_kernel(function: wp.Function, scalar: bool, take_dtype: str):
 
 
 @functools.lru_cache(maxsize=256)
-def body_force_kernel(function: wp.Function, dtype: str, slots: int, points: int, take_dtype: str):
-    """Kernel of Eq. (23): f_i = sum_q rho w s_i b(r_q, t), with b evaluated at the current position."""
+def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
+    """Kernel of Eq. (23): f_i = sum_q rho w s_i b(r_q, t), b at the current position; one serves all elements."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     take = precision(take_dtype)
@@ -228,21 +228,22 @@ def body_force_kernel(function: wp.Function, dtype: str, slots: int, points: int
         elem = members[k]
         column = elem % block.shape.shape[2]
         count = members.shape[0]
-        for i in range(wp.static(slots)):
+        slots = block.conn.shape[0]
+        for i in range(slots):
             contribution[world, offset + i * count + k] = vec3()
-        for q in range(wp.static(points)):
+        for q in range(block.field_weight.shape[0]):
             r = vec3()
-            for i in range(wp.static(slots)):
+            for i in range(slots):
                 s = block.conn[i, elem]
                 r += block.shape[q, i, column] * (reference[s] + u[world, s])
             x = take.vec3(origin + wp.vec3d(r))
             b = vec3(function(x, take.T(time[world])))
             f = (T(ramp[world]) * block.field_weight[q, elem]) * b
-            for i in range(wp.static(slots)):
+            for i in range(slots):
                 e = offset + i * count + k
                 contribution[world, e] = contribution[world, e] + block.shape[q, i, column] * f
 
-    return wp.Kernel(func=fill, module=_unique_module("field", function, dtype, slots, points, take_dtype))
+    return wp.Kernel(func=fill, module=_unique_module("field", function, dtype, take_dtype))
 
 
 _names: dict[str, list[wp.Function]] = {}

@@ -10,7 +10,6 @@ import numpy as np
 import warp as wp
 
 from .. import elements as families
-from ..elements import Rule
 from ..kernels.terms.loads import body_force_kernel
 from ..model import assembly
 from ..model.description import BodyForce
@@ -72,10 +71,10 @@ class BodyForces(Term):
                 first += len(host.elements)
                 if host.body not in force.bodies or block.key.part:  # one part of an element's energy stands for it
                     continue
-                rule = self._tables(block)
+                self._tables(block)
                 take = argument_precision(force.function, m.dtype)
                 field = FieldPart(
-                    kernel=body_force_kernel(force.function, m.dtype, block.slots, len(rule.weights), take),
+                    kernel=body_force_kernel(force.function, m.dtype, take),
                     block=block,
                     members=m.array("loads", members, wp.int32),
                     origin=wp.vec3d(*host.body.origin),
@@ -85,7 +84,7 @@ class BodyForces(Term):
                 out.append((field, host.conn + host.body.slot_offset))
         return out
 
-    def _tables(self, block: Any) -> Rule:
+    def _tables(self, block: Any) -> None:
         """Shape functions and rho w at the points of the mass rule, made once per block."""
         m = self.model
         rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.parts]
@@ -103,7 +102,6 @@ class BodyForces(Term):
             block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
             block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
             block.field_rule = rule
-        return block.field_rule
 
     def modules(self, at: At) -> Iterable[wp.Module]:
         return {field.kernel.module for field in self.parts_of_fields}
