@@ -11,9 +11,7 @@ RENAMED = ("pushed", "massive", "lagged", "guess")
 """Words for which the code has terms of the field: nonpotential, with_mass, reused, predictor."""
 
 # to be done: this set may only shrink
-WITHOUT: set[str] = {
-    "warpfea/builder/scene.py:Parameter.required",
-}
+WITHOUT: set[str] = set()
 
 
 def files(folder):

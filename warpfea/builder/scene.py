@@ -53,6 +53,7 @@ class Parameter:
 
     @property
     def required(self) -> bool:
+        """There is no default."""
         return self.default is REQUIRED
 
     @property
