@@ -1,0 +1,103 @@
+"""What a case of the stress suite is told, and what it answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+__all__ = ["CASES", "Answer", "Case", "Setting", "case"]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a case runs on."""
+
+    device: str
+    dtype: str
+
+    @property
+    def single(self) -> bool:
+        """In float32."""
+        return self.dtype == "float32"
+
+
+@dataclass
+class Answer:
+    """What a case found. It passes where every `error` is within its `bound`.
+
+    Attributes:
+        error: what is judged, usually a relative error against `reference`; NaN fails.
+        bound: largest error that passes.
+        reference: where the right answer comes from.
+        newton, pcg, halvings: of the whole case, the worst world's.
+        limits: further numbers that must not exceed a bound, {name: (value, bound)}, such as Newton iterations.
+        largest_step: largest stable step found, s.
+        drift: of the energy, relative.
+        violation: of constraints, over the model's size.
+        min_J, floor: as in StepReport, the worst of the case.
+        note: a line for the table.
+    """
+
+    error: float
+    bound: float
+    reference: str
+    newton: int = 0
+    pcg: int = 0
+    halvings: int = 0
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    largest_step: float | None = None
+    drift: float | None = None
+    violation: float | None = None
+    min_J: float | None = None
+    floor: float | None = None
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether everything is within its bound."""
+        return self.error <= self.bound and all(value <= bound for value, bound in self.limits.values())
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case: a function of the setting, or of the setting and one of `values`, that returns an Answer.
+
+    Attributes:
+        name: as users type it; rows are called NAME or NAME/VALUE.
+        group: heading of the table.
+        run: the function.
+        values: one row each; (None,): a single row.
+        quick: which rows belong to the quick suite, "none", "float64" or "both" precisions.
+        refusal: {dtype: texts}: there the case may end with an error of warpfea whose text holds one of `texts` instead
+            of an answer; with `must`, has to.
+        must: an answer fails: the case is to be refused.
+    """
+
+    name: str
+    group: str
+    run: Callable[..., Answer]
+    values: tuple[Any, ...]
+    quick: str
+    refusal: dict[str, tuple[str, ...]]
+    must: bool
+    about: str
+
+
+CASES: dict[str, Case] = {}
+"""By name, in the order of their definition."""
+
+
+def case(
+    name: str, group: str, *, values: Sequence[Any] = (None,), quick: str = "none",
+    refusal: dict[str, Sequence[str]] | None = None, must: bool = False,
+) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:  # fmt: skip
+    """Add a function to `CASES`; see Case. The first line of its docstring says what is tried."""
+
+    def add(run: Callable[..., Answer]) -> Callable[..., Answer]:
+        texts = {dtype: tuple(t) for dtype, t in (refusal or {}).items()}
+        about = (run.__doc__ or "").strip().splitlines()[0]
+        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must, about)
+        return run
+
+    return add
