@@ -65,8 +65,8 @@ def element_kernels(
     ):
         """Internal force contributions (N), Eqs. (32) and (70), strain energy and viscous potential (J) by element.
 
-        `lanes` threads share the quadrature points of an element. The smallest J goes to `min_J`, and to `domain_J` for
-        laws that need J > 0.
+        `lanes` threads share the quadrature points of an element. The smallest J goes to `min_J`, and for laws that need
+        J > 0 that of the points to `domain_J`: at the vertices, which count in `min_J`, such a law has no barrier.
         """
         world, index = wp.tid()
         if active[world] == 0:
@@ -79,8 +79,6 @@ def element_kernels(
         psi = T(0.0)
         psi_v = T(0.0)
         J_low = T(1.0e30)
-        if wp.static(needs_J):
-            J_low = fn.vertex_jacobian(block, U, elem)
         V = Local()
         if wp.static(damping == "rate"):
             V = fn.load(block, v, world, elem)
@@ -104,15 +102,35 @@ def element_kernels(
         stored = row_sum(wp.float64(psi), lanes)
         lost = row_sum(wp.float64(psi_v), lanes)
         low = wp.float64(J_low)
-        if low < min_J[world]:
-            wp.atomic_min(min_J, world, low)
         if wp.static(needs_J):
             if low < domain_J[world]:
                 wp.atomic_min(domain_J, world, low)
+            low = wp.min(low, wp.float64(fn.vertex_jacobian(block, U, elem)))
+        if low < min_J[world]:
+            wp.atomic_min(min_J, world, low)
         if lane == 0 and index < block.count * lanes:
             fn.store(block, f, world, elem, contribution)
             energy[0, world, block.element_offset + elem] = stored
             energy[1, world, block.element_offset + elem] = lost
+
+    @wp.kernel(module=module)
+    def turned_over(
+        block: Block,
+        before: wp.array2d(dtype=vec3),
+        u: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        turned: wp.array(dtype=wp.int32),
+    ):
+        """Flag the worlds with a quadrature point that had J > 0 at `before` and has J <= 0 at u."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = fn.load(block, u, world, elem)
+        past = fn.load(block, before, world, elem)
+        for point in range(block.gradient.shape[0]):
+            if T(1.0) + t.volume_change(fn.gradient_of(block, U, point, elem)) <= T(0.0):
+                if T(1.0) + t.volume_change(fn.gradient_of(block, past, point, elem)) > T(0.0):
+                    turned[world] = 1
 
     @wp.kernel(module=module)
     def tangent_product(
@@ -180,6 +198,7 @@ def element_kernels(
     return _types.SimpleNamespace(
         module=module,
         internal_force=internal_force,
+        turned_over=turned_over,
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,
         **vars(matrix_kernels(dtype, law, slots, affine, damping, framed)),

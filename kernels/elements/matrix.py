@@ -85,6 +85,8 @@ def matrix_kernels(
         block: Block,
         U: Local,
         V: Local,
+        step: Local,
+        mixed: int,
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.float64,
         c: coef,
@@ -96,7 +98,9 @@ def matrix_kernels(
         """F with columns along the law's axes, and the second Piola-Kirchhoff stress S there, Pa.
 
         `form` 0: S with its viscous part; 1: without it, and with compression removed. Of laws that need J > 0, S is
-        the viscous part alone; their elastic tangent comes whole from `increment` or `stand_in`.
+        the viscous part alone; their elastic tangent comes whole from `increment` or `stand_in`. `mixed`: S is that of
+        the linear prediction (mixed integration points, Magisano, Leonetti and Garcea 2017), `step` the last change of
+        the slots, m; see `foreseen`.
         """
         G = fn.gradient_of(block, U, point, elem)
         local = fn.into_axes(block, G, point, elem)
@@ -111,6 +115,9 @@ def matrix_kernels(
                 Fdot = fn.velocity_gradient(block, V, point, elem)
                 rate = fn.strain_rate(block, local, Fdot, history, T(dq_dv), world, point, elem)
                 S += t.isotropic(rate, c[LAMBDA_V], c[ETA])
+        if mixed != 0 and form == 0:
+            ahead = fn.into_axes(block, fn.gradient_of(block, step, point, elem), point, elem)
+            S += fn.foreseen(local, ahead, c, T(dq_dv))
         if wp.static(framed):
             F = F * block.frame[point, elem]
         return F, S
@@ -123,11 +130,29 @@ def matrix_kernels(
         else:
             return Local()
 
+    @wp.func
+    def last_step(
+        block: Block,
+        v: wp.array2d(dtype=vec3),
+        base: wp.array2d(dtype=vec3),
+        mixed: int,
+        dq_dv: wp.float64,
+        world: int,
+        elem: int,
+    ) -> Local:
+        """Change of an element's slots by the last iteration, m; zeros where it is not wanted."""
+        step = Local()
+        if mixed != 0:
+            step = T(dq_dv) * (fn.load(block, v, world, elem) - fn.load(block, base, world, elem))
+        return step
+
     @wp.kernel(module=module)
     def prepare_matrix(
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
+        base: wp.array2d(dtype=vec3),
+        mixed: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         form: int,
@@ -137,14 +162,15 @@ def matrix_kernels(
         """F and S of `point_state`, which all columns of an element's matrix need: [world, 5 point + row, elem].
 
         Rows 0 to 2 are those of F, row 3 is the diagonal of S, row 4 its components (23, 13, 12). `form`: see
-        `element_matrix`.
+        `element_matrix`; `base`: v at the iterate before, for worlds that are `mixed`.
         """
         world, point, elem = wp.tid()
         if active[world] == 0:
             return
         U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
         c = fn.coefficients(block, world, elem)
-        F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, point, elem)
+        step = last_step(block, v, base, mixed[world], dq_dv[world], world, elem)
+        F, S = point_state(block, U, V, step, mixed[world], history, dq_dv[world], c, form, world, point, elem)
         for i in range(3):
             lines[world, 5 * point + i, elem] = F[i]
         lines[world, 5 * point + 3, elem] = vec3(S[0, 0], S[1, 1], S[2, 2])
@@ -282,6 +308,8 @@ def matrix_kernels(
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
+        base: wp.array2d(dtype=vec3),
+        mixed: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         form: int,
@@ -295,7 +323,7 @@ def matrix_kernels(
 
         Args:
             matrix: [world, elem, row_of(panel, a)], K_ab over the slots b of a panel, see `rows_type`.
-            form, add: see `element_matrix`.
+            form, add: see `element_matrix`; base, mixed: see `prepare_matrix`.
         """
         world, elem = wp.tid()
         if active[world] == 0:
@@ -308,12 +336,13 @@ def matrix_kernels(
         if wp.static(damping == "incremental" or damping == "rate"):
             moduli += t.isotropic_moduli(cv[0], cv[1])
         U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
+        step = last_step(block, v, base, mixed[world], dq_dv[world], world, elem)
         if add == 0:
             for k in range(matrix.shape[2]):
                 matrix[world, elem, k] = Rows()
         h, H = Local(), Slots()
         for point in range(block.gradient.shape[0]):
-            F, S = point_state(block, U, V, history, dq_dv[world], c, form, world, point, elem)
+            F, S = point_state(block, U, V, step, mixed[world], history, dq_dv[world], c, form, world, point, elem)
             into = t.identity()
             if wp.static(framed):
                 into = wp.transpose(block.frame[point, elem])

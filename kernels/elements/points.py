@@ -61,7 +61,7 @@ def point_functions(
     coef = wp.types.vector(length=NCOEF, dtype=T)
     Local = local_type(dtype, slots)
     load, store = load_functions(dtype, slots, Block)
-    NS = slots
+    NS, needs_J = slots, law not in materials.ANY_J
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
 
     @wp.func
@@ -198,6 +198,25 @@ def point_functions(
         return J
 
     @wp.func
+    def foreseen(G: mat33, dG: mat33, c: coef, dq: T) -> mat33:
+        """S of the linear prediction from the iterate before, G - dG, over S at G, Pa; both in the law's axes.
+
+        With stresses linear in E it is -C : (dG^T dG)/2, what a linear step does not see; of other laws
+        S + dS - S(G) with dS = F^-1 (dP - dF S) at G - dG.
+        """
+        if wp.static(needs_J):
+            past = G - dG
+            Fi = wp.inverse(t.identity() + past)
+            S = Fi * m.stress(past, c)
+            ahead = S + Fi * (m.increment(past, dG, c) - dG * S)
+            change = t.sym(ahead - wp.inverse(t.identity() + G) * m.stress(G, c))
+        else:
+            change = -m.stiffness(T(0.5) * wp.transpose(dG) * dG, c)
+        if wp.static(damping == "incremental"):
+            change = change - t.isotropic(T(0.5) * wp.transpose(dG) * dG, c[LAMBDA_V] / dq, c[ETA] / dq)
+        return change
+
+    @wp.func
     def point_increment(
         block: Block,
         G: mat33,
@@ -245,11 +264,12 @@ def point_functions(
 
     return _types.SimpleNamespace(
         types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
-        framed=framed, needs_J=law not in materials.ANY_J,
+        framed=framed, needs_J=needs_J,
         coefficients=coefficients, damping_coefficients=damping_coefficients, load=load, store=store,
         inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
         weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
         into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,
         strain_rate=strain_rate, vertex_jacobian=vertex_jacobian, point_increment=point_increment,
+        foreseen=foreseen,
         tangent_force=tangent_force,
     )  # fmt: skip

@@ -70,6 +70,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
     Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
     rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
+    mixed_module = kernel_module(f"{name}_mixed")
 
     @wp.func
     def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
@@ -93,6 +94,14 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         return first, second, e
 
     @wp.func
+    def foreseen(block: Block, step: Local, e: Ties, elem: int) -> Ties:
+        """The shears of the linear prediction from the iterate before, m^2; `step` is the last change of the slots, m."""
+        out = e
+        for t in range(NT):
+            out[t] = out[t] - wp.dot(line(block.first, step, t, elem), line(block.second, step, t, elem))
+        return out
+
+    @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
         """s = mu A e, the derivative of the energy by the shears, N/m."""
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
@@ -104,6 +113,24 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                 total += block.coupling[t, k, elem] * e[first + k]
             s[t] = mu * total
         return s
+
+    @wp.func
+    def tangent_force(
+        block: Block, P: Local, x1: TieVectors, x2: TieVectors, e: Ties, world: int, elem: int
+    ) -> Local:
+        """Forces for a change P of the slots, with x_a, x_b and the shears e of the geometric part, N."""
+        de = Ties()
+        for t in range(NT):
+            de[t] = wp.dot(x1[t], line(block.second, P, t, elem)) + wp.dot(x2[t], line(block.first, P, t, elem))
+        s = stresses(block, e, world, elem)
+        ds = stresses(block, de, world, elem)
+        f = Local()
+        for t in range(NT):
+            da = ds[t] * x1[t] + s[t] * line(block.first, P, t, elem)
+            dd = ds[t] * x2[t] + s[t] * line(block.second, P, t, elem)
+            for i in range(NS):
+                f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
+        return f
 
     @wp.kernel(module=module)
     def internal_force(
@@ -154,18 +181,32 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         U = load(block, u, world, elem)
         P = load(block, direction, world, elem)
         x1, x2, e = kinematics(block, U, elem)
-        de = Ties()
-        for t in range(NT):
-            de[t] = wp.dot(x1[t], line(block.second, P, t, elem)) + wp.dot(x2[t], line(block.first, P, t, elem))
-        s = stresses(block, e, world, elem)
-        ds = stresses(block, de, world, elem)
-        f = Local()
-        for t in range(NT):
-            da = ds[t] * x1[t] + s[t] * line(block.first, P, t, elem)
-            dd = ds[t] * x2[t] + s[t] * line(block.second, P, t, elem)
-            for i in range(NS):
-                f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
-        store(block, f, world, elem, contribution)
+        store(block, tangent_force(block, P, x1, x2, e, world, elem), world, elem, contribution)
+
+    @wp.kernel(module=mixed_module)
+    def mixed_product(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        base: wp.array2d(dtype=vec3),
+        mixed: wp.array(dtype=wp.int32),
+        history: wp.array2d(dtype=sym6),
+        dq_dv: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """`tangent_product` with the shear stress of the linear prediction; see kernels/elements/mixed.py."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = load(block, u, world, elem)
+        x1, x2, e = kinematics(block, U, elem)
+        if mixed[world] != 0:
+            change = load(block, v, world, elem) - load(block, base, world, elem)
+            e = foreseen(block, T(dq_dv[world]) * change, e, elem)
+        P = load(block, direction, world, elem)
+        store(block, tangent_force(block, P, x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=module)
     def diagonal_blocks(
@@ -202,6 +243,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
+        base: wp.array2d(dtype=vec3),
+        mixed: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         form: int,
@@ -225,6 +268,10 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         a = block.X_first[tie, elem] + da
         d = block.X_second[tie, elem] + dd
         shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
+        if mixed[world] != 0:
+            change = load(block, v, world, elem) - load(block, base, world, elem)
+            factor = T(dq_dv[world]) * T(dq_dv[world])
+            shear -= factor * wp.dot(line(block.first, change, tie, elem), line(block.second, change, tie, elem))
         lines[world, tie, elem] = a
         lines[world, NT + tie, elem] = d
         lines[world, 2 * NT + tie, elem] = vec3(shear, T(0.0), T(0.0))
@@ -295,6 +342,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
+        base: wp.array2d(dtype=vec3),
+        mixed: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         form: int,
@@ -321,6 +370,9 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                 second[row, a % P] = s
                 for i in range(3):
                     B[3 * row + i, a % P] = f * d2[i] + s * d1[i]
+        if mixed[world] != 0:
+            change = load(block, v, world, elem) - load(block, base, world, elem)
+            e = foreseen(block, T(dq_dv[world]) * change, e, elem)
         stress = Ties()
         if form != 1:
             stress = stresses(block, e, world, elem)
@@ -367,5 +419,6 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         element_matrix=element_matrix,
         internal_force=internal_force,
         tangent_product=tangent_product,
+        mixed_product=mixed_product,
         diagonal_blocks=diagonal_blocks,
     )

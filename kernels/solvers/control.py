@@ -8,12 +8,16 @@ __all__ = [
     "COMPONENT_ROWS",
     "FAIL_CONSTRAINT",
     "FAIL_CURVATURE",
+    "FAIL_FLOOR",
     "FAIL_GROWTH",
+    "FAIL_INVERTED",
     "FAIL_ITERATIONS",
     "FAIL_JACOBIAN",
     "FAIL_LIMIT",
     "FAIL_LINE_SEARCH",
     "FAIL_NAN",
+    "FAIL_WORK",
+    "FLOOR_ROWS",
     "LANES",
     "TERM_ROWS",
     "control_struct",
@@ -27,8 +31,12 @@ FAIL_CURVATURE = 5
 FAIL_CONSTRAINT = 6
 FAIL_GROWTH = 7
 FAIL_LIMIT = 8
+FAIL_FLOOR = 9
+FAIL_INVERTED = 10
+FAIL_WORK = 11
 
 COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
+FLOOR_ROWS = 5  # -g.p, inertia.(v - v~), strain energy, largest |p| and |u|
 LANES = 32
 TERM_ROWS = 3
 """Rows summed per world of what terms store: the potential with what is held in a line search (multipliers, caps), the
@@ -86,6 +94,31 @@ def control_struct():
         fixed_forcing: wp.int32  # all solves go as far as the first, whatever Newton's method needs
         tol: wp.float64
         eps: wp.float64
+        # where full steps are taken although Phi rises, see judging.py
+        leaps: wp.array(dtype=wp.int32)  # such steps since the best iterate
+        mixed: wp.array(dtype=wp.int32)  # H has the stress of the linear prediction
+        tame: wp.array(dtype=wp.int32)  # the next step must satisfy Armijo
+        mark: wp.array(dtype=wp.int32)  # the base of the last step is the best iterate
+        restoring: wp.array(dtype=wp.int32)  # the trial is the best iterate
+        best_phi: wp.array(dtype=wp.float64)
+        best_norm: wp.array(dtype=wp.float64)
+        # where rounding stops the residual
+        strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left
+        strict_count: wp.array(dtype=wp.int32)
+        eta: wp.array(dtype=wp.float64)  # that error, over the size of the solution; of the last such solve
+        last_eta: wp.array(dtype=wp.float64)
+        floor: wp.array(dtype=wp.float64)  # the largest eta that was accepted in this step, 0: none
+        floor_bound: wp.float64  # largest that is
+        floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, component, lane]
+        negative: wp.array(dtype=wp.int32)  # the last solve met a direction without positive curvature
+        any_strict: wp.array(dtype=wp.int32)
+        # the first iterate
+        potential: wp.array(dtype=wp.float64)  # strain energy of the state, J
+        choose: wp.array(dtype=wp.int32)  # it is to be chosen among others
+        any_choice: wp.array(dtype=wp.int32)
+        turned: wp.array(dtype=wp.int32)  # the iterate turned an element inside out
+        any_turned: wp.array(dtype=wp.int32)
+        refuse_inversion: wp.int32
         rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
         max_iterations: wp.int32
         components: wp.int32

@@ -52,7 +52,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     f64 = wp.float64
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
     shared = newton_kernels(dtype, traits)
-    measure, record = shared.measure, shared.record
+    measure, record, accept = shared.measure, shared.record, shared.accept
     paired = acceleration in ("secants", "anderson")
     module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'gated', 'limited')}")
 
@@ -76,7 +76,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_LIMIT
         elif ctl.excess[world] <= f64(1.0):
-            ctl.active[world] = 0
+            accept(ctl, world)
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
             if ctl.norm[world] > jac.growth * jac.first_norm[world]:
@@ -84,9 +84,9 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             if wp.static(traits.gated):
                 if ctl.open[world] * ctl.constraint_tol > jac.gap:
                     ctl.failed[world] = FAIL_CONSTRAINT
-            # not rough where rounding explains what is left
-            if ctl.failed[world] == 0 and ctl.floor_excess[world] > f64(1.0):
+            if ctl.failed[world] == 0:
                 ctl.rough[world] = 1
+                accept(ctl, world)
 
     @wp.kernel(module=module)
     def begin(ctl: Newton, jac: Jacobi):

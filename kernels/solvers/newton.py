@@ -7,16 +7,10 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module
-from .control import (
-    FAIL_CONSTRAINT,
-    FAIL_CURVATURE,
-    FAIL_ITERATIONS,
-    FAIL_JACOBIAN,
-    FAIL_LIMIT,
-    FAIL_LINE_SEARCH,
-    FAIL_NAN,
-    control_struct,
-)
+from .control import FAIL_CONSTRAINT, FAIL_CURVATURE, FAIL_FLOOR, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_LINE_SEARCH, FAIL_NAN
+from .control import FAIL_WORK, LANES, control_struct
+from .judging import TRIES, judging_functions
+from .pcg import pcg_struct
 from .vectors import vector_kernels
 
 __all__ = ["newton_kernels"]
@@ -24,10 +18,15 @@ __all__ = ["newton_kernels"]
 ARMIJO = 1.0e-4
 WOLFE = 0.8
 NOISE = 100.0  # Phi is blind below this many roundings of its parts
-FLOOR = 16.0
 MAX_SEARCH = 20
 REUSED_SEARCH = 2
-PREDICTED = 1.0e-3
+LEAPS = 5
+"""Full steps in a row that may raise Phi: with the stress of the linear prediction in H, a slender body comes to its
+equilibrium over iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
+RIGID = 64.0
+"""Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
+HOPELESS = 3.0
+"""A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
 
 
 @functools.cache
@@ -38,136 +37,13 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     """
     f64 = wp.float64
     Control = control_struct()
+    PCG = pcg_struct()
     stored, gated, limited = traits.stored, traits.gated, traits.limited
+    judging = judging_functions(traits)
+    objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
+    measure, settle, fail = judging.measure, judging.settle, judging.fail
+    accept, give_up = judging.accept, judging.give_up
     module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited')}")
-
-    @wp.func
-    def objective(ctl: Control, world: int) -> f64:
-        """Phi of Eq. (18) at the trial, over dq/dv, with what terms hold in the search.
-
-        Phi = 1/2 (v - v~).M (v - v~) c_M - f_held.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv), whose derivative by v
-        is the residual, Eq. (17). Of the sums over a world: inertia and the forces held, f_held (dead loads, and forces
-        without a potential as the search began), are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc, J, are
-        elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is term_sums[0].
-        """
-        energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
-        if wp.static(stored):
-            energy += ctl.term_sums[0, world]
-        return ctl.slot_sums[4, world] + energy / ctl.dq_dv[world]
-
-    @wp.func
-    def magnitude(ctl: Control, world: int) -> f64:
-        """Sum of the magnitudes of Phi's parts: its rounding is a few eps of it."""
-        energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
-        if wp.static(stored):
-            energy += ctl.term_sums[2, world]
-        return ctl.slot_sums[5, world] + energy / ctl.dq_dv[world]
-
-    @wp.func
-    def largest_violation(ctl: Control, world: int) -> f64:
-        """Of the constraints of all components, m."""
-        largest = f64(0.0)
-        for c in range(ctl.components):
-            largest = wp.max(largest, ctl.violation[world, c])
-        return largest
-
-    @wp.func
-    def measure(ctl: Control, world: int):
-        """Norms and acceptance of the residual just evaluated, for each component apart where there are several.
-
-        Components that do not touch must not hide behind each other's forces, and a converged one is left alone.
-        """
-        force = wp.sqrt(ctl.slot_sums[9, world])
-        ctl.force[world] = force
-        largest = f64(0.0)
-        excess = f64(0.0)
-        floor_excess = f64(0.0)
-        solve = f64(0.0)
-        solve_accept = f64(1.0e300)
-        for c in range(ctl.components):
-            g2 = ctl.slot_sums[0, world]
-            f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
-            spread = ctl.slot_sums[8, world]
-            if ctl.components > 1:
-                g2 = ctl.component_sums[0, world, c]
-                f2 = wp.max(
-                    ctl.component_sums[1, world, c],
-                    wp.max(ctl.component_sums[2, world, c], ctl.component_sums[3, world, c]),
-                )
-                spread = ctl.component_sums[4, world, c]
-            norm = wp.sqrt(g2)
-            scale = wp.sqrt(f2)
-            accept = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
-            if force > f64(0.0):
-                # the force's tolerance in this norm, as they compare at this iterate
-                accept = wp.max(accept, norm * (ctl.force_tol / force))
-            if ctl.predicted[world] != 0:
-                accept = f64(PREDICTED) * accept  # what is left would add up over steps that none solves for
-            loud = norm > accept
-            if wp.static(gated):
-                if ctl.violation[world, c] > ctl.constraint_tol:
-                    loud = True
-                    excess = wp.max(excess, ctl.violation[world, c] / ctl.constraint_tol)
-                    floor_excess = f64(1.0e300)
-            ctl.quiet[world, c] = wp.where(loud, 0, 1)
-            if loud:
-                solve += g2
-                solve_accept = wp.min(solve_accept, accept)
-                rounding = f64(2.0) * ctl.eps * wp.sqrt(spread)
-                if wp.static(gated):
-                    if ctl.classical != 0:  # the residual holds rho c, and so kappa times the rounding of places
-                        rounding = rounding / (ctl.slack * ctl.slack)
-                floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
-            ratio = norm / wp.max(scale, f64(1.0e-300))
-            largest = wp.max(largest, ratio)
-            excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))
-        if wp.static(gated):
-            ctl.open[world] = largest_violation(ctl, world) / ctl.constraint_tol
-        ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
-        ctl.relative[world] = largest
-        ctl.excess[world] = excess
-        ctl.floor_excess[world] = floor_excess
-        ctl.solve_norm[world] = wp.sqrt(solve)
-        ctl.solve_accept[world] = solve_accept
-
-    @wp.func
-    def record(ctl: Control, world: int):
-        """Keep the relative residual of the iterate, for messages."""
-        k = ctl.iterations[world]
-        if k < ctl.history.shape[1]:
-            ctl.history[world, k] = ctl.relative[world]
-
-    @wp.func
-    def unsatisfied(ctl: Control, world: int) -> bool:
-        """Whether forces balance but constraints do not hold: more iterations only raise the multipliers."""
-        balanced = wp.max(ctl.tol, wp.min(f64(1.0e3) * ctl.tol, f64(1.0e-4)))
-        return ctl.relative[world] <= balanced and ctl.open[world] > f64(1.0)
-
-    @wp.func
-    def settle(ctl: Control, world: int):
-        """End the iteration where it has converged, stands still within rounding, or used up its iterations."""
-        record(ctl, world)
-        stalled = ctl.iterations[world] > 0 and ctl.reduction[world] > f64(0.5) and ctl.reused[world] == 0
-        if ctl.excess[world] <= f64(1.0) or (stalled and ctl.floor_excess[world] <= f64(1.0)):
-            ctl.active[world] = 0
-        elif ctl.iterations[world] >= ctl.max_iterations:
-            ctl.active[world] = 0
-            ctl.failed[world] = FAIL_ITERATIONS
-            if wp.static(gated):
-                if unsatisfied(ctl, world):
-                    ctl.failed[world] = FAIL_CONSTRAINT
-
-    @wp.func
-    def fail(ctl: Control, world: int, why: int):
-        """End without convergence, unless rounding alone explains what is left of the residual."""
-        ctl.active[world] = 0
-        ctl.searching[world] = 0
-        within = ctl.floor_excess[world] <= f64(1.0) and ctl.iterations[world] > 0
-        if not (within and why != FAIL_NAN):
-            ctl.failed[world] = why
-            if wp.static(gated):
-                if why != FAIL_NAN and why != FAIL_JACOBIAN and unsatisfied(ctl, world):
-                    ctl.failed[world] = FAIL_CONSTRAINT
 
     @wp.kernel(module=module)
     def reset_min_J(ctl: Control, active: wp.array(dtype=wp.int32)):
@@ -177,24 +53,79 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.min_J[world] = f64(1.0e30)
             ctl.domain_J[world] = f64(1.0e30)
 
-    @wp.kernel(module=module)
-    def begin(ctl: Control):
-        """Judge the first iterate."""
-        world = wp.tid()
-        if ctl.active[world] == 0:
-            return
+    @wp.func
+    def start(ctl: Control, world: int):
+        """Judge the iterate that Newton's method begins from."""
         measure(ctl, world)
         phi = objective(ctl, world) + ctl.slot_sums[7, world]
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = magnitude(ctl, world)
         ctl.forcing[world] = ctl.first_forcing
         ctl.reused[world] = 0
+        ctl.leaps[world] = 0
+        ctl.mixed[world] = 0
+        ctl.tame[world] = 0
+        ctl.mark[world] = 0
+        ctl.restoring[world] = 0
+        ctl.strict[world] = 0
+        ctl.strict_count[world] = 0
+        ctl.negative[world] = 0
+        ctl.eta[world] = f64(1.0e30)
+        ctl.slope[world] = f64(0.0)
         if ctl.domain_J[world] <= f64(0.0):
-            fail(ctl, world, FAIL_JACOBIAN)
+            give_up(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
-            fail(ctl, world, FAIL_NAN)
+            give_up(ctl, world, FAIL_NAN)
         else:
             settle(ctl, world)
+
+    @wp.func
+    def hopeless(ctl: Control, world: int) -> bool:
+        """Whether another first iterate should be looked for: Phi is above a bound of Phi at q_n, or J <= 0.
+
+        At q_n Phi is the strain energy of the state and a kinetic energy, which row 10 of `residual` has for backward
+        Euler and a third of which for BDF2.
+        """
+        phi = objective(ctl, world)
+        bound = ctl.potential[world] / ctl.dq_dv[world] + f64(HOPELESS) * ctl.slot_sums[10, world]
+        bound += f64(NOISE) * ctl.eps * magnitude(ctl, world)
+        # written so that NaN is hopeless too
+        return not (phi <= bound and ctl.min_J[world] > f64(0.0))
+
+    @wp.kernel(module=module)
+    def begin(ctl: Control, stage: int):
+        """Judge the first iterate; `stage` 0: it is the only one. 1: others may be better. 2: it was chosen."""
+        world = wp.tid()
+        if stage != 2:
+            ctl.choose[world] = 0
+        if ctl.active[world] == 0 or (stage == 2 and ctl.choose[world] == 0):
+            return
+        if stage == 1:
+            if hopeless(ctl, world):
+                ctl.choose[world] = 1
+                wp.atomic_max(ctl.any_choice, 0, 1)
+                return
+        start(ctl, world)
+
+    @wp.kernel(module=module)
+    def compare(ctl: Control, first: int, better: wp.array(dtype=wp.int32)):
+        """Flag the worlds where the first iterate just evaluated is the best yet: J > 0 before Phi."""
+        world = wp.tid()
+        better[world] = 0
+        if first != 0 and world == 0:
+            ctl.any_choice[0] = 0
+        if ctl.choose[world] == 0:
+            return
+        phi = objective(ctl, world)
+        if not (wp.isfinite(phi) and ctl.domain_J[world] > f64(0.0)):
+            phi = f64(1.0e300)
+        low = wp.min(ctl.min_J[world], f64(0.0))
+        if first != 0 or low > ctl.best_norm[world] or (low == ctl.best_norm[world] and phi < ctl.best_phi[world]):
+            ctl.best_phi[world] = phi
+            ctl.best_norm[world] = low
+            better[world] = 1
+            if first == 0:
+                ctl.predicted[world] = 0
 
     @wp.kernel(module=module)
     def free_step(ctl: Control):
@@ -204,7 +135,37 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.limit[world] = f64(1.0)
 
     @wp.kernel(module=module)
-    def begin_search(ctl: Control):
+    def judge_floor(ctl: Control):
+        """The error that a residual stands for, over the size of the solution, of the worst component.
+
+        With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv).
+        """
+        world = wp.tid()
+        if world == 0:
+            ctl.any_strict[0] = 0
+        if ctl.strict[world] == 0:
+            return
+        dq = ctl.dq_dv[world]
+        worst = f64(0.0)
+        for c in range(ctl.components):
+            if ctl.quiet[world, c] == 0:
+                work, kinetic, strain, step, size = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
+                for lane in range(LANES):
+                    work += ctl.floor_sums[0, world, c, lane]
+                    kinetic += ctl.floor_sums[1, world, c, lane]
+                    strain += ctl.floor_sums[2, world, c, lane]
+                    step = wp.max(step, ctl.floor_sums[3, world, c, lane])
+                    size = wp.max(size, ctl.floor_sums[4, world, c, lane])
+                eta = f64(1.0e30)
+                if ctl.negative[world] == 0 and wp.isfinite(work) and work >= f64(0.0):
+                    eta = wp.sqrt(work * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
+                    if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * size:
+                        eta = dq * step / wp.max(size, f64(1.0e-300))
+                worst = wp.max(worst, eta)
+        ctl.eta[world] = worst
+
+    @wp.kernel(module=module)
+    def begin_search(ctl: Control, pcg: PCG, max_work: int):
         """Take the slope along the new direction; try the full step first."""
         world = wp.tid()
         if ctl.active[world] == 0:
@@ -218,6 +179,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.searches[world] = 0
         ctl.searching[world] = 1
         ctl.predicted[world] = 0
+        ctl.mark[world] = 0
         if wp.static(stored):
             ctl.stepped[world] = 0
         if wp.static(gated):
@@ -226,15 +188,49 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         barred = False
         if wp.static(limited):
             barred = not ctl.limit[world] > f64(0.0)
-        if not wp.isfinite(slope):
+        strict = ctl.strict[world]
+        ctl.strict[world] = 0
+        if strict != 0:
+            eta = ctl.eta[world]
+            if eta <= ctl.floor_bound:
+                ctl.floor[world] = wp.max(ctl.floor[world], eta)
+                accept(ctl, world)
+                return
+            tries = ctl.strict_count[world] + 1
+            ctl.strict_count[world] = tries
+            if eta < f64(1.0e30) and (tries >= TRIES or (tries > 1 and eta > f64(0.5) * ctl.last_eta[world])):
+                give_up(ctl, world, FAIL_FLOOR)
+                return
+            ctl.last_eta[world] = eta
+        if pcg.total[world] >= max_work:
+            give_up(ctl, world, FAIL_WORK)
+        elif not wp.isfinite(slope):
             fail(ctl, world, FAIL_NAN)
         elif barred:
             fail(ctl, world, FAIL_LIMIT)
         elif slope >= f64(0.0):
             if ctl.reused[world] != 0:
                 ctl.alpha[world] = f64(0.0)
+            elif ctl.leaps[world] > 0:
+                ctl.restoring[world] = 1
             else:
                 fail(ctl, world, FAIL_CURVATURE)
+
+    @wp.func
+    def watch(ctl: Control, world: int, old_phi: f64, old_norm: f64):
+        """After a full step that raised Phi, or one that followed such: go back to the best iterate where the residual
+        has not halved nor Phi fallen below that of the best one for too long."""
+        if ctl.leaps[world] == 0:
+            ctl.mark[world] = 1
+            ctl.best_phi[world] = old_phi
+            ctl.best_norm[world] = old_norm
+        ctl.mixed[world] = 1
+        ctl.leaps[world] = ctl.leaps[world] + 1
+        if ctl.norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
+            ctl.leaps[world] = 0
+        elif ctl.leaps[world] >= LEAPS and ctl.active[world] != 0:
+            ctl.restoring[world] = 1
+            ctl.searching[world] = 1
 
     @wp.kernel(module=module)
     def judge_trial(ctl: Control):
@@ -244,13 +240,15 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return
         alpha = ctl.alpha[world]
         old_norm = ctl.norm[world]
+        old_phi = ctl.phi[world]
         # forces held in the search are held with their symmetric tangent: Phi is then as curved as H says
         bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
         phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
         norm = wp.sqrt(ctl.slot_sums[0, world])
-        change = phi - ctl.phi[world]
+        change = phi - old_phi
         noise = f64(NOISE) * ctl.eps * (ctl.phi_magnitude[world] + magnitude(ctl, world))
-        good = wp.isfinite(phi) and wp.isfinite(norm)
+        finite = wp.isfinite(phi) and wp.isfinite(norm)
+        good = finite
         if good:
             if wp.abs(change) > noise:
                 good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
@@ -260,11 +258,16 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 good = True
         if ctl.domain_J[world] <= f64(0.0):
             good = False
-        if ctl.reused[world] != 0 and ctl.iterations[world] == 0 and not norm <= f64(0.5) * old_norm:
+        reused = ctl.reused[world] != 0
+        if reused and ctl.iterations[world] == 0 and not norm <= f64(0.5) * old_norm:
             good = False  # a step must not begin worse than with an operator of its own
             ctl.searches[world] = REUSED_SEARCH
-        stands = alpha == f64(0.0) and ctl.reused[world] != 0
-        if good or stands:
+        stands = alpha == f64(0.0) or ctl.restoring[world] != 0
+        leap = False
+        if finite and not (good or stands or reused):
+            whole = alpha == f64(1.0) and ctl.min_J[world] > f64(0.0) and ctl.negative[world] == 0
+            leap = whole and ctl.tame[world] == 0
+        if good or stands or leap:
             ctl.searching[world] = 0
             measure(ctl, world)
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
@@ -274,9 +277,16 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
             ctl.phi_magnitude[world] = magnitude(ctl, world)
             if stands:
-                ctl.reused[world] = 2
+                if reused:
+                    ctl.reused[world] = 2
+                if ctl.restoring[world] != 0:
+                    ctl.restoring[world] = 0
+                    ctl.leaps[world] = 0
+                    ctl.mixed[world] = 0
+                    ctl.tame[world] = 1
             else:
                 ctl.iterations[world] = ctl.iterations[world] + 1
+                ctl.tame[world] = 0
             ctl.total_iterations[world] = ctl.total_iterations[world] + 1
             ratio = norm / wp.max(old_norm, f64(1.0e-300))
             ctl.reduction[world] = ratio
@@ -287,10 +297,14 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             if ctl.fixed_forcing == 0 and not stands:
                 ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
             settle(ctl, world)
+            if not stands and (leap or ctl.leaps[world] > 0):
+                watch(ctl, world, old_phi, old_norm)
+        elif ctl.leaps[world] > 0:
+            ctl.restoring[world] = 1
         else:
             ctl.searches[world] = ctl.searches[world] + 1
             ctl.alpha[world] = f64(0.5) * alpha
-            if ctl.reused[world] != 0 and ctl.searches[world] > REUSED_SEARCH:
+            if reused and ctl.searches[world] > REUSED_SEARCH:
                 # not the iterate is to blame: stand still, and go on with an operator of its own
                 ctl.alpha[world] = f64(0.0)
             if ctl.searches[world] > MAX_SEARCH:
@@ -328,9 +342,12 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         **vars(vectors),
         module=module,
         measure=measure,
-        record=record,
+        accept=accept,
+        record=judging.record,
         reset_min_J=reset_min_J,
         begin=begin,
+        compare=compare,
+        judge_floor=judge_floor,
         free_step=free_step,
         begin_search=begin_search,
         judge_trial=judge_trial,

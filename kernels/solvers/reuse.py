@@ -124,6 +124,8 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         k = newton.iterations[world]
         need = wp.log10(wp.max(newton.excess[world], f64(1.0)))
         fresh = wp.max(need / f64(DECADES), f64(1.0))
+        if newton.strict[world] != 0 or newton.mixed[world] != 0:
+            reuse.due[world] = 1
         if newton.reused[world] == 2:
             reuse.due[world] = 1
             if k == 0:
@@ -165,6 +167,8 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
+        if newton.mixed[world] != 0:
+            reuse.due[world] = 1  # the state does not hold what it was made from
         made_at = wp.max(reuse.made_at[world], 0)
         # a step that made it on the way began with another matrix: one iteration more counts for that
         count = f64(newton.iterations[world] - made_at + wp.min(made_at, 1))

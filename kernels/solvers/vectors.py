@@ -67,12 +67,71 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         ctl: Control,
         base: wp.array2d(dtype=vec3),
         direction: wp.array2d(dtype=vec3),
+        best: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
     ):
-        """v = base + alpha p."""
+        """v = base + alpha p, or the best iterate where that is to be restored."""
         world, slot = wp.tid()
         if ctl.searching[world] != 0:
-            v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
+            if ctl.restoring[world] != 0:
+                v[world, slot] = best[world, slot]
+            else:
+                v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
+
+    @wp.kernel(module=module)
+    def set_base(
+        ctl: Control,
+        v: wp.array2d(dtype=vec3),
+        base: wp.array2d(dtype=vec3),
+        best: wp.array2d(dtype=vec3),
+    ):
+        """base = v; before, the best iterate = base where that is marked."""
+        world, slot = wp.tid()
+        if ctl.active[world] != 0:
+            if ctl.mark[world] != 0:
+                best[world, slot] = base[world, slot]
+            base[world, slot] = v[world, slot]
+
+    @wp.kernel(module=module)
+    def floor_partial(
+        ctl: Control,
+        start: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        element_start: wp.array(dtype=wp.int32),
+        element: wp.array(dtype=wp.int32),
+        gradient: wp.array2d(dtype=vec3),
+        direction: wp.array2d(dtype=vec3),
+        inertia: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        v_tilde: wp.array2d(dtype=vec3),
+        u: wp.array2d(dtype=vec3),
+        energy: wp.array3d(dtype=f64),
+        sums: wp.array4d(dtype=f64),
+    ):
+        """Strided partial sums of FLOOR_ROWS over the slots and elements of a component; empty lists: all there are."""
+        world, component, lane = wp.tid()
+        if ctl.strict[world] == 0:
+            return
+        work, kinetic, strain, step, size = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
+        for k in range(start[component] + lane, start[component + 1], LANES):
+            i = k
+            if slot.shape[0] > 0:
+                i = slot[k]
+            p = direction[world, i]
+            work -= f64(wp.dot(gradient[world, i], p))
+            kinetic += f64(wp.dot(inertia[world, i], v[world, i] - v_tilde[world, i]))
+            step = wp.max(step, f64(wp.max(wp.abs(p))))
+            size = wp.max(size, f64(wp.max(wp.abs(u[world, i]))))
+        for k in range(element_start[component] + lane, element_start[component + 1], LANES):
+            e = k
+            if element.shape[0] > 0:
+                e = element[k]
+            strain += energy[0, world, e]
+        sums[0, world, component, lane] = work
+        sums[1, world, component, lane] = kinetic
+        sums[2, world, component, lane] = strain
+        sums[3, world, component, lane] = step
+        sums[4, world, component, lane] = size
 
     @wp.kernel(module=module)
     def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):
@@ -99,5 +158,7 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         update_position=update_position,
         trial_velocity=trial_velocity,
         copy_active=copy_active,
+        set_base=set_base,
+        floor_partial=floor_partial,
         dot_rows=dot_rows,
     )

@@ -22,6 +22,7 @@ REPORT = (
     "outer",
     "residual_force",
     "rough",
+    "floor",
 )
 """Columns of the report of a step, [world, column] in float64; probes follow."""
 

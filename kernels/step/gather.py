@@ -17,10 +17,10 @@ from ..terms.constraints import constraint_struct, multiplier_struct
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels"]
 
-RESIDUAL_ROWS = 10
+RESIDUAL_ROWS = 11
 """Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
 part of Phi and its magnitude; g.p with non-potential forces held; what Phi changes by when they are refreshed; the
-squared norm of the rounding of the positions; |g|^2."""
+squared norm of the rounding of the positions; |g|^2; v~.M v~ c_M / 2."""
 
 
 SUM_BLOCKS = {"float64": 6, "float32": 8}
@@ -124,10 +124,12 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
                 of_pool += balance.pool_force[world, topo.pool_entry[k]]
             f += of_pool
-        a = vec3()
+        a, past = vec3(), vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             j = topo.mass_column[k]
-            a += topo.mass_value[k] * (balance.v[world, j] - balance.v_tilde[world, j])
+            before = balance.v_tilde[world, j]
+            a += topo.mass_value[k] * (balance.v[world, j] - before)
+            past += topo.mass_value[k] * before
         a = T(balance.mass_factor[world]) * a
         load = balance.dead[world, slot]
         magnitude = balance.dead_magnitude[world, slot]
@@ -175,6 +177,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         balance.rows[8, world, slot] = spread(balance.u[world, slot], free, D, balance.dq_dv[world])
         plain = wp.cw_mul(residual_force, free)
         balance.rows[9, world, slot] = f64(wp.dot(plain, plain))
+        motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
+        balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)
 
     @wp.func
     def finish(

@@ -11,7 +11,7 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
-from ..solvers.control import control_struct
+from ..solvers.control import FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
 from .control import STATUS, step_struct
 from .ledger import ledger_kernels
@@ -51,6 +51,7 @@ def step_kernels(
         step.refused[world] = 0
         newton.total_iterations[world] = 0
         newton.rough[world] = 0
+        newton.floor[world] = f64(0.0)
         if wp.static(gated):
             newton.outer[world] = 0
         pcg.total[world] = 0
@@ -73,6 +74,7 @@ def step_kernels(
         step.first_refusal[world] = 0
         newton.active[world] = step.running[world]
         newton.searching[world] = 0
+        newton.turned[world] = 0
         if step.running[world] == 0:
             return  # `refused` keeps the verdict of a world that failed earlier in this step
         step.refused[world] = 0
@@ -145,11 +147,45 @@ def step_kernels(
         v[world, slot] = first
 
     @wp.kernel(module=module)
+    def candidate(
+        step: Step,
+        newton: Newton,
+        kind: int,
+        is_position: wp.array(dtype=T),
+        free: wp.array(dtype=vec3),
+        u_n: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        q_tilde: wp.array2d(dtype=vec3),
+        v_tilde: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+    ):
+        """Another first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
+        world, slot = wp.tid()
+        if newton.choose[world] == 0:
+            return
+        dq = T(step.dq_dv[world])
+        new = v_n[world, slot]
+        if kind == 0:
+            new = v_tilde[world, slot] + (dq * is_position[slot]) * vec3(step.gravity[world])
+        elif kind == 2:
+            new = (T(1.0) / dq) * (u_n[world, slot] - q_tilde[world, slot])
+        f = free[slot]
+        old = v[world, slot]
+        for k in range(3):
+            if f[k] != T(0.0):
+                old[k] = new[k]
+        v[world, slot] = old
+
+    @wp.kernel(module=module)
     def end_attempt(step: Step, newton: Newton):
         """Accept the substep, or refuse it and halve."""
         world = wp.tid()
+        if world == 0:
+            newton.any_turned[0] = 0
         if step.running[world] == 0:
             return
+        if newton.turned[world] != 0 and newton.failed[world] == 0:
+            newton.failed[world] = FAIL_INVERTED
         if newton.failed[world] == 0:
             step.accepted[world] = 1
             step.total_J[world] = wp.min(step.total_J[world], newton.min_J[world])
@@ -171,7 +207,11 @@ def step_kernels(
             step.first_refusal[world] = 1
         step.halvings[world] = step.halvings[world] + 1
         level = step.level[world] + 1
-        if level > step.max_halvings:
+        why = newton.failed[world]
+        hopeless = why == FAIL_WORK
+        if wp.static(static):
+            hopeless = hopeless or why == FAIL_FLOOR  # a smaller load step is as ill-conditioned
+        if hopeless or level > step.max_halvings:
             step.status[world] = wp.static(STATUS["failed"])
             step.running[world] = 0
         else:
@@ -190,6 +230,7 @@ def step_kernels(
     @wp.kernel(module=module)
     def commit(
         step: Step,
+        newton: Newton,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         u_n: wp.array2d(dtype=vec3),
@@ -208,6 +249,8 @@ def step_kernels(
                 step.previous_h[world] = step.h[world]
                 step.previous_end[world] = step.new_time[world]
         u_n[world, slot] = u[world, slot]
+        if slot == 0:
+            newton.potential[world] = newton.elem_sums[0, world]
         if wp.static(not static):
             v_n[world, slot] = v[world, slot]
 
@@ -228,6 +271,7 @@ def step_kernels(
         report[world, 10] = f64(0.0)
         report[world, 11] = newton.force[world]
         report[world, 12] = f64(newton.rough[world])
+        report[world, 13] = newton.floor[world]
         if wp.static(gated):
             largest = f64(0.0)
             for c in range(newton.components):
@@ -262,6 +306,7 @@ def step_kernels(
         begin_step=begin_step,
         begin_attempt=begin_attempt,
         predict=predict,
+        candidate=candidate,
         end_attempt=end_attempt,
         failed_now=failed_now,
         commit=commit,

@@ -14,6 +14,7 @@ from ..kernels.elements.element import element_kernels
 from ..kernels.elements.materials import ANY_J, NCOEF
 from ..kernels.elements.points import block_struct
 from ..kernels.elements.tied import tied_kernels, tied_struct
+from ..kernels.elements.mixed import mixed_product
 from ..kernels.elements.with_mass import with_mass_kernel
 from . import assembly
 
@@ -53,6 +54,13 @@ class Block:
         if k.tying:
             return self.kernels
         return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
+
+    def mixed_product(self, dtype: str) -> wp.Kernel:
+        """The kernel of K p with the stress of the linear prediction, without viscosity."""
+        k = self.key
+        if k.tying:
+            return self.kernels.mixed_product
+        return mixed_product(dtype, k.law, self.slots, self.points, k.affine, k.framed)
 
     def with_mass_product(self, dtype: str, damping: str | None) -> wp.Kernel:
         """The kernel of the product of a with_mass block, with a form of damping."""

@@ -198,12 +198,14 @@ class Model:
         return term and term.tables
 
     def _upload_components(self) -> None:
-        """Slots by component, where there are several."""
+        """Slots and elements by component; with one component the lists are empty and stand for all in order."""
+        of_element = np.concatenate([self.component[b.connectivity[:, 0]] for b in self.blocks])
+        for name, of in (("slot", self.component), ("element", of_element)):
+            edges = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=self.component_count))])
+            order = np.argsort(of, kind="stable") if self.component_count > 1 else np.zeros(0)
+            setattr(self, f"component_{name}_start", self.array("components", edges, wp.int32))
+            setattr(self, f"component_{name}", self.array("components", order, wp.int32))
         if self.component_count > 1:
-            order = np.argsort(self.component, kind="stable")
-            edges = np.concatenate([[0], np.cumsum(np.bincount(self.component, minlength=self.component_count))])
-            self.component_start = self.array("components", edges, wp.int32)
-            self.component_slot = self.array("components", order, wp.int32)
             self.component_of_slot = self.array("components", self.component, wp.int32)
 
     def graph(self) -> sp.csr_matrix:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ArraySpec", "State", "words_of"]
 
-MEMORY = ("preconditioner", "operator", "predictor")
+MEMORY = ("preconditioner", "operator", "predictor", "potential")
 """What names of arrays begin with that solvers remember; a state can do without."""
 
 

@@ -118,7 +118,8 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     meta, arrays = _read(file)
     _compare(file, meta, sim)
     state = {name.removeprefix("state."): a for name, a in arrays.items() if name.startswith("state.")}
-    arrays.setdefault("total.rough", np.zeros(sim.model.worlds, int))  # of files before it was counted
+    for name in ("rough", "floored"):  # of files before they were counted
+        arrays.setdefault(f"total.{name}", np.zeros(sim.model.worlds, int))
     totals = {name: arrays.get(f"total.{name}") for name in sim.totals}
     history = arrays.get("history", np.zeros((0, 0, 0)))
     shape = {name: None if a is None else a.shape for name, a in totals.items()}

@@ -10,12 +10,15 @@ from ..base.errors import ConstraintError, ConvergenceError
 from ..kernels.solvers.control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
+    FAIL_FLOOR,
     FAIL_GROWTH,
+    FAIL_INVERTED,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
     FAIL_LIMIT,
     FAIL_LINE_SEARCH,
     FAIL_NAN,
+    FAIL_WORK,
 )
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
@@ -33,7 +36,10 @@ REASONS = {
     FAIL_CURVATURE: "no descent direction was found",
     FAIL_LIMIT: "a term allowed no step along Newton's direction",
     FAIL_GROWTH: "the residual grew more than tenfold",
+    FAIL_INVERTED: "an element turned inside out (J <= 0)",
 }
+UNSTABLE = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
+"""Failures that an indefinite tangent may explain."""
 OPEN = 1e-4
 """Violation at the start, over the model's size, that a dynamic run refuses to snap shut."""
 
@@ -49,21 +55,41 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         return _unsatisfied(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1
     history = work.newton.history.numpy()[world, :count].tolist()
-    if code == FAIL_JACOBIAN:
+    if code in (FAIL_JACOBIAN, FAIL_INVERTED):
         element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
-    reason = REASONS.get(code, "unknown reason")
-    hint = "; try more load steps" if sim.integrator.static else "; try a smaller dt"
-    direct = sim.stepper.newton.direct
-    if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
-        reason, hint = "H is singular (a body or mechanism that nothing holds?)", ""
+    reason, hint = _why(sim, code, world)
     return ConvergenceError(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
         f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}",
         time=time, world=world, residuals=history, element=element, state=sim.state,
     )  # fmt: skip
+
+
+def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
+    """Why Newton's method failed, and what may help."""
+    work, dtype = sim.stepper.work, sim.model.dtype
+    smaller = "; try more load steps" if sim.integrator.static else "; try a smaller dt"
+    direct = sim.stepper.newton.direct
+    if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
+        return "H is singular (a body or mechanism that nothing holds?)", ""
+    if code == FAIL_FLOOR:
+        eta = float(work.newton.eta.numpy()[world])
+        hint = "; take float64" if dtype == "float32" else "; take fewer, stouter elements, or look at the units"
+        return f"{dtype} can't hold this case: rounding leaves an estimated error of {eta:.2g} of the solution", hint
+    if code == FAIL_WORK:
+        spent = f"{int(work.pcg.total.numpy()[world])} iterations of the conjugate gradients"
+        hint = f"; look for slivers and extreme contrasts of stiffness, or raise max_work = {sim.solver.max_work}"
+        return f"the step has taken {spent}", hint
+    if code == FAIL_INVERTED:
+        return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
+    if sim.integrator.static and code in UNSTABLE and int(work.newton.negative.numpy()[world]):
+        return f"{REASONS[code]}: the equilibrium is unstable there (it buckles or snaps through)", (
+            "; find what follows by a motion with damping, or prescribe displacements in place of loads"
+        )
+    return REASONS.get(code, "unknown reason"), smaller
 
 
 def _step_from(sim: Any, time: float) -> str:

@@ -15,13 +15,16 @@ class StepReport:
     """What a step took, each an array [world].
 
     Attributes:
-        converged: the step was accepted and is within the solver's tolerance. With wf.Jacobi a world may go on without:
-            False with status 0.
+        converged: the step was accepted, and its residual is within the solver's tolerance, or rounding stops it above
+            and `floor` is the error that this leaves. With wf.Jacobi a world may go on without: False with status 0.
+        floor: estimated error of the step's increment where rounding stopped the residual, relative to the solution and
+            in the norm of energy; the true one is at most three times it. 0 where the tolerance was reached.
         newton, pcg: iterations, refused attempts included; Jacobi's count as newton.
         residual: |g| over the largest force, of the last attempt.
         halvings: refused attempts.
         status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
-        min_J: smallest det F; a value <= 0 means that an element turned inside out (SVK only; others refuse it).
+        min_J: smallest det F at quadrature points, and of laws that need J > 0 at the vertices too. At a point a value
+            <= 0 means that an element is inside out, which a step must not bring about, see `inversion` of Simulation.
         time: s.
         residual_force: |g| over the free components, N, of the last attempt.
         violation: largest of the constraints, m.
@@ -40,6 +43,7 @@ class StepReport:
     violation: np.ndarray
     outer: np.ndarray
     residual_force: np.ndarray
+    floor: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +71,7 @@ def idle_report(sim: Any) -> StepReport:
     """The report of a simulation that has done no step since it was made or resumed."""
     count = sim.model.worlds
     zero, none = np.zeros(count, int), np.zeros(count)
-    return StepReport(sim.status == 0, zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero, none)
+    return StepReport(sim.status == 0, zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero, none, none)
 
 
 def describe(sim: Any) -> str:

@@ -64,6 +64,8 @@ class Simulation(Results):
             where that is a terminal. Warp's own lines about modules are not shown, unless its log level was lowered.
         on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
             several only once all have failed.
+        inversion: a step that turns an element inside out, J <= 0 at a quadrature point where J was positive, is
+            refused ("refuse"), or passes where the law allows it ("report": StepReport.min_J tells).
 
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
@@ -83,12 +85,15 @@ class Simulation(Results):
         record: bool = True,
         capture: bool = True,
         on_failure: str | None = None,
+        inversion: str = "refuse",
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
         scheme, options = integrators.get(integrator), solvers.get(solver)
         check_model(model)
         if not scheme.static:
             require_density(model.bodies, "motion")
+        if inversion not in ("refuse", "report"):
+            raise ModelError(f"inversion = {inversion!r} is neither 'refuse' nor 'report'")
         if on_failure not in (None, "raise", "freeze"):
             raise ModelError(f"on_failure = {on_failure!r} is neither 'raise' nor 'freeze'")
         _check_dt(dt)
@@ -111,7 +116,7 @@ class Simulation(Results):
         with quiet_warp(), compile_bar(None if on_compile is None else False) as bar:
             self.stepper = Stepper(
                 model, self.state, scheme, options,
-                ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size,
+                ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
                 on_compile=on_compile or bar,
             )  # fmt: skip
         self.compile_s = clock.perf_counter() - began
@@ -119,7 +124,7 @@ class Simulation(Results):
         check_closed(self)
         self.steps = 0
         self.last: StepReport | None = None
-        self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough")}
+        self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough", "floored")}
         self.max_residual = 0.0
         self.min_J = math.inf
         self.max_violation = 0.0
@@ -200,6 +205,7 @@ class Simulation(Results):
             violation=column["violation"].copy(),
             outer=column["outer"].astype(int),
             residual_force=column["residual_force"].copy(),
+            floor=column["floor"].copy(),
         )
         self.steps += 1
         good = status == STATUS["running"]
@@ -208,6 +214,7 @@ class Simulation(Results):
         self.totals["newton"] += self.last.newton
         self.totals["pcg"] += self.last.pcg
         self.totals["rough"] += good & ~self.last.converged
+        self.totals["floored"] += good & (self.last.floor > 0.0)
         if good.any():
             self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
             self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))

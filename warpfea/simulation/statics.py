@@ -85,6 +85,7 @@ def solve_static(
     solver: NewtonPCG | None = None,
     state: State | None = None,
     constraint_tol: float | None = None,
+    inversion: str = "refuse",
     outputs: Sequence[Any] = (),
     progress: bool | None = False,
 ) -> StaticResult:
@@ -97,7 +98,7 @@ def solve_static(
         load_steps: number of load steps.
         tol: relative residual, by default the solver's.
         solver: NewtonPCG options; by default with room for slender bodies, max_pcg = 20000.
-        constraint_tol: as of Simulation.
+        constraint_tol, inversion: as of Simulation.
         state: start; by default model.state(). It is copied.
         outputs: writers (PNGWriter, USDWriter, VTUWriter, ...), which get each load step as a state; what they say of
             time is the part of the load, 0 to 1, and pictures are labelled "load 100 %".
@@ -111,7 +112,7 @@ def solve_static(
         KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """
     options: dict[str, Any] = {"load_steps": load_steps, "tol": tol, "solver": solver, "state": state}
-    sim = begin_static(model, constraint_tol=constraint_tol, **options)
+    sim = begin_static(model, constraint_tol=constraint_tol, inversion=inversion, **options)
     return run_static(sim, outputs=outputs, progress=progress)
 
 
@@ -123,6 +124,7 @@ def begin_static(
     solver: NewtonPCG | None = None,
     state: State | None = None,
     constraint_tol: float | None = None,
+    inversion: str = "refuse",
     on_compile: Callable[[int, int, str], None] | None = None,
 ) -> Simulation:
     """The loop of `solve_static` before its first load step; ModelError as there. `on_compile` as of Simulation."""
@@ -143,7 +145,7 @@ def begin_static(
     start.time.zero_()
     return Simulation(
         model, start, dt=1.0 / load_steps, integrator=INTEGRATORS["static"], solver=options, ledger=False,
-        on_failure="raise", constraint_tol=constraint_tol, on_compile=on_compile,
+        on_failure="raise", constraint_tol=constraint_tol, inversion=inversion, on_compile=on_compile,
     )  # fmt: skip
 
 

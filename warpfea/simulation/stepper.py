@@ -19,6 +19,7 @@ from ..kernels.step.step import step_kernels
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_loop
 from ..terms.checks import check_measured
+from ..terms.elements import Elements
 from ..terms.term import At, Term
 from ..terms.workspace import Workspace
 from .integrators import Integrator
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Stepper"]
 
+CANDIDATES = (0, 1, 2)
+"""Other first iterates, see the kernel `candidate`."""
 OnCompile = Callable[[int, int, str], None]
 
 
@@ -48,6 +51,7 @@ class Stepper:
         ledger: bool,
         capture: bool,
         constraint_tol: float = 0.0,
+        inversion: str = "refuse",
         on_compile: OnCompile | None = None,
     ) -> None:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
@@ -74,7 +78,7 @@ class Stepper:
         self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger)
         self.at = At(model, self.work, self.launch, state, self.u_before, inertia=not integrator.static)
         self.terms.allocate(self.work, self.at)
-        self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol)
+        self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
         self.predictor: Predictor | None = None
         # single roundings would grow from step to step, and so would what Jacobi's steps leave
@@ -82,6 +86,8 @@ class Stepper:
             more = (self.newton.residual.reduce, state, self.kernels.module)
             self.predictor = Predictor(model, self.work, self.launch, *more, multistep=integrator.multistep)
         self.dim = (model.worlds, model.slots)
+        if not integrator.static and isinstance(solver, NewtonPCG):
+            self.newton.candidates = [partial(self._candidate, kind) for kind in CANDIDATES]
         self.running = self.work.any_flag[2:3]
         self._bind()
         self._probe_tables = self._upload_probes() if model.probes else []
@@ -256,8 +262,20 @@ class Stepper:
         for term in self.terms:
             term.begin(self.at, running)
         self.newton.run()
+        wp.capture_if(w.newton.any_turned, self._look_for_inversion)
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
         self.commit()
+
+    def _candidate(self, kind: int) -> None:
+        """Put another first iterate into work.v where one is to be chosen."""
+        m, w, state = self.model, self.work, self.state
+        args = [w.step, w.newton, kind, m.is_position, m.topology.free, state.displacement, state.velocity]
+        self.launch(self.kernels.candidate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
+
+    @labelled("residual")
+    def _look_for_inversion(self) -> None:
+        """Flag the worlds that the attempt turned inside out."""
+        self.terms.find(Elements).look_for_inversion(self.at, self.work.step.running)
 
     @labelled("commit")
     def commit(self) -> None:
@@ -270,7 +288,7 @@ class Stepper:
             self._book()
         if self.predictor:
             self.predictor.commit()
-        args = [w.step, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
+        args = [w.step, w.newton, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
         launch(self.kernels.commit, self.dim, args)
         for term in self.terms:
             term.commit(self.at, w.step.accepted)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,8 @@ import warp as wp
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
+from ..base.launch import labelled
+from ..kernels.solvers.control import LANES
 from ..kernels.solvers.newton import newton_kernels
 from .direct import Direct
 from .pcg import PCG
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
 __all__ = ["NewtonLoop", "NewtonPCG"]
 
 EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
+FLOOR = {"float64": 1e-4, "float32": 2e-3}
+"""Largest estimated error, relative and in the norm of energy, of a step whose residual is stopped by rounding."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +37,16 @@ class NewtonPCG:
     Args:
         tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
             for each connected part of the model apart. A thousandth of the reactions counts with f_int, so that a held,
-            stressed body without loads has a scale. None: 1e-8 in float64, 1e-4 in float32.
+            stressed body without loads has a scale. None: 1e-8 in float64, 1e-4 in float32. Where rounding stops the
+            residual above it, the error that is left is estimated and told (`StepReport.floor`); above 1e-4 in
+            float64, 2e-3 in float32, the step is refused.
         force_tol: a step is also accepted when |g|, the plain norm over the free components, is at most this, N
             (gradient slots count in N m); 0: never.
         forcing: relative residual of the linear solves; None: Eisenstat and Walker's, no further than needed.
         max_newton: iterations before a step is rejected.
         max_pcg: iterations per linear solve.
         max_halvings: how often a rejected step may be halved.
+        max_work: iterations of the conjugate gradients in a step, refused attempts included, before it is given up.
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
             serves), "banded" (Cholesky factors of the whole, kept as well; on the CPU, for chains, strips and slender
             or small bodies), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
@@ -65,6 +73,7 @@ class NewtonPCG:
     max_newton: int = 30
     max_pcg: int = 2000
     max_halvings: int = 8
+    max_work: int = 200_000
     preconditioner: str = "auto"
     linear: str = "pcg"
     preconditioner_dtype: str | None = None
@@ -97,7 +106,7 @@ class NewtonPCG:
             raise ModelError(f"NewtonPCG: forcing = {self.forcing!r} must lie between 0 and 1")
         if self.operator not in ("auto", "elements", "matrix"):
             raise ModelError(f"NewtonPCG: operator = {self.operator!r} is none of 'auto', 'elements', 'matrix'")
-        for name in ("max_newton", "max_pcg", "max_outer"):
+        for name in ("max_newton", "max_pcg", "max_outer", "max_work"):
             if not (is_count(getattr(self, name)) and getattr(self, name) >= 1):
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be a whole number, at least 1")
         if self.multipliers not in ("newton", "outer"):
@@ -130,7 +139,7 @@ class TermOptions:
 class NewtonLoop:
     """The iteration of all worlds: conditional loops on the device, one code path with and without capture."""
 
-    def __init__(self, at: At, options: NewtonPCG, *, constraint_tol: float) -> None:
+    def __init__(self, at: At, options: NewtonPCG, *, constraint_tol: float, inversion: str = "refuse") -> None:
         model, work, launch, inertia = at.model, at.work, at.launch, at.inertia
         self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
         self.constraint_tol = constraint_tol
@@ -179,16 +188,21 @@ class NewtonLoop:
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
         ctl.max_iterations = options.max_newton
+        ctl.floor_bound = FLOOR[model.dtype]
+        ctl.refuse_inversion = int(inversion == "refuse")
+        self.max_work = options.max_work
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.nonpotential = int(traits.nonpotential or rate)
         ctl.classical = int(self.classical)
         ctl.slack = 1.0 / math.sqrt(1.0 + options.penalty)
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves are for g alone
+        self.candidates: Sequence[Callable[[], None]] = ()
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
 
     def register(self, state: State) -> None:
         """Make what the solvers keep from step to step part of the state."""
+        self.work.newton.potential = state.register("potential", wp.float64)
         self.preconditioner.register(state)
         self.residual.register(state)
 
@@ -208,27 +222,53 @@ class NewtonLoop:
         return out | self.preconditioner.modules() | self.residual.modules()
 
     def run(self) -> None:
-        """Iterate from work.v until every active world has converged or failed."""
+        """Iterate from work.v until every active world has converged or failed.
+
+        `candidates` put other first iterates into work.v, in the worlds with the flag `choose`.
+        """
         w = self.work
-        active = w.newton.active
-        self._clear_direction(active)
-        # D is needed to judge the first iterate, so the blocks come first
-        self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
-        self._each("prepare", active)
-        self.preconditioner.start(active)
-        self._each("scale", active)
-        self.residual.evaluate(active, hold=True)
-        self._solve()
+        self._clear_direction(w.newton.active)
+        self._open(w.newton.active)
+        self._solve(first=True)
         if self.classical:
             self._judge_outer()
             wp.capture_while(self.iterating, self._update_multipliers)
 
-    def _solve(self) -> None:
-        """Newton's iteration from the residual at hand."""
+    def _open(self, flags: wp.array) -> None:
+        """Evaluate the first iterate."""
         w = self.work
-        self.launch(self.kernels.begin, self.model.worlds, [w.newton])
+        # D is needed to judge it, so the blocks come first
+        self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, flags, w.u])
+        self._each("prepare", flags)
+        self.preconditioner.start(flags)
+        self._each("scale", flags)
+        self.residual.evaluate(flags, hold=True)
+
+    def _solve(self, first: bool = False) -> None:
+        """Newton's iteration from the residual at hand; `first`: of an attempt."""
+        w = self.work
+        choose = bool(self.candidates) and first
+        self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
+        if choose:
+            wp.capture_if(w.newton.any_choice, self._choose)
         self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
+
+    @labelled("control")
+    def _choose(self) -> None:
+        """Take the best of the first iterate at hand and the candidates, where that may be another one."""
+        w, k, launch = self.work, self.kernels, self.launch
+        choose, better = w.newton.choose, w.newton.searching
+        launch(k.compare, self.model.worlds, [w.newton, 1, better])
+        launch(k.copy_active, self.dim, [w.v, better, w.best])
+        for put in self.candidates:
+            put()
+            self.residual.evaluate(choose, hold=True)
+            launch(k.compare, self.model.worlds, [w.newton, 0, better])
+            launch(k.copy_active, self.dim, [w.v, better, w.best])
+        launch(k.copy_active, self.dim, [w.best, choose, w.v])
+        self._open(choose)
+        launch(k.begin, self.model.worlds, [w.newton, 2])
 
     def _judge_outer(self) -> None:
         w = self.work
@@ -254,19 +294,28 @@ class NewtonLoop:
         if self.limited:
             launch(k.free_step, self.model.worlds, [w.newton])
         self._each("aim", active)
-        launch(k.copy_active, self.dim, [w.v, active, w.base])
+        launch(k.set_base, self.dim, [w.newton, w.v, w.base, w.best])
         launch(k.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
-        launch(k.begin_search, self.model.worlds, [w.newton])
+        wp.capture_if(w.newton.any_strict, self._measure_floor)
+        launch(k.begin_search, self.model.worlds, [w.newton, w.pcg, self.max_work])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self.preconditioner.follow(active)
         self._each("follow", active)
         self._any(active, self.iterating)
 
+    def _measure_floor(self) -> None:
+        """How large an error the residuals stand for, where that was asked."""
+        m, w, k = self.model, self.work, self.kernels
+        args = [w.newton, m.component_slot_start, m.component_slot, m.component_element_start, m.component_element]
+        args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
+        self.launch(k.floor_partial, (m.worlds, m.component_count, LANES), args)
+        self.launch(k.judge_floor, m.worlds, [w.newton])
+
     def _search(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
-        launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.v])
+        launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.judge_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:

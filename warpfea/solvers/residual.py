@@ -85,7 +85,9 @@ class Residual:
             cheaper = assembled
         self.by_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
         self.clusters: ModelClusters | None = None
-        if self.with_mass and not self.by_matrix:
+        # an equilibrium takes few products per iterate, and fewer iterates with the stress of the linear prediction
+        self.mixed = not at.inertia and not self.by_matrix
+        if self.with_mass and not self.by_matrix and at.inertia:
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
@@ -138,6 +140,8 @@ class Residual:
             out |= {self.reuse.kernels.module} if self.keep else set()
         elif self.clusters:
             out |= {kernel.module for kernel in self.products}
+        elif self.mixed:
+            out |= {kernel.module for kernel in self.elements.mixed_kernels()}
         return out
 
     def register(self, state: State) -> None:
@@ -214,7 +218,7 @@ class Residual:
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         if m.component_count > 1:
-            args = [m.component_start, m.component_slot, w.rows, active, w.component_partial]
+            args = [m.component_slot_start, m.component_slot, w.rows, active, w.component_partial]
             launch(self.newton.component_partial, (m.worlds, m.component_count, LANES), args)
             sums = (COMPONENT_ROWS, m.worlds, m.component_count)
             launch(self.newton.component_sum, sums, [w.component_partial, active, w.newton.component_sums])
@@ -246,6 +250,8 @@ class Residual:
                 args = [block.data, data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
                 args += [lanes, self.pool, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
+        elif self.mixed:
+            self.elements.mixed_tangent(self.at, p, active)
         elif not self.by_matrix:
             self.elements.tangent(self.at, p, active)
         for term in self.terms:

@@ -49,6 +49,25 @@ class Elements(Term):
             dim = (w.u.shape[0], launch.padded(block.count * lanes))
             launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
 
+    def look_for_inversion(self, at: At, active: wp.array) -> None:
+        """Flag in newton.turned the worlds with a point where J > 0 in the state and J <= 0 at the iterate."""
+        w = at.work
+        for block, kernels in zip(self.model.blocks, self.kernels(at)):
+            if not block.key.tying:
+                args = [block.data, at.state.displacement, w.u, active, w.newton.turned]
+                at.launch(kernels.turned_over, (w.u.shape[0], block.count), args)
+
+    def mixed_kernels(self) -> list[wp.Kernel]:
+        """Kernels of `mixed_tangent`."""
+        return [block.mixed_product(self.model.dtype) for block in self.model.blocks]
+
+    def mixed_tangent(self, at: At, p: wp.array, active: wp.array) -> None:
+        """`tangent` with the stress of the linear prediction in its geometric part, for worlds that are `mixed`."""
+        m, w = self.model, at.work
+        for block, kernel in zip(m.blocks, self.mixed_kernels()):
+            args = [block.data, w.u, w.v, w.base, w.newton.mixed, w.history, w.step.dq_dv, active, p, w.contribution]
+            at.launch(kernel, (p.shape[0], block.count), args)
+
     def tangent(self, at: At, p: wp.array, active: wp.array) -> None:
         """K p of all elements into work.contribution, where products go by the elements one by one."""
         m, w = self.model, at.work

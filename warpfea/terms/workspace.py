@@ -11,7 +11,7 @@ from ..base.errors import ModelError
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
-from ..kernels.solvers.control import COMPONENT_ROWS, LANES, TERM_ROWS, control_struct
+from ..kernels.solvers.control import COMPONENT_ROWS, FLOOR_ROWS, LANES, TERM_ROWS, control_struct
 from ..kernels.solvers.pcg import LANES as GROUP_LANES
 from ..kernels.solvers.pcg import pcg_struct
 from ..kernels.step.control import step_struct
@@ -37,7 +37,7 @@ class Workspace:
             return self.array(name, (B, n), vec3)
 
         # the iterate and what it is measured from
-        self.v, self.u, self.base = field("v"), field("u"), field("base")
+        self.v, self.u, self.base, self.best = field("v"), field("u"), field("base"), field("best")
         self.q_tilde, self.v_tilde = field("q_tilde"), field("v_tilde")
         # conjugate gradients
         self.direction, self.r, self.z, self.p, self.Hp = (field(k) for k in ("direction", "r", "z", "p", "Hp"))
@@ -91,18 +91,19 @@ class Workspace:
         C = model.component_count
         sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
         self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
-        skip: tuple[str, ...] = ("violation",)
+        skip: tuple[str, ...] = ("violation", "negative", "potential")  # of others
         skip += () if traits.gated else ("outer", "open")
         skip += () if traits.stored else ("term_sums", "stepped")
         skip += () if traits.limited else ("limit",)
         self.newton = self.struct(
             control_struct(), B, skip=skip,
             history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
-            term_sums=(TERM_ROWS, B),
+            term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, C, LANES),
         )  # fmt: skip
         self.newton.components = C
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
+        self.newton.negative = self.pcg.negative
         self.step = self.struct(step_struct(), B)
         self.balance = balance_struct(model.dtype)()
         for name in balance_struct(model.dtype).vars:
@@ -138,8 +139,7 @@ class Workspace:
             "elem_sums": (2, worlds),
             "slope_sum": (1, worlds),
             "tangent_sum": (1, worlds),
-            "any_active": (1,),
-            "any_running": (1,),
+            **dict.fromkeys(("any_active", "any_running", "any_strict", "any_choice", "any_turned"), (1,)),
         } | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array) and name not in skip:

@@ -1,0 +1,193 @@
+"""How an iterate of Newton's method is judged: Phi, norms, convergence, failure. Functions of one world."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.traits import NO_TERMS, Traits
+from .control import FAIL_CONSTRAINT, FAIL_FLOOR, FAIL_ITERATIONS, FAIL_JACOBIAN, FAIL_LINE_SEARCH, FAIL_NAN
+from .control import FAIL_CURVATURE, control_struct
+
+__all__ = ["judging_functions"]
+
+FLOOR = 16.0
+PREDICTED = 1.0e-3
+STALLED = 0.5
+"""A reduction of the residual that is no better than this is none."""
+NEAR = 1.0e3
+"""Roundings of the positions, as they change the residual, within which a stall may be put down to rounding."""
+SETTLING = 10.0
+"""A residual can only be at its floor when the last step was below this many accepted errors."""
+TRIES = 3
+"""Solves that may find the error of a stalled iterate too large before the step is given up."""
+
+
+@functools.cache
+def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+    """The functions; of the traits "stored" and "gated" count."""
+    f64 = wp.float64
+    Control = control_struct()
+    stored, gated = traits.stored, traits.gated
+
+    @wp.func
+    def objective(ctl: Control, world: int) -> f64:
+        """Phi of Eq. (18) at the trial, over dq/dv, with what terms hold in the search.
+
+        Phi = 1/2 (v - v~).M (v - v~) c_M - f_held.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv), whose derivative by v
+        is the residual, Eq. (17). Of the sums over a world: inertia and the forces held, f_held (dead loads, and forces
+        without a potential as the search began), are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc, J, are
+        elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is term_sums[0].
+        """
+        energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
+        if wp.static(stored):
+            energy += ctl.term_sums[0, world]
+        return ctl.slot_sums[4, world] + energy / ctl.dq_dv[world]
+
+    @wp.func
+    def magnitude(ctl: Control, world: int) -> f64:
+        """Sum of the magnitudes of Phi's parts: its rounding is a few eps of it."""
+        energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
+        if wp.static(stored):
+            energy += ctl.term_sums[2, world]
+        return ctl.slot_sums[5, world] + energy / ctl.dq_dv[world]
+
+    @wp.func
+    def largest_violation(ctl: Control, world: int) -> f64:
+        """Of the constraints of all components, m."""
+        largest = f64(0.0)
+        for c in range(ctl.components):
+            largest = wp.max(largest, ctl.violation[world, c])
+        return largest
+
+    @wp.func
+    def measure(ctl: Control, world: int):
+        """Norms and acceptance of the residual just evaluated, for each component apart where there are several.
+
+        Components that do not touch must not hide behind each other's forces, and a converged one is left alone.
+        """
+        force = wp.sqrt(ctl.slot_sums[9, world])
+        ctl.force[world] = force
+        largest = f64(0.0)
+        excess = f64(0.0)
+        floor_excess = f64(0.0)
+        solve = f64(0.0)
+        solve_accept = f64(1.0e300)
+        for c in range(ctl.components):
+            g2 = ctl.slot_sums[0, world]
+            f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
+            spread = ctl.slot_sums[8, world]
+            if ctl.components > 1:
+                g2 = ctl.component_sums[0, world, c]
+                f2 = wp.max(
+                    ctl.component_sums[1, world, c],
+                    wp.max(ctl.component_sums[2, world, c], ctl.component_sums[3, world, c]),
+                )
+                spread = ctl.component_sums[4, world, c]
+            norm = wp.sqrt(g2)
+            scale = wp.sqrt(f2)
+            accept = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
+            if force > f64(0.0):
+                # the force's tolerance in this norm, as they compare at this iterate
+                accept = wp.max(accept, norm * (ctl.force_tol / force))
+            if ctl.predicted[world] != 0:
+                accept = f64(PREDICTED) * accept  # what is left would add up over steps that none solves for
+            loud = norm > accept
+            if wp.static(gated):
+                if ctl.violation[world, c] > ctl.constraint_tol:
+                    loud = True
+                    excess = wp.max(excess, ctl.violation[world, c] / ctl.constraint_tol)
+                    floor_excess = f64(1.0e300)
+            ctl.quiet[world, c] = wp.where(loud, 0, 1)
+            if loud:
+                solve += g2
+                solve_accept = wp.min(solve_accept, accept)
+                rounding = f64(2.0) * ctl.eps * wp.sqrt(spread)
+                if wp.static(gated):
+                    if ctl.classical != 0:  # the residual holds rho c, and so kappa times the rounding of places
+                        rounding = rounding / (ctl.slack * ctl.slack)
+                floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
+            ratio = norm / wp.max(scale, f64(1.0e-300))
+            largest = wp.max(largest, ratio)
+            excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))
+        if wp.static(gated):
+            ctl.open[world] = largest_violation(ctl, world) / ctl.constraint_tol
+        ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
+        ctl.relative[world] = largest
+        ctl.excess[world] = excess
+        ctl.floor_excess[world] = floor_excess
+        ctl.solve_norm[world] = wp.sqrt(solve)
+        ctl.solve_accept[world] = solve_accept
+
+    @wp.func
+    def record(ctl: Control, world: int):
+        """Keep the relative residual of the iterate, for messages."""
+        k = ctl.iterations[world]
+        if k < ctl.history.shape[1]:
+            ctl.history[world, k] = ctl.relative[world]
+
+    @wp.func
+    def unsatisfied(ctl: Control, world: int) -> bool:
+        """Whether forces balance but constraints do not hold: more iterations only raise the multipliers."""
+        balanced = wp.max(ctl.tol, wp.min(f64(1.0e3) * ctl.tol, f64(1.0e-4)))
+        return ctl.relative[world] <= balanced and ctl.open[world] > f64(1.0)
+
+    @wp.func
+    def accept(ctl: Control, world: int):
+        """End the iteration with this iterate; where J <= 0 it is looked at once more."""
+        ctl.active[world] = 0
+        ctl.searching[world] = 0
+        if ctl.refuse_inversion != 0 and ctl.min_J[world] <= f64(0.0):
+            wp.atomic_max(ctl.any_turned, 0, 1)
+
+    @wp.func
+    def ask(ctl: Control, world: int):
+        """Let the next solve tell how large an error the residual stands for; see `judge_floor`."""
+        ctl.strict[world] = 1
+        ctl.mixed[world] = 0
+        wp.atomic_max(ctl.any_strict, 0, 1)
+
+    @wp.func
+    def give_up(ctl: Control, world: int, why: int):
+        """End without convergence."""
+        ctl.active[world] = 0
+        ctl.searching[world] = 0
+        ctl.failed[world] = why
+        if wp.static(gated):
+            if why != FAIL_NAN and why != FAIL_JACOBIAN and unsatisfied(ctl, world):
+                ctl.failed[world] = FAIL_CONSTRAINT
+
+    @wp.func
+    def settle(ctl: Control, world: int):
+        """End the iteration where it has converged or used up its iterations; where it stands still within rounding,
+        ask for the error that is left."""
+        record(ctl, world)
+        # the energy that the last step promised, over what there is
+        energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
+        step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
+        most = f64(SETTLING) * ctl.floor_bound
+        settling = step <= most * most * energy or ctl.iterations[world] + 1 >= ctl.max_iterations
+        still = ctl.reduction[world] > f64(STALLED) and ctl.reused[world] == 0
+        if ctl.excess[world] <= f64(1.0):
+            accept(ctl, world)
+        elif ctl.iterations[world] > 0 and still and settling and ctl.floor_excess[world] <= f64(NEAR):
+            ask(ctl, world)
+        elif ctl.iterations[world] >= ctl.max_iterations:
+            give_up(ctl, world, FAIL_ITERATIONS)
+
+    @wp.func
+    def fail(ctl: Control, world: int, why: int):
+        """No step was found. Where rounding alone may explain that, stand still and ask for the error that is left."""
+        near = ctl.floor_excess[world] <= f64(NEAR) and ctl.iterations[world] > 0 and ctl.strict_count[world] < TRIES
+        if near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
+            ask(ctl, world)
+            ctl.alpha[world] = f64(0.0)
+        elif ctl.strict_count[world] > 0 and ctl.eta[world] < f64(1.0e30):
+            give_up(ctl, world, FAIL_FLOOR)
+        else:
+            give_up(ctl, world, why)
+
+    return _types.SimpleNamespace(
+        objective=objective, magnitude=magnitude, largest_violation=largest_violation, measure=measure, record=record,
+        accept=accept, ask=ask, give_up=give_up, settle=settle, fail=fail,
+    )  # fmt: skip
