@@ -133,6 +133,24 @@ def element_kernels(
                     turned[world] = 1
 
     @wp.kernel(module=module)
+    def largest_turn(
+        block: Block,
+        direction: wp.array2d(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        turn: wp.array(dtype=wp.float64),
+    ):
+        """Largest gradient of a direction at the quadrature points, as a norm: rotation or strain per unit step."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        P = fn.load(block, direction, world, elem)
+        most = T(0.0)
+        for point in range(block.gradient.shape[0]):
+            G = fn.gradient_of(block, P, point, elem)
+            most = wp.max(most, wp.ddot(G, G))
+        wp.atomic_max(turn, world, wp.float64(wp.sqrt(most)))
+
+    @wp.kernel(module=module)
     def tangent_product(
         block: Block,
         u: wp.array2d(dtype=vec3),
@@ -199,6 +217,7 @@ def element_kernels(
         module=module,
         internal_force=internal_force,
         turned_over=turned_over,
+        largest_turn=largest_turn,
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,
         **vars(matrix_kernels(dtype, law, slots, affine, damping, framed)),

@@ -97,6 +97,9 @@ def control_struct():
         # where full steps are taken although Phi rises, see judging.py
         leaps: wp.array(dtype=wp.int32)  # such steps since the best iterate
         mixed: wp.array(dtype=wp.int32)  # H has the stress of the linear prediction
+        wish: wp.array(dtype=wp.int32)  # 1: such a step is wanted, how long may it be? 2: the trial is one
+        any_wish: wp.array(dtype=wp.int32)
+        turn: wp.array(dtype=wp.float64)  # largest gradient of the direction
         tame: wp.array(dtype=wp.int32)  # the next step must satisfy Armijo
         mark: wp.array(dtype=wp.int32)  # the base of the last step is the best iterate
         restoring: wp.array(dtype=wp.int32)  # the trial is the best iterate

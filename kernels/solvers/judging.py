@@ -166,13 +166,14 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
         step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
         most = f64(SETTLING) * ctl.floor_bound
-        settling = step <= most * most * energy or ctl.iterations[world] + 1 >= ctl.max_iterations
+        limit = ctl.max_iterations * (1 + ctl.choose[world])  # twice as many from far away
+        settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
         still = ctl.reduction[world] > f64(STALLED) and ctl.reused[world] == 0
         if ctl.excess[world] <= f64(1.0):
             accept(ctl, world)
         elif ctl.iterations[world] > 0 and still and settling and ctl.floor_excess[world] <= f64(NEAR):
             ask(ctl, world)
-        elif ctl.iterations[world] >= ctl.max_iterations:
+        elif ctl.iterations[world] >= limit:
             give_up(ctl, world, FAIL_ITERATIONS)
 
     @wp.func

@@ -23,8 +23,12 @@ REUSED_SEARCH = 2
 LEAPS = 5
 """Full steps in a row that may raise Phi: with the stress of the linear prediction in H, a slender body comes to its
 equilibrium over iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
+TURN = 0.5
+"""Most that such a step turns or stretches an element."""
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
+FAR_FORCING = 0.1
+"""Tolerance of the first solve of a step that begins far from its end: what it is solved to is lost."""
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
 
@@ -89,8 +93,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         phi = objective(ctl, world)
         bound = ctl.potential[world] / ctl.dq_dv[world] + f64(HOPELESS) * ctl.slot_sums[10, world]
         bound += f64(NOISE) * ctl.eps * magnitude(ctl, world)
-        # written so that NaN is hopeless too
-        return not (phi <= bound and ctl.min_J[world] > f64(0.0))
+        return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
 
     @wp.kernel(module=module)
     def begin(ctl: Control, stage: int):
@@ -106,6 +109,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 wp.atomic_max(ctl.any_choice, 0, 1)
                 return
         start(ctl, world)
+        if stage == 2 and ctl.fixed_forcing == 0:
+            ctl.forcing[world] = f64(FAR_FORCING)
 
     @wp.kernel(module=module)
     def compare(ctl: Control, first: int, better: wp.array(dtype=wp.int32)):
@@ -177,6 +182,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if wp.static(limited):
             ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
         ctl.searches[world] = 0
+        ctl.wish[world] = 0
+        ctl.turn[world] = f64(0.0)
         ctl.searching[world] = 1
         ctl.predicted[world] = 0
         ctl.mark[world] = 0
@@ -208,6 +215,13 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             fail(ctl, world, FAIL_NAN)
         elif barred:
             fail(ctl, world, FAIL_LIMIT)
+        elif ctl.negative[world] != 0 and ctl.mixed[world] != 0:
+            if ctl.leaps[world] > 0:
+                ctl.restoring[world] = 1
+            else:
+                ctl.mixed[world] = 0
+                ctl.tame[world] = 1
+                ctl.alpha[world] = f64(0.0)
         elif slope >= f64(0.0):
             if ctl.reused[world] != 0:
                 ctl.alpha[world] = f64(0.0)
@@ -231,6 +245,17 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         elif ctl.leaps[world] >= LEAPS and ctl.active[world] != 0:
             ctl.restoring[world] = 1
             ctl.searching[world] = 1
+
+    @wp.kernel(module=module)
+    def plan_leap(ctl: Control):
+        """Length of a step that may raise Phi: no element turns or stretches by more than TURN."""
+        world = wp.tid()
+        if world == 0:
+            ctl.any_wish[0] = 0
+        if ctl.searching[world] != 0 and ctl.wish[world] == 1:
+            ctl.wish[world] = 2
+            most = ctl.dq_dv[world] * ctl.turn[world]
+            ctl.alpha[world] = wp.min(f64(1.0), f64(TURN) / wp.max(most, f64(1.0e-300)))
 
     @wp.kernel(module=module)
     def judge_trial(ctl: Control):
@@ -263,10 +288,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             good = False  # a step must not begin worse than with an operator of its own
             ctl.searches[world] = REUSED_SEARCH
         stands = alpha == f64(0.0) or ctl.restoring[world] != 0
-        leap = False
-        if finite and not (good or stands or reused):
-            whole = alpha == f64(1.0) and ctl.min_J[world] > f64(0.0) and ctl.negative[world] == 0
-            leap = whole and ctl.tame[world] == 0
+        wishes = finite and not (good or stands or reused) and ctl.searches[world] == 0
+        wishes = wishes and ctl.wish[world] == 0 and ctl.negative[world] == 0 and ctl.tame[world] == 0
+        leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or leap:
             ctl.searching[world] = 0
             measure(ctl, world)
@@ -286,7 +310,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                     ctl.tame[world] = 1
             else:
                 ctl.iterations[world] = ctl.iterations[world] + 1
-                ctl.tame[world] = 0
+                if ctl.tame[world] != 0:
+                    ctl.tame[world] = 0
+                    ctl.mixed[world] = 1
             ctl.total_iterations[world] = ctl.total_iterations[world] + 1
             ratio = norm / wp.max(old_norm, f64(1.0e-300))
             ctl.reduction[world] = ratio
@@ -299,9 +325,13 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             settle(ctl, world)
             if not stands and (leap or ctl.leaps[world] > 0):
                 watch(ctl, world, old_phi, old_norm)
+        elif wishes:
+            ctl.wish[world] = 1
+            wp.atomic_max(ctl.any_wish, 0, 1)
         elif ctl.leaps[world] > 0:
             ctl.restoring[world] = 1
         else:
+            ctl.wish[world] = 0
             ctl.searches[world] = ctl.searches[world] + 1
             ctl.alpha[world] = f64(0.5) * alpha
             if reused and ctl.searches[world] > REUSED_SEARCH:
@@ -346,6 +376,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         record=judging.record,
         reset_min_J=reset_min_J,
         begin=begin,
+        plan_leap=plan_leap,
         compare=compare,
         judge_floor=judge_floor,
         free_step=free_step,

@@ -221,6 +221,13 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         if flags[world] != 0:
             reuse.stale[world] = 1
 
+    @wp.kernel(module=module)
+    def renew(flags: wp.array(dtype=wp.int32), reuse: Reuse):
+        """Let the flagged worlds make the object anew before the next solve."""
+        world = wp.tid()
+        if flags[world] != 0:
+            reuse.due[world] = 1
+
     @wp.func
     def which(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
         """What to copy: 1: the iterate to the place; 2: the state's place to it; 3: the place to the state; 0: nothing.
@@ -315,6 +322,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         commit=commit,
         mark=mark,
         made=made,
+        renew=renew,
         carry_places=carry_places,
         carry_rows=carry_rows,
         carry_words=carry_words,

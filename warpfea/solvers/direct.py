@@ -66,6 +66,9 @@ class Direct:
         """D and the inverses of its blocks."""
         self.residual.blocks(active)
 
+    def renew(self, active: wp.array) -> None:
+        """Nothing is kept but factors of the operator's matrix."""
+
     def follow(self, active: wp.array) -> None:
         """Nothing to do: D stays that of the start of the step."""
 

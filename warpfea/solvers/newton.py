@@ -267,6 +267,7 @@ class NewtonLoop:
             launch(k.compare, self.model.worlds, [w.newton, 0, better])
             launch(k.copy_active, self.dim, [w.v, better, w.best])
         launch(k.copy_active, self.dim, [w.best, choose, w.v])
+        self.preconditioner.renew(choose)
         self._open(choose)
         launch(k.begin, self.model.worlds, [w.newton, 2])
 
@@ -318,9 +319,17 @@ class NewtonLoop:
         launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.judge_trial, self.model.worlds, [w.newton])
+        wp.capture_if(w.newton.any_wish, self._plan_leap)
         if self.terms.traits.stored:
             self._each("adopt", w.newton.stepped)
         self._any(w.newton.searching, self.searching)
+
+    @labelled("control")
+    def _plan_leap(self) -> None:
+        """How far a step may go that Armijo's rule would cut."""
+        w = self.work
+        self.residual.elements.measure_turn(self.at, w.direction, w.newton.searching)
+        self.launch(self.kernels.plan_leap, self.model.worlds, [w.newton])
 
     def _each(self, what: str, flags: wp.array) -> None:
         """Call a method of all terms."""

@@ -37,6 +37,9 @@ class Preconditioner(Protocol):
     def start(self, active: wp.array) -> None:
         """At the first iterate of an attempt: compute work.diagonal and work.inverse."""
 
+    def renew(self, active: wp.array) -> None:
+        """The attempt begins from another iterate than that of the last `start`, which follows once more."""
+
     def follow(self, active: wp.array) -> None:
         """At every further iterate: follow it as far as needed."""
 
@@ -77,6 +80,9 @@ class BlockJacobi:
         self.residual.blocks(active)
 
     follow = start
+
+    def renew(self, active: wp.array) -> None:
+        """Nothing is kept."""
 
     def commit(self, accepted: wp.array) -> None:
         """Nothing to keep."""

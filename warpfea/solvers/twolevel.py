@@ -183,6 +183,10 @@ class TwoLevel:
 
     # the seam
 
+    def renew(self, active: wp.array) -> None:
+        """What was made at the iterate before is of no use."""
+        self.launch(self.reuse.kernels.renew, self.model.worlds, [active, self.reuse.control])
+
     def follow(self, active: wp.array) -> None:
         """Nothing to do: it is reused at later iterates."""
 

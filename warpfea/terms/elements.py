@@ -57,6 +57,13 @@ class Elements(Term):
                 args = [block.data, at.state.displacement, w.u, active, w.newton.turned]
                 at.launch(kernels.turned_over, (w.u.shape[0], block.count), args)
 
+    def measure_turn(self, at: At, p: wp.array, active: wp.array) -> None:
+        """Largest gradient of a direction, into newton.turn."""
+        for block, kernels in zip(self.model.blocks, self.kernels(at)):
+            if not block.key.tying:
+                args = [block.data, p, active, at.work.newton.turn]
+                at.launch(kernels.largest_turn, (p.shape[0], block.count), args)
+
     def mixed_kernels(self) -> list[wp.Kernel]:
         """Kernels of `mixed_tangent`."""
         return [block.mixed_product(self.model.dtype) for block in self.model.blocks]
