@@ -100,6 +100,7 @@ def control_struct():
         wish: wp.array(dtype=wp.int32)  # 1: such a step is wanted, how long may it be? 2: the trial is one
         any_wish: wp.array(dtype=wp.int32)
         turn: wp.array(dtype=wp.float64)  # largest gradient of the direction
+        radius: wp.array(dtype=wp.float64)  # most that such a step may turn or stretch an element
         tame: wp.array(dtype=wp.int32)  # the next step must satisfy Armijo
         mark: wp.array(dtype=wp.int32)  # the base of the last step is the best iterate
         restoring: wp.array(dtype=wp.int32)  # the trial is the best iterate

@@ -23,8 +23,8 @@ REUSED_SEARCH = 2
 LEAPS = 5
 """Full steps in a row that may raise Phi: with the stress of the linear prediction in H, a slender body comes to its
 equilibrium over iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
-TURN = 0.5
-"""Most that such a step turns or stretches an element."""
+TURN, SHRINK = 0.5, 0.4
+"""Most that such a step turns or stretches an element, and what remains of it when the best iterate was restored."""
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1
@@ -71,6 +71,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.tame[world] = 0
         ctl.mark[world] = 0
         ctl.restoring[world] = 0
+        ctl.radius[world] = f64(TURN)
         ctl.strict[world] = 0
         ctl.strict_count[world] = 0
         ctl.negative[world] = 0
@@ -242,20 +243,21 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.leaps[world] = ctl.leaps[world] + 1
         if ctl.norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
             ctl.leaps[world] = 0
+            ctl.radius[world] = wp.min(f64(2.0) * ctl.radius[world], f64(TURN))
         elif ctl.leaps[world] >= LEAPS and ctl.active[world] != 0:
             ctl.restoring[world] = 1
             ctl.searching[world] = 1
 
     @wp.kernel(module=module)
     def plan_leap(ctl: Control):
-        """Length of a step that may raise Phi: no element turns or stretches by more than TURN."""
+        """Length of a step that may raise Phi: no element turns or stretches by more than the radius."""
         world = wp.tid()
         if world == 0:
             ctl.any_wish[0] = 0
         if ctl.searching[world] != 0 and ctl.wish[world] == 1:
             ctl.wish[world] = 2
             most = ctl.dq_dv[world] * ctl.turn[world]
-            ctl.alpha[world] = wp.min(f64(1.0), f64(TURN) / wp.max(most, f64(1.0e-300)))
+            ctl.alpha[world] = wp.min(f64(1.0), ctl.radius[world] / wp.max(most, f64(1.0e-300)))
 
     @wp.kernel(module=module)
     def judge_trial(ctl: Control):
@@ -305,6 +307,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                     ctl.reused[world] = 2
                 if ctl.restoring[world] != 0:
                     ctl.restoring[world] = 0
+                    ctl.radius[world] = f64(SHRINK) * ctl.radius[world]
                     ctl.leaps[world] = 0
                     ctl.mixed[world] = 0
                     ctl.tame[world] = 1
