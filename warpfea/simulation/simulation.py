@@ -69,6 +69,7 @@ class Simulation(Results):
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
         ConstraintError: joints that are open at the start.
+        CapacityError: the device has too little memory.
     """
 
     def __init__(
