@@ -20,7 +20,10 @@ def inverse_function(dtype: str):
 
     @wp.func
     def positive_inverse(A: mat33, least: T) -> mat33:
-        """A^-1 where the leading minors of A are safely positive, else the inverse of |diag A|, at least `least`."""
+        """A^-1 where the leading minors of A are safely positive, else the inverse of |diag A|, at least `least`.
+
+        For an A of about 1, whose minors neither overflow nor vanish.
+        """
         d1 = A[0, 0]
         d2 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
         d3 = wp.determinant(A)
@@ -36,16 +39,20 @@ def inverse_function(dtype: str):
     @wp.func
     def free_inverse(A: mat33, least: T, free: vec3) -> mat33:
         """Inverse of A on the components where `free` is 1; rows and columns of prescribed components are zero."""
+        scale = T(1.0e-30)
+        for i in range(3):
+            scale = wp.max(scale, wp.abs(A[i, i]))
+        s = T(1.0) / scale
         M = A
         for i in range(3):
             for j in range(3):
-                M[i, j] = A[i, j] * free[i] * free[j]
+                M[i, j] = s * A[i, j] * free[i] * free[j]
             if free[i] == T(0.0):
-                M[i, i] = wp.max(wp.abs(A[i, i]), T(1.0e-30))
-        B = positive_inverse(M, least)
+                M[i, i] = wp.max(s * wp.abs(A[i, i]), T(1.0e-30))
+        B = positive_inverse(M, s * least)
         for i in range(3):
             for j in range(3):
-                B[i, j] = B[i, j] * free[i] * free[j]
+                B[i, j] = s * B[i, j] * free[i] * free[j]
         return B
 
     return free_inverse

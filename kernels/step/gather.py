@@ -176,7 +176,10 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             )
         balance.rows[8, world, slot] = spread(balance.u[world, slot], free, D, balance.dq_dv[world])
         plain = wp.cw_mul(residual_force, free)
-        balance.rows[9, world, slot] = f64(wp.dot(plain, plain))
+        square = f64(0.0)  # of forces that float32 can't hold the square of
+        for k in range(3):
+            square += f64(plain[k]) * f64(plain[k])
+        balance.rows[9, world, slot] = square
         motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
         balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)
 

@@ -68,7 +68,15 @@ class PenetrationError(Error):
 
 
 class CapacityError(Error):
-    """A device array is too small for what a step needs."""
+    """A device has too little memory for a model, a simulation or a step.
+
+    Attributes:
+        bytes: size of the array that found no room; 0 where that is not known.
+    """
+
+    def __init__(self, message: str, *, bytes: int = 0) -> None:
+        super().__init__(message)
+        self.bytes = bytes
 
 
 class CheckpointError(Error):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -18,6 +19,18 @@ __all__ = ["beam_geometry", "spline"]
 
 CORNER = math.radians(1.0)
 """A polyline that bends by more than this has a corner."""
+KINK = 5.0
+"""Degrees that a curve given as a function may turn by at a point."""
+STEPS = 32
+"""Steps of the differences per element."""
+FORWARD = np.array([-147.0, 360.0, -450.0, 400.0, -225.0, 72.0, -10.0]) / 60.0
+"""Weights of f(0), f(h), ..., f(6 h) in h f'(0), of sixth order."""
+SMOOTH = 1e-4
+"""Relative difference of the derivatives on both sides of a node that counts as rounding."""
+CHORDS = 8
+"""Chords per element, whose angles show how far it turns."""
+HALVINGS = 16
+"""Halvings of a part of the curve in the search for a corner."""
 
 
 def spline(points: Any, *, closed: bool = False) -> Callable[[float], np.ndarray]:
@@ -52,11 +65,13 @@ class _Path:
         at: s -> (3,) m.
         slope: (s, side) -> dX/ds (3,), side -1 or 1.
         marks: parameters of corners, which must be nodes.
+        turns: angles (degrees) that the elements turn by, summed along each, where ends alone don't tell.
     """
 
     at: Callable[[float], np.ndarray]
     slope: Callable[[float, int], np.ndarray]
     marks: tuple[float, ...] = ()
+    turns: np.ndarray | None = None
 
 
 def beam_geometry(
@@ -77,13 +92,11 @@ def beam_geometry(
         raise ModelError(f"body {name!r}: section must be a Rectangle, got {section!r}")
     if corners not in ("error", "weld"):
         raise ModelError(f"body {name!r}: corners = {corners!r} is neither 'error' nor 'weld'")
-    path = _path(name, curve, corners)
+    path = _path(name, curve, int(elements), corners)
     s = _parameters(name, int(elements), path.marks)
     points = np.array([path.at(k) for k in s])
-    if points.shape != (len(s), 3) or not np.all(np.isfinite(points)):
-        raise ModelError(f"body {name!r}: the curve must give three finite coordinates (m) for every s in [0, 1]")
     ends = [(path.slope(a, 1) * (b - a), path.slope(b, -1) * (b - a)) for a, b in itertools.pairwise(s)]
-    _check_turns(name, s, ends, sharp_allowed=bool(path.marks))
+    _check_turns(name, s, ends, path.turns, sharp_allowed=bool(path.marks))
     frames = np.array(
         [[_frame(name, x, k, section, normal) for x, k in zip(pair, s[e : e + 2])] for e, pair in enumerate(ends)]
     )
@@ -95,14 +108,18 @@ def beam_geometry(
     return Mesh(points, cells, "line", node_sets=sets, name=name), axes, local
 
 
-def _check_turns(name: str, s: np.ndarray, ends: list[tuple[np.ndarray, np.ndarray]], *, sharp_allowed: bool) -> None:
+def _check_turns(
+    name: str,
+    s: np.ndarray,
+    ends: list[tuple[np.ndarray, np.ndarray]],
+    along: np.ndarray | None,
+    *,
+    sharp_allowed: bool,
+) -> None:
     """Refuse elements that turn too far for a cubic, and kinks between elements."""
-
-    def angle(a: np.ndarray, b: np.ndarray) -> float:
-        size = float(np.linalg.norm(a) * np.linalg.norm(b))
-        return math.degrees(math.acos(float(np.clip(a @ b / size, -1.0, 1.0)))) if size > 0.0 else 0.0
-
-    turns = [angle(a, b) for a, b in ends]
+    turns = np.array([float(_angles(np.array(pair))[0]) for pair in ends])
+    if along is not None:
+        turns = np.maximum(turns, along)
     worst = int(np.argmax(turns))
     if turns[worst] > 100.0:
         raise ModelError(
@@ -110,12 +127,23 @@ def _check_turns(name: str, s: np.ndarray, ends: list[tuple[np.ndarray, np.ndarr
             f"degrees; use elements = {math.ceil(len(ends) * turns[worst] / 20.0)} or more, for 20 degrees each"
         )
     for k in range(1, len(ends)):
-        kink = angle(ends[k - 1][1], ends[k][0])
-        if kink > 5.0 and not sharp_allowed:
-            raise ModelError(
-                f"body {name!r}: the curve has a corner of {kink:.3g} degrees at s = {s[k]:.3g}; give a smooth curve, "
-                "one beam per side, or a polyline with corners='weld'"
-            )
+        kink = float(_angles(np.array([ends[k - 1][1], ends[k][0]]))[0])
+        if kink > KINK and not sharp_allowed:
+            _refuse_corner(name, kink, s[k])
+
+
+def _refuse_corner(name: str, angle: float, s: float) -> None:
+    raise ModelError(
+        f"body {name!r}: the curve has a corner of {angle:.3g} degrees at s = {s:.3g}; give a smooth curve, "
+        "one beam per side, or a polyline with corners='weld'"
+    )
+
+
+def _angles(lines: np.ndarray) -> np.ndarray:
+    """Angles (degrees) between successive vectors (n, 3), (n - 1,); 0 beside a vector of length 0."""
+    a, b = lines[:-1], lines[1:]
+    across = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.degrees(np.arctan2(across, np.sum(a * b, axis=1)))
 
 
 def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal: Any) -> np.ndarray:
@@ -155,9 +183,9 @@ def _parameters(name: str, elements: int, marks: tuple[float, ...]) -> np.ndarra
     return np.concatenate([*parts, [1.0]])
 
 
-def _path(name: str, curve: Any, corners: str) -> _Path:
+def _path(name: str, curve: Any, elements: int, corners: str) -> _Path:
     if callable(curve):
-        return _function_path(name, curve)
+        return _function_path(name, curve, elements)
     ends = np.asarray(curve, dtype=float)
     if ends.ndim != 2 or ends.shape[1] != 3 or len(ends) < 2 or not np.all(np.isfinite(ends)):
         raise ModelError(
@@ -189,26 +217,68 @@ def _path(name: str, curve: Any, corners: str) -> _Path:
     return _Path(lambda s: np.array([np.interp(s, at, ends[:, c]) for c in range(3)]), side, marks)
 
 
-def _function_path(name: str, curve: Callable[[float], Any]) -> _Path:
-    """A smooth curve; its derivative by fourth-order differences, one-sided at the ends."""
+def _function_path(name: str, curve: Callable[[float], Any], elements: int) -> _Path:
+    """A smooth curve. The derivative at the end of an element is taken from points within the element.
+
+    So it holds for any number of turns and up to the joints of arcs and lines, and the function is asked in [0, 1]
+    only. Neighbours share the mean of theirs, so that their sections coincide, but where the curve bends or its speed
+    jumps.
+    """
 
     def at(s: float) -> np.ndarray:
         out = np.asarray(curve(s), dtype=float)
         if out.shape != (3,):
             raise ModelError(f"body {name!r}: the curve must return three numbers (m), it returned shape {out.shape}")
+        if not np.all(np.isfinite(out)):
+            raise ModelError(
+                f"body {name!r}: the curve must be finite for every s in [0, 1]; it is {out.tolist()} at s = {s:.4g}"
+            )
         return out
 
-    h = 1e-3
+    def one_sided(s: float, side: int) -> np.ndarray:
+        h = side / (STEPS * elements)
+        return FORWARD @ np.array([at(min(max(s + k * h, 0.0), 1.0)) for k in range(len(FORWARD))]) / h
+
+    @functools.lru_cache(maxsize=2)
+    def sides(s: float) -> tuple[np.ndarray, np.ndarray]:
+        if s in (0.0, 1.0):
+            end = one_sided(s, 1 if s == 0.0 else -1)
+            return end, end
+        left, right = one_sided(s, -1), one_sided(s, 1)
+        if np.linalg.norm(left - right) < SMOOTH * np.linalg.norm(left + right):
+            left = right = 0.5 * (left + right)
+        return left, right
 
     def slope(s: float, side: int) -> np.ndarray:
-        low, high = at(max(s - h, 0.0)), at(min(s + h, 1.0))
-        middle = at(s)
-        bend = float(np.linalg.norm(high - 2.0 * middle + low))
-        kinked = 2 * h <= s <= 1 - 2 * h and bend > 0.05 * float(np.linalg.norm(high - low))
-        if s < 2 * h or s > 1 - 2 * h or kinked:
-            d = h * side if kinked else h if s < 2 * h else -h
-            w = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / (12.0 * d)
-            return np.sum([c * at(s + k * d) for k, c in enumerate(w)], axis=0)
-        return (8.0 * (at(s + h) - at(s - h)) - (at(s + 2 * h) - at(s - 2 * h))) / (12.0 * h)
+        return sides(s)[(side + 1) // 2]
 
-    return _Path(at, slope)
+    return _Path(at, slope, turns=_turns(name, at, elements))
+
+
+def _turns(name: str, at: Callable[[float], np.ndarray], elements: int) -> np.ndarray:
+    """Angles (degrees) between the chords within each element, summed. ModelError for a corner of the curve."""
+    grid = np.linspace(0.0, 1.0, CHORDS * elements + 1)
+    turns = _angles(np.diff([at(s) for s in grid], axis=0))
+    pairs = turns + np.append(turns[1:], 0.0)  # a corner between two points of the grid is shared by both
+    for k in np.flatnonzero(pairs > 2.0 * KINK):
+        low, high = grid[k], grid[min(int(k) + 3, CHORDS * elements)]
+        angle, where = _closest_turn(at, low, high)
+        if angle > KINK:
+            _refuse_corner(name, angle, where)
+    inner = np.append(turns, 0.0).reshape(elements, CHORDS)[:, :-1]
+    return np.asarray(inner.sum(axis=1))
+
+
+def _closest_turn(at: Callable[[float], np.ndarray], low: float, high: float) -> tuple[float, float]:
+    """Angle (degrees) by which a curve turns where it does so fastest, in an ever shorter part, and where that is.
+
+    That of a smooth curve goes to 0 with the length, that of a corner does not.
+    """
+    for _ in range(HALVINGS):
+        s = np.linspace(low, high, 5)
+        turns = _angles(np.diff([at(k) for k in s], axis=0))
+        if turns.sum() <= KINK:
+            break
+        k = int(np.argmax(turns))
+        low, high = float(s[k]), float(s[k + 2])
+    return float(turns.sum()), 0.5 * (low + high)

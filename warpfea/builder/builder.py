@@ -416,6 +416,7 @@ class ModelBuilder:
         Raises:
             ModelError: no bodies, unknown device or precision, or gravity or a body force on a body whose material has
                 no density.
+            CapacityError: the device has too little memory.
 
         Warns:
             MeshWarning: a size, mass or density that a wrong unit is likely to have made.

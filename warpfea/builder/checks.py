@@ -133,7 +133,7 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
 
     Args:
         values: (3,) the same everywhere; a function X (n, 3) -> (n, 3), whose gradient is taken by central
-            differences; or (nodes, 3), for bodies without gradient slots.
+            differences with steps that follow the size of the cells; or (nodes, 3), for bodies without gradient slots.
 
     Raises:
         ModelError: another shape, values that are not finite, or nodal values on a body with gradient slots.
@@ -143,11 +143,14 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
         out = nodal(values(X), len(X), what)[body.slot_node]
         gradient = np.flatnonzero(body.slot_kind > 0)
         if len(gradient):
-            low, high = body.mesh.bounding_box()
-            step = 1e-5 * float(np.max(high - low))
-            at, along = X[body.slot_node[gradient]], body.reference[gradient]
-            ahead, behind = (nodal(values(at + k * step * along), len(at), what) for k in (1.0, -1.0))
-            out[gradient] = (ahead - behind) / (2.0 * step)
+            node = body.slot_node[gradient]
+            step = _node_sizes(body.mesh)[node, None] / 256.0
+            at, along = X[node], step * body.reference[gradient]
+            far, near = (
+                nodal(values(at + k * along), len(at), what) - nodal(values(at - k * along), len(at), what)
+                for k in (2.0, 1.0)
+            )
+            out[gradient] = (8.0 * near - far) / (12.0 * step)
         return out
     if body.family.has_gradients and np.shape(values) != (3,):
         raise ModelError(
@@ -155,6 +158,15 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
             "X (n, 3) -> (n, 3), or one vector (3,)"
         )
     return np.where((body.slot_kind == 0)[:, None], nodal(values, len(X), what)[body.slot_node], 0.0)
+
+
+def _node_sizes(mesh: Mesh) -> np.ndarray:
+    """Extent (m) of the smallest cell at each node (nodes,), 1 where there is none."""
+    x = mesh.points[mesh.cells]
+    extent = np.max(x.max(axis=1) - x.min(axis=1), axis=1)
+    out = np.full(len(mesh.points), np.inf)
+    np.minimum.at(out, mesh.cells, np.broadcast_to(extent[:, None], mesh.cells.shape))
+    return np.where(np.isfinite(out), out, 1.0)
 
 
 def component_mask(text: str, what: str) -> np.ndarray:

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..base.errors import ModelError
+from ..base.memory import enough_memory
 from ..kernels.common.types import precision
 from ..kernels.elements.materials import ANY_J, NCOEF
 from . import assembly
@@ -78,6 +79,11 @@ class Model:
         self.types = precision(dtype)
         self._memory: dict[str, int] = {}
         self.cache: dict[str, Any] = {}
+        with enough_memory(f"a model with {self.worlds} worlds", self.device):
+            self._build(builder, tables)
+
+    def _build(self, builder: Source, tables: bool) -> None:
+        """Number, assemble and upload what the builder describes."""
         self._number()
         self._assemble_mass()
         self._build_blocks(tables)

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import CheckpointError, ModelError
+from ..base.memory import enough_memory
 from ..kernels.common.state import state_kernels
 
 if TYPE_CHECKING:
@@ -82,12 +83,14 @@ class State:
         row = int(np.prod(spec.shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
         if row % 4:
             raise ModelError(f"state array {name!r}: a row has {row} bytes, which is no multiple of 4")
-        array = wp.zeros((self.worlds, *spec.shape), dtype=dtype, device=self.device)
-        values = np.asarray(initial)
-        if values.ndim or values != 0:
-            host = array.numpy()
-            host[...] = values
-            array.assign(host)
+        shape = (self.worlds, *spec.shape)
+        with enough_memory(f"state array {name!r} of {' x '.join(map(str, shape))} items", self.device):
+            array = wp.zeros(shape, dtype=dtype, device=self.device)
+            values = np.asarray(initial)
+            if values.ndim or values != 0:
+                host = array.numpy()
+                host[...] = values
+                array.assign(host)
         self.specs[name] = spec
         self._arrays[name] = array
         return array
@@ -106,7 +109,8 @@ class State:
         """A state with the same registry and values of its own, copied from this one."""
         out = State(self.worlds, self.device)
         out.specs = dict(self.specs)
-        out._arrays = {name: wp.clone(array) for name, array in self._arrays.items()}
+        with enough_memory(f"a copy of a state with {self.worlds} worlds", self.device):
+            out._arrays = {name: wp.clone(array) for name, array in self._arrays.items()}
         return out
 
     def copy_rows(self, launch: Launcher, flags: wp.array, source: State, skip: tuple[str, ...] = ()) -> None:

@@ -59,13 +59,18 @@ def run_steps(
 
 
 def close_all(opened: list[Any], sim: Any, *, quiet: bool = True) -> None:
-    """Close all, also after one has failed; then raise the first error, unless `quiet`."""
-    failed: Exception | None = None
+    """Close all, also after one has failed or was interrupted; then raise what came first, unless `quiet`.
+
+    Ctrl-C, which gives up the output that is being closed, is raised in any case.
+    """
+    failed: BaseException | None = None
     for out in opened:
         try:
             out.close(sim)
         except Exception as error:
             failed = failed or error
+        except BaseException as error:
+            failed, quiet = error, False
     if failed and not quiet:
         raise failed
 

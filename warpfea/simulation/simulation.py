@@ -12,6 +12,7 @@ import numpy as np
 from .. import solvers
 from ..base.console import compile_bar, quiet_warp
 from ..base.errors import ConstraintError, ConvergenceError, ModelError
+from ..base.memory import enough_memory
 from ..base.names import did_you_mean, listing
 from ..kernels.step.control import REPORT, STATUS
 from ..kernels.terms.constraints import JOINT_COLUMNS
@@ -70,6 +71,7 @@ class Simulation(Results):
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
         ConstraintError: joints that are open at the start.
+        CapacityError: the device has too little memory.
     """
 
     def __init__(
@@ -113,7 +115,8 @@ class Simulation(Results):
         self.integrator, self.solver = scheme, options
         self.on_failure, self.record = on_failure, record
         began = clock.perf_counter()
-        with quiet_warp(), compile_bar(None if on_compile is None else False) as bar:
+        room = enough_memory(f"a simulation of {model.worlds} worlds", model.device)
+        with quiet_warp(), room, compile_bar(None if on_compile is None else False) as bar:
             self.stepper = Stepper(
                 model, self.state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,

@@ -108,6 +108,7 @@ def solve_static(
         ModelError: a body is not supported, gravity acts on a material without a density, or an option is out of range.
         ConvergenceError: a load step was not accepted after all halvings.
         ConstraintError: the same, and it is the constraints that can't be satisfied.
+        CapacityError: the device has too little memory.
         OutputError: an output can't be written.
         KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """

@@ -13,6 +13,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
+from ..base.memory import enough_memory
 from ..kernels.step.control import REPORT
 from ..kernels.step.ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
@@ -212,10 +213,11 @@ class Stepper:
 
     def run(self) -> None:
         """Do one step of every running world."""
-        if self.graph is not None:
-            wp.capture_launch(self.graph)
-        else:
-            self.sequence()
+        with enough_memory("a step", self.model.device):
+            if self.graph is not None:
+                wp.capture_launch(self.graph)
+            else:
+                self.sequence()
 
     # the sequence of launches
 

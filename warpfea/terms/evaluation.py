@@ -12,6 +12,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import Launcher
+from ..base.memory import enough_memory
 from ..elements import Rule
 from ..kernels.common.types import precision
 from ..kernels.elements.materials import ANY_J
@@ -38,7 +39,8 @@ class Evaluation:
         self.elements = Elements(model)
 
     def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        return wp.zeros(shape, dtype=dtype, device=self.model.device)
+        with enough_memory("an evaluation at a state", self.model.device):
+            return wp.zeros(shape, dtype=dtype, device=self.model.device)
 
     def _gather(self, contribution: wp.array) -> np.ndarray:
         m = self.model

@@ -1,0 +1,42 @@
+"""Device memory that does not suffice, as one error that says how much was asked for and what to do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from .console import size
+from .errors import CapacityError
+
+__all__ = ["enough_memory"]
+
+_REFUSED = re.compile(r"Failed to allocate (?:(\d+) bytes|memory)|out of memory", re.IGNORECASE)
+
+
+@contextmanager
+def enough_memory(what: str, device: Any) -> Iterator[None]:
+    """Turn a refused allocation within, on a Warp device or on the host, into a CapacityError about `what`."""
+    try:
+        yield
+    except MemoryError as error:
+        raise CapacityError(f"{what}: the host has no memory left ({error}){_REMEDY}") from error
+    except RuntimeError as error:
+        found = _REFUSED.search(str(error))
+        if found is None:
+            raise
+        count = int(found[1]) if found[1] else 0
+        asked = f"another {count} bytes ({size(count)})" if count else "what it needs"
+        text = f"{what}: device {device} has no room for {asked}{_room(device)}{_REMEDY}"
+        raise CapacityError(text, bytes=count) from error
+
+
+_REMEDY = "; take fewer worlds, a coarser mesh, dtype='float32' or a device with more memory"
+
+
+def _room(device: Any) -> str:
+    """How much of a GPU's memory is free."""
+    if not getattr(device, "is_cuda", False):
+        return ""
+    return f": {size(device.free_memory)} of {size(device.total_memory)} are free"
