@@ -7,7 +7,7 @@ import numpy as np
 import warpfea as wf
 
 from ..case import Answer, Setting, case
-from ._common import Z, Effort, off, solve
+from ._common import Effort, Z, off, solve
 
 HARD = ("float32 can't hold this case",)
 
