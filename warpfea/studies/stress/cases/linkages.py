@@ -160,7 +160,7 @@ def _dead_point(setting: Setting) -> Answer:
     first, second = bar(0.0 * arm, arm, "crank"), bar(span, span + arm, "follower")
     rod = bar(arm, span + arm, "coupler")
     turn = ([0.0, 1.0], [0.0, 2.0 * np.pi])
-    motor = b.add_joint("revolute", parent=wf.GROUND, child=first.start, axis=-np.array(Y), drive=turn)
+    b.add_joint("revolute", parent=wf.GROUND, child=first.start, axis=-np.array(Y), drive=turn)
     b.add_joint("revolute", parent=wf.GROUND, child=second.start, axis=Y)
     b.add_joint("revolute", parent=first.end, child=rod.start, axis=Y)
     b.add_joint("spherical", parent=second.end, child=rod.end)
@@ -181,7 +181,7 @@ def _dead_point(setting: Setting) -> Answer:
     away = float(np.linalg.norm(far - pin - span, axis=1).max())
     return Answer(error, 1e-3, "rigid bars", **effort.told,
                   limits={"violation": (effort.violation or 0.0, _tol(setting))},
-                  note="stays a parallelogram" if away < 1e-2 * coupler else "goes over to the crossed one")  # fmt: skip
+                  note="stays a parallelogram" if away < 1e-2 * coupler else "crosses over")  # fmt: skip
 
 
 REFUSED = ("constraints could not be satisfied",)

@@ -89,8 +89,9 @@ def spin(setting: Setting, integrator: str) -> Answer:
         "momentum": (float(np.linalg.norm(linear)) / (start / 0.1), small),
         "tilt": (float(np.linalg.norm(angular[:2])) / start, small),
     }
-    return Answer(max(lost, energy), 0.05 if setting.single else 1e-3, "the scheme for a rigid rotor", **effort.told,
-                  limits=limits, drift=e["kinetic"] / kinetic - 1.0, note=f"keeps {L:.4f} of L, {T:.4f} of T")  # fmt: skip
+    bound = 0.05 if setting.single else 1e-3
+    return Answer(max(lost, energy), bound, "the scheme for a rigid rotor", **effort.told, limits=limits,
+                  drift=e["kinetic"] / kinetic - 1.0, note=f"keeps {L:.4f} of L, {T:.4f} of T")  # fmt: skip
 
 
 def _rotor(omega: float, h: float, steps: int, second: bool) -> tuple[float, float]:
