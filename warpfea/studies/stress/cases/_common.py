@@ -11,7 +11,7 @@ from warpfea.simulation.statics import StaticResult
 
 from ..case import Setting
 
-__all__ = ["Effort", "X", "Y", "Z", "finalize", "off", "put", "solve", "split"]
+__all__ = ["Effort", "X", "Y", "Z", "finalize", "off", "put", "solve"]
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -98,8 +98,3 @@ def off(value: Any, expected: Any, scale: float | None = None) -> float:
     """Largest difference over `scale`, by default the largest expected value."""
     value, expected = np.asarray(value, dtype=float), np.asarray(expected, dtype=float)
     return float(np.abs(value - expected).max() / (np.abs(expected).max() if scale is None else scale))
-
-
-def split(value: str) -> list[str]:
-    """The parts of a row's name, such as "T10-flat"."""
-    return value.split("-")

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation as Turn
 import warpfea as wf
 
 from ..case import Answer, Setting, case
-from ._common import Effort, finalize, off, solve, split
+from ._common import Effort, finalize, off, solve
 
 TURNS = ((0.3, 0.0, 0.0), (1.2, -2.1, 0.7), (0.0, np.pi, 0.0))
 """Rotation vectors, rad."""
@@ -32,12 +32,12 @@ def _cantilever(
         b.clamp(body.start)
         end: Any = body.end
     elif element == "3443":
-        grid = wf.mesh.grid(size[:2], cells=(8, 1))
+        grid = wf.mesh.grid(tuple(size[:2]), cells=(8, 1))
         body = b.add_shell(grid, thickness=size[2], material=law, transform=(R, shift))
         b.clamp(body.edge("x-"))
         end = body.edge("x+")
     else:
-        mesh = wf.mesh.box(size, cells=(6, 1, 1), element=element)
+        mesh = wf.mesh.box(tuple(size), cells=(6, 1, 1), element=element)
         body = b.add_solid(mesh, element=element, material=law, transform=(R, shift))
         b.clamp(body.nodes("x-"))
         end = body.nodes("x+")
@@ -50,7 +50,7 @@ def _cantilever(
       quick="both")  # fmt: skip
 def frame(setting: Setting, value: str) -> Answer:
     """A cantilever bent by a third of its length, turned and carried 10 or 1000 km away, deflects as at the origin."""
-    element, away = split(value)
+    element, away = value.split("-")
     law = wf.SVK(E=1e9, nu=0.3)
     load = 1e9 * SIZE[1] ** 4 / 12.0
     tol = None if setting.single else 1e-12

@@ -33,8 +33,8 @@ def _links(
         ends = [k * LINK * along, (k + 1) * LINK * along]
         link = b.add_beam(ends, elements=1, section=wf.Rectangle(SIDE, SIDE), normal=across, name=f"link {k}",
                           material=wf.SVK(E=E, nu=0.3, density=density))  # fmt: skip
-        axis = {"axis": Y} if kind == "revolute" else {}
-        joints.append(b.add_joint(kind, parent=above, child=link.start, **axis))
+        axis = Y if kind == "revolute" else None
+        joints.append(b.add_joint(kind, parent=above, child=link.start, axis=axis))
         bodies.append(link)
         above = link.end
     return bodies, joints

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 import warpfea as wf
 
 from ..case import Answer, Setting, case
-from ._common import Y, Z, Effort, finalize, split
+from ._common import Effort, Y, Z, finalize
 
 SPAN, RISE, SIDE, E = 1.0, 0.1, 0.1, 1e7
 """Of a truss of two bars: half its span, rise and side of the bars, m; modulus, Pa."""
@@ -60,7 +60,7 @@ def snap_through(setting: Setting, value: str) -> Answer:
 
     Statics under the load may refuse, or find the same state.
     """
-    element, way = split(value)
+    element, way = value.split("-")
     load = 1.2 * _load(RISE / np.sqrt(3.0))
     height = brentq(lambda z: _load(z) - load, -2.0 * RISE, -RISE, xtol=1e-15)
     model = _truss(setting, element, load)
