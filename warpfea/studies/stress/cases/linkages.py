@@ -58,7 +58,8 @@ def _pendulum(masses: Any, angle: float, times: np.ndarray) -> np.ndarray:
     return solve_ivp(rates, (0.0, times[-1]), [angle, angle, 0, 0], t_eval=times, rtol=1e-10, atol=1e-12).y[:2].T
 
 
-@case("mass-ratio", "Joints", values=("light-heavy", "heavy-light"), quick="both")
+@case("mass-ratio", "Joints", values=("light-heavy", "heavy-light"), quick="both",
+      refusal={"float32": ("float32 can't hold this case",)})  # fmt: skip
 def mass_ratio(setting: Setting, value: str) -> Answer:
     """Double pendulum whose links' masses are as 1 to 1e6, from 45 degrees for 1 s, against rigid links."""
     densities = [LIGHT * (RATIO if word == "heavy" else 1.0) for word in value.split("-")]
