@@ -21,7 +21,7 @@ class Effort:
 
     Attributes:
         newton, pcg, halvings: sums, of the worst world.
-        min_J, floor: the worst; None where no step told it.
+        min_J, floor: the worst, of worlds that have not failed; None where no step told it.
         violation: the largest of constraints over the model's size; None without constraints.
     """
 
@@ -38,8 +38,10 @@ class Effort:
         self.newton += int(report.newton.max())
         self.pcg += int(report.pcg.max())
         self.halvings += int(report.halvings.max())
-        low = float(report.min_J.min())
-        self.min_J = low if self.min_J is None else min(self.min_J, low)
+        running = report.status == 0
+        if running.any():
+            low = float(report.min_J[running].min())
+            self.min_J = low if self.min_J is None else min(self.min_J, low)
         floor = getattr(report, "floor", None)
         if floor is not None:
             self.floor = max(self.floor or 0.0, float(np.max(floor)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import numpy as np
@@ -121,7 +120,7 @@ def nan_load(setting: Setting, value: str) -> Answer:
     except wf.ConvergenceError as error:
         after = sim.state.numpy()
         intact = all(v.tobytes() == before[k] for k, v in after.items() if k != "status")
-        if not intact or not np.isfinite(after["displacement"]).all() or not re.search(r"finite", str(error)):
+        if not intact or not np.isfinite(after["displacement"]).all() or "finite" not in str(error):
             return wrong
         raise
     return wrong
