@@ -18,7 +18,10 @@ SOFT = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
 
 @case("rest-1e6", "Endurance", values=("T4", "3243"))
 def rest(setting: Setting, element: str) -> Answer:
-    """A body that hangs at rest stays where it is over 1e6 steps, 1e5 on a CPU."""
+    """A body that hangs at rest stays where it is over 1e6 steps, 1e5 on a CPU.
+
+    In float32 the first 1000 steps settle what the tolerance of statics, 1e-4, has left.
+    """
     steps = 1_000_000 if "cuda" in setting.device else 100_000
     b = wf.ModelBuilder()
     if element == "3243":
@@ -39,13 +42,15 @@ def rest(setting: Setting, element: str) -> Answer:
         sim.step(1000)
         effort.add(sim)
         e = sim.energies()
+        if setting.single and first is None:
+            start = sim.state.displacement.numpy().copy()
         total = float((e["kinetic"] + e["strain"] + e["potential"])[0])
         first = first or {"total": total, "strain": float(e["strain"][0])}
         drift = max(drift, abs(total - first["total"]) / first["strain"])
     moved = float(np.abs(sim.state.displacement.numpy() - start).max() / np.abs(start).max())
-    limits = {"energy": (drift, 1e-3 if setting.single else 1e-10)}
+    limits = {"energy": (drift, 1e-5 if setting.single else 1e-10)}
     told = effort.told | {name: int(sim.totals[name].max()) for name in ("newton", "pcg")}
-    return Answer(moved, 1e-3 if setting.single else 1e-12, "it stays", **told, limits=limits, drift=drift,
+    return Answer(moved, 1e-5 if setting.single else 1e-12, "it stays", **told, limits=limits, drift=drift,
                   note=f"{steps:.0e} steps of 10 ms")  # fmt: skip
 
 
