@@ -1,0 +1,1 @@
+"""The cases of the stress suite, by theme."""

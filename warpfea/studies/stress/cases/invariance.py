@@ -1,0 +1,139 @@
+"""What must not matter: where a body lies, how it is turned, and the unit of its lengths and stresses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation as Turn
+
+import warpfea as wf
+
+from ..case import Answer, Setting, case
+from ._common import Effort, finalize, off, solve
+
+TURNS = ((0.3, 0.0, 0.0), (1.2, -2.1, 0.7), (0.0, np.pi, 0.0))
+"""Rotation vectors, rad."""
+SIZE = (1.0, 0.1, 0.1)
+"""Of the cantilevers, in the unit of the row."""
+
+
+def _cantilever(
+    element: str, law: wf.SVK, load: float, turn: Turn, shift: np.ndarray, unit: float = 1.0
+) -> tuple[wf.ModelBuilder, wf.Body]:
+    """A cantilever of length `unit`, turned about the origin and moved, `load` N across at its end; probe "tip"."""
+    R = turn.as_matrix()
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    size = unit * np.array(SIZE)
+    if element == "3243":
+        ends = [shift, shift + size[0] * R[:, 0]]
+        section = wf.Rectangle(size[1], size[2])
+        body = b.add_beam(ends, elements=4, section=section, normal=R[:, 2], material=law)
+        b.clamp(body.start)
+        end: Any = body.end
+    elif element == "3443":
+        grid = wf.mesh.grid(tuple(size[:2]), cells=(8, 1))
+        body = b.add_shell(grid, thickness=size[2], material=law, transform=(R, shift))
+        b.clamp(body.edge("x-"))
+        end = body.edge("x+")
+    else:
+        mesh = wf.mesh.box(tuple(size), cells=(6, 1, 1), element=element)
+        body = b.add_solid(mesh, element=element, material=law, transform=(R, shift))
+        b.clamp(body.nodes("x-"))
+        end = body.nodes("x+")
+    b.add_point_load(end, tuple(load * R[:, 2]))
+    b.add_probe("tip", end)
+    return b, body
+
+
+@case("frame", "Invariance", values=("T10-1e4", "T10-1e6", "H3843-1e6", "3243-1e4", "3243-1e6", "3443-1e6"),
+      quick="both")  # fmt: skip
+def frame(setting: Setting, value: str) -> Answer:
+    """A cantilever bent by a third of its length, turned and carried 10 or 1000 km away, deflects as at the origin."""
+    element, away = value.split("-")
+    law = wf.SVK(E=1e9, nu=0.3)
+    load = 1e9 * SIZE[1] ** 4 / 12.0
+    tol = None if setting.single else 1e-12
+    effort = Effort()
+    worst, at_home = 0.0, None
+    for turn in (Turn.identity(), *(Turn.from_rotvec(v) for v in TURNS)):
+        shift = np.zeros(3) if at_home is None else float(away) * np.array([0.6, -0.48, 0.64])
+        b, _ = _cantilever(element, law, load, turn, shift)
+        tip = turn.inv().apply(solve(b, setting, effort, load_steps=2, tol=tol).probe("tip").displacement[0, -1])
+        if at_home is None:
+            at_home = tip
+        worst = max(worst, off(tip, at_home))
+    return Answer(worst, 1e-4 if setting.single else 1e-8, "the same body at the origin", **effort.told)
+
+
+@case("units", "Invariance", values=("mm", "km"), quick="both")
+def units(setting: Setting, value: str) -> Answer:
+    """A cantilever measured in mm and N, and in km and N, deflects by the same part of its length as in m."""
+    unit = {"mm": 1e3, "km": 1e-3}[value]
+    effort = Effort()
+    worst = 0.0
+    for element in ("T10", "3243", "3443"):
+        tips = []
+        for per_metre in (1.0, unit):
+            law = wf.SVK(E=1e9 / per_metre**2, nu=0.3)
+            load = 1e9 * SIZE[1] ** 4 / 12.0
+            b, _ = _cantilever(element, law, load, Turn.identity(), np.zeros(3), per_metre)
+            tol = None if setting.single else 1e-12
+            result = solve(b, setting, effort, load_steps=2, tol=tol)
+            tips.append(result.probe("tip").displacement[0, -1] / per_metre)
+        worst = max(worst, off(tips[1], tips[0]))
+    return Answer(worst, 1e-4 if setting.single else 1e-8, "the same body in m", **effort.told)
+
+
+MODULI = ("1e3", "1e6", "1e9", "1e12")
+
+
+@case("stiffness-static", "Invariance", values=MODULI, quick="both")
+def stiffness_static(setting: Setting, value: str) -> Answer:
+    """A fixed small load: deflection times E is the same for E from 1 kPa to 1 TPa."""
+    load = 1e-6 * 1e3 * SIZE[1] ** 4 / 12.0
+    effort = Effort()
+    worst = 0.0
+    for element in ("T10", "3243", "3443"):
+        K = []
+        for E in (1e6, float(value)):
+            b, _ = _cantilever(element, wf.SVK(E=E, nu=0.3), load, Turn.identity(), np.zeros(3))
+            tol = 1e-6 if setting.single else 1e-10
+            K.append(E * solve(b, setting, effort, load_steps=1, tol=tol).probe("tip").displacement[0, -1, 2])
+        worst = max(worst, off(K[1], K[0]))
+    return Answer(worst, 1e-4 if setting.single else 1e-8, "linear statics", **effort.told)
+
+
+@case("stiffness-dynamic", "Invariance", values=MODULI, quick="both")
+def stiffness_dynamic(setting: Setting, value: str) -> Answer:
+    """Steps of 1 ms of backward Euler from rest under a small load, E from 1 kPa to 1 TPa."""
+    E, h, steps = float(value), 1e-3, 20
+    effort = Effort()
+    worst = 0.0
+    for element in ("T10", "3243"):
+        law = wf.SVK(E=E, nu=0.3, density=1000.0)
+        exact = _linear_steps(*_cantilever(element, law, 1.0, Turn.identity(), np.zeros(3)), h, steps)
+        load = 1e-7 / float(np.abs(exact).max())  # second order: strains of 1e-7 or so
+        b, _ = _cantilever(element, law, load, Turn.identity(), np.zeros(3))
+        tol = None if setting.single else 1e-10
+        sim = wf.Simulation(finalize(b, setting), dt=h, solver=wf.NewtonPCG(tol=tol))
+        effort.step(sim, steps)
+        worst = max(worst, off(sim.state.displacement.numpy()[0], load * exact))
+    return Answer(worst, 1e-4 if setting.single else 1e-6, "linear backward Euler by scipy", **effort.told)
+
+
+def _linear_steps(b: wf.ModelBuilder, body: wf.Body, h: float, steps: int) -> np.ndarray:
+    """Slots' displacements (slots, 3) after steps of backward Euler with the matrices at rest, in float64."""
+    model = b.finalize(device="cpu")
+    free = np.flatnonzero(model.free_slots.ravel())
+    M, K = (A[free][:, free].toarray() for A in (model.mass_matrix(), model.tangent_matrix(model.state())))
+    f = np.zeros((model.slots, 3))
+    for dead in b.description.dead_loads:
+        np.add.at(f, body.slot_offset + dead.slots, dead.weights[:, None] * dead.law.values[0])
+    u, v = np.zeros(len(free)), np.zeros(len(free))
+    for _ in range(steps):
+        v = np.linalg.solve(M + h * h * K, M @ v + h * (f.ravel()[free] - K @ u))
+        u = u + h * v
+    out = np.zeros(3 * model.slots)
+    out[free] = u
+    return out.reshape(-1, 3)

@@ -1,0 +1,203 @@
+"""Joints between very unequal bodies, repeated, at a dead point, and in conflict."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import warpfea as wf
+
+from ..case import Answer, Setting, case
+from ._common import Effort, X, Y, Z, finalize
+
+G = 9.81
+SIDE, LINK = 0.05, 0.5
+"""Of a link, m."""
+LIGHT, RATIO = 10.0, 1e6
+"""Density of the light links, kg/m^3, and how many times as heavy the others are."""
+
+
+def _tol(setting: Setting) -> float:
+    return 1e-5 if setting.single else 1e-8
+
+
+def _links(
+    b: wf.ModelBuilder, kind: str, densities: Any, along: np.ndarray, across: Any, E: float
+) -> tuple[list[wf.Body], list[Any]]:
+    """Beams of one element in a row from the origin, with joints above each."""
+    bodies, joints = [], []
+    above: Any = wf.GROUND
+    for k, density in enumerate(densities):
+        ends = [k * LINK * along, (k + 1) * LINK * along]
+        link = b.add_beam(ends, elements=1, section=wf.Rectangle(SIDE, SIDE), normal=across, name=f"link {k}",
+                          material=wf.SVK(E=E, nu=0.3, density=density))  # fmt: skip
+        axis = Y if kind == "revolute" else None
+        joints.append(b.add_joint(kind, parent=above, child=link.start, axis=axis))
+        bodies.append(link)
+        above = link.end
+    return bodies, joints
+
+
+def _pendulum(masses: Any, angle: float, times: np.ndarray) -> np.ndarray:
+    """Angles (times, 2) of two rigid links from rest, from the downward vertical."""
+    c = LINK / 2.0
+    own = [m * (LINK**2 + SIDE**2) / 12.0 for m in masses]
+    A = own[0] + masses[0] * c**2 + masses[1] * LINK**2
+    B = masses[1] * LINK * c
+    C = own[1] + masses[1] * c**2
+    weights = G * np.array([masses[0] * c + masses[1] * LINK, masses[1] * c])
+
+    def rates(_: float, y: np.ndarray) -> np.ndarray:
+        q, v = y[:2], y[2:]
+        sine, cosine = np.sin(q[0] - q[1]), np.cos(q[0] - q[1])
+        force = -weights * np.sin(q) - B * sine * np.array([v[1] ** 2, -(v[0] ** 2)])
+        return np.append(v, np.linalg.solve([[A, B * cosine], [B * cosine, C]], force))
+
+    return solve_ivp(rates, (0.0, times[-1]), [angle, angle, 0, 0], t_eval=times, rtol=1e-10, atol=1e-12).y[:2].T
+
+
+@case("mass-ratio", "Joints", values=("light-heavy", "heavy-light"), quick="both",
+      refusal={"float32": ("float32 can't hold this case",)})  # fmt: skip
+def mass_ratio(setting: Setting, value: str) -> Answer:
+    """Double pendulum whose links' masses are as 1 to 1e6, from 45 degrees for 1 s, against rigid links."""
+    densities = [LIGHT * (RATIO if word == "heavy" else 1.0) for word in value.split("-")]
+    angle, h = np.pi / 4, 1e-3
+    along = np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    bodies, _ = _links(b, "revolute", densities, along, np.cross(along, Y), 2e12)
+    for name, body in zip(("elbow", "tip"), bodies):
+        b.add_probe(name, body.end)
+    model = finalize(b, setting)
+    sim = wf.Simulation(model, dt=h, integrator="bdf2")
+    effort = Effort()
+    sim.run(1.0, outputs=[effort], progress=False)
+    times = sim.probe("tip").time
+    angles = _pendulum([d * SIDE**2 * LINK for d in densities], angle, np.append(0.0, times))[1:]
+    ways = np.stack([np.sin(angles), 0.0 * angles, -np.cos(angles)], axis=-1)
+    exact = LINK * np.cumsum(ways, axis=1)
+    got = np.stack([sim.probe(name).position[0] for name in ("elbow", "tip")], axis=1)
+    error = float(np.linalg.norm(got - exact, axis=2).max() / (2.0 * LINK))
+    return Answer(error, 5e-3 if setting.single else 1e-3, "rigid double pendulum by scipy", **effort.told,
+                  limits={"violation": (effort.violation or 0.0, _tol(setting))})  # fmt: skip
+
+
+@case("mass-ratio-chain", "Joints", values=("fixed", "revolute"), quick="both")
+def mass_ratio_chain(setting: Setting, kind: str) -> Answer:
+    """Six links that hang at rest, light and 1e6 times as heavy in turn: force of every joint against the weight."""
+    densities = [LIGHT, RATIO * LIGHT] * 3
+    return _hanging(setting, kind, densities, 0.0)
+
+
+@case("chain-1e3", "Joints", values=("fixed", "revolute"), quick="both")
+def chain(setting: Setting, kind: str) -> Answer:
+    """Ten links that hang at rest with a load of 1000 times a link's weight at their end."""
+    return _hanging(setting, kind, [1000.0] * 10, 1000.0)
+
+
+def _hanging(setting: Setting, kind: str, densities: list[float], load: float) -> Answer:
+    """Joint forces of a chain at rest over the weight below, `load` in weights of the first link hung from its end.
+
+    Statics where the joints leave nothing free, else 100 steps of 10 ms of backward Euler, which settle it.
+    """
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    bodies, joints = _links(b, kind, densities, -np.array(Z), X, 2e11)
+    weights = np.array(densities) * SIDE**2 * LINK * G
+    if load:
+        b.add_point_load(bodies[-1].end, (0, 0, -load * weights[0]))
+    effort = Effort()
+    model = finalize(b, setting)
+    if kind == "fixed":
+        sim = wf.solve_static(model, load_steps=1, outputs=[effort]).simulation
+    else:
+        sim = wf.Simulation(model, dt=1e-2)
+        effort.step(sim, 100)
+    below = np.cumsum(weights[::-1])[::-1] + load * weights[0]
+    got = np.array([sim.joint_force(joint)[0, :3] for joint in joints])
+    error = float((np.linalg.norm(got - below[:, None] * np.array(Z), axis=1) / below).max())
+    return Answer(error, 1e-3 if setting.single else 1e-6, "weight below", **effort.told,
+                  limits={"violation": (effort.violation or 0.0, _tol(setting))})  # fmt: skip
+
+
+@case("joints", "Joints", values=("redundant", "dead-point"), quick="both")
+def joints(setting: Setting, value: str) -> Answer:
+    """A door on two hinges in one place; a parallelogram driven through its dead points."""
+    return _redundant(setting) if value == "redundant" else _dead_point(setting)
+
+
+def _redundant(setting: Setting) -> Answer:
+    """The sum of the hinges' forces on a door that hangs down at rest, against its weight."""
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    mesh = wf.mesh.box((0.4, 0.04, 0.8), cells=(2, 1, 4), origin=(-0.2, -0.02, -0.8))
+    door = b.add_solid(mesh, material=wf.SVK(E=1e9, nu=0.3, density=600.0))
+    hinges = [b.add_joint("revolute", parent=wf.GROUND, child=door.surface("z+"), axis=Y) for _ in range(2)]
+    model = finalize(b, setting)
+    sim = wf.Simulation(model, dt=1e-2)
+    effort = Effort()
+    effort.step(sim, 40)
+    weight = 600.0 * 0.4 * 0.04 * 0.8 * G
+    total = sum(sim.joint_force(hinge)[0] for hinge in hinges)
+    error = float(np.linalg.norm(total[:3] - weight * np.array(Z)) / weight)
+    return Answer(error, 1e-3 if setting.single else 1e-6, "weight of the door", **effort.told,
+                  limits={"violation": (effort.violation or 0.0, _tol(setting))})  # fmt: skip
+
+
+def _dead_point(setting: Setting) -> Answer:
+    """A full turn of the crank, at 1 turn/s: at 0 and 180 degrees all pins lie on a line, and the follower may go on
+    either way. Judged is that cranks and coupler keep their lengths, and that the crank is where it is driven to."""
+    crank, coupler, h = 0.2, 0.5, 2e-3
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    law = wf.SVK(E=2e11, nu=0.3, density=7800.0)
+    start = 0.5
+    arm = crank * np.array([np.cos(start), 0.0, np.sin(start)])
+    span = coupler * np.array(X)
+    section = wf.Rectangle(0.02, 0.02)
+
+    def bar(a: Any, c: Any, name: str) -> wf.Body:
+        along = np.asarray(c) - np.asarray(a)
+        return b.add_beam([a, c], elements=1, section=section, normal=np.cross(along, Y), material=law, name=name)
+
+    first, second = bar(0.0 * arm, arm, "crank"), bar(span, span + arm, "follower")
+    rod = bar(arm, span + arm, "coupler")
+    turn = ([0.0, 1.0], [0.0, 2.0 * np.pi])
+    b.add_joint("revolute", parent=wf.GROUND, child=first.start, axis=-np.array(Y), drive=turn)
+    b.add_joint("revolute", parent=wf.GROUND, child=second.start, axis=Y)
+    b.add_joint("revolute", parent=first.end, child=rod.start, axis=Y)
+    b.add_joint("spherical", parent=second.end, child=rod.end)
+    around = 2.0 * np.pi * np.array([0.0, -1.0, 0.0])
+    b.set_initial(first, velocity=lambda P: np.cross(around, P))
+    b.set_initial(second, velocity=lambda P: np.cross(around, P - span))
+    b.set_initial(rod, velocity=tuple(np.cross(around, arm)))
+    for name, body in (("pin", first), ("far", second)):
+        b.add_probe(name, body.end)
+    sim = wf.Simulation(finalize(b, setting), dt=h, integrator="bdf2")
+    effort = Effort()
+    sim.run(1.0, outputs=[effort], progress=False)
+    pin, far = (sim.probe(name).position[0] for name in ("pin", "far"))
+    lengths = np.stack([np.linalg.norm(far - pin, axis=1) / coupler, np.linalg.norm(far - span, axis=1) / crank])
+    angle = start + 2.0 * np.pi * sim.probe("pin").time
+    exact = crank * np.stack([np.cos(angle), 0.0 * angle, np.sin(angle)], axis=1)
+    error = max(float(np.abs(lengths - 1.0).max()), float(np.linalg.norm(pin - exact, axis=1).max() / crank))
+    away = float(np.linalg.norm(far - pin - span, axis=1).max())
+    return Answer(error, 1e-3, "rigid bars", **effort.told,
+                  limits={"violation": (effort.violation or 0.0, _tol(setting))},
+                  note="stays a parallelogram" if away < 1e-2 * coupler else "crosses over")  # fmt: skip
+
+
+REFUSED = ("constraints could not be satisfied",)
+
+
+@case("joints-conflicting", "Joints", quick="both", must=True, refusal={"float64": REFUSED, "float32": REFUSED})
+def joints_conflicting(setting: Setting) -> Answer:
+    """One point pinned to two places is refused by the names of the pins."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(1, 1, 1)), material=wf.SVK(E=1e7, nu=0.3, density=1000.0))
+    b.clamp(body.nodes("x-"))
+    tip = body.at((1, 0.1, 0.1))
+    effort = Effort()
+    for k, way in enumerate((0.1, 0.2)):
+        b.add_constraint("PIN", points=(tip, (1, 0.1, 0.1)), value=([0, 1e-2], [(0, 0, 0), (0, 0, way)]),
+                         name=f"pin {k}")  # fmt: skip
+    effort.step(wf.Simulation(finalize(b, setting), dt=1e-3), 10)
+    return Answer(float("nan"), 0.0, "no place satisfies both", **effort.told)

@@ -1,0 +1,98 @@
+"""Starts that no motion leads to: inside out, flat, in one point, scrambled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+import warpfea as wf
+
+from ..case import Answer, Setting, case
+from ._common import Effort, Z, finalize
+
+MODULUS = 1e6
+SOLIDS = ("T4", "T10", "ENMC", "FN18", "H3843")
+ROWS = [f"{e}-{law}" for e in SOLIDS for law in ("svk", "neo")] + ["3243-svk", "3443-svk"]
+
+NAMED = ("worst element", "J <= 0")
+"""A refusal names the element."""
+
+
+def _body(b: wf.ModelBuilder, element: str, law: str) -> wf.Body:
+    """A body 1 m long along x, held at x = 0."""
+    material = (wf.SVK if law == "svk" else wf.NeoHookean).from_E_nu(E=MODULUS, nu=0.3, density=1000.0)
+    if element == "3243":
+        body = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=4, section=wf.Rectangle(0.1, 0.1), normal=Z,
+                          material=material)  # fmt: skip
+        b.clamp(body.start)
+    elif element == "3443":
+        body = b.add_shell(wf.mesh.grid((1.0, 0.5), cells=(4, 2)), thickness=0.05, material=material)
+        b.clamp(body.edge("x-"))
+    else:
+        mesh = wf.mesh.box((1.0, 0.4, 0.4), cells=(4, 2, 2), element=element)
+        body = b.add_solid(mesh, element=element, material=material)
+        b.clamp(body.nodes("x-"))
+    return body
+
+
+def _starts(kind: str, body: wf.Body) -> np.ndarray:
+    """Slot values (slots, 3) of a start, positions from the body's middle."""
+    E = body.reference
+    if kind == "inverted":
+        return E * (-1.0, 1.0, 1.0)
+    if kind == "flat":
+        return E * (1.0, 1.0, 0.0)
+    if kind == "collapsed":
+        return 0.0 * E
+    size = np.where(body.slot_kind == 0, 0.05, 0.3)[:, None]
+    if body.materials[0][1].law != "svk":  # no point inside out
+        size = 0.06 * size
+    return E + size * np.random.default_rng(0).standard_normal(E.shape)
+
+
+def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
+    """Let a start go without load; how far the end is from rest, over the length."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = _body(b, *value.split("-"))
+    model = finalize(b, setting)
+    state = model.state()
+    u = (_starts(kind, body) - body.reference) * model.free_slots[body.slots]
+    state.displacement.assign(u[None].astype(state.displacement.numpy().dtype))
+    effort = Effort()
+    bound = 1e-4 if setting.single else 1e-6
+    # rest is stress-free: its forces have no scale but rounding in those of a strain of 1
+    area = {"3243": 0.01, "3443": 0.025}.get(body.family.name, 0.16)
+    solver = wf.NewtonPCG(max_newton=200, max_pcg=20000, force_tol=(2e-7 if setting.single else 1e-12) * MODULUS * area)
+    if damped:  # omega h > 6 for the slowest mode: a step of backward Euler leaves less than a sixth of anything
+        h = 4.0 if body.family.name in ("3243", "3443") else 0.5
+        sim = wf.Simulation(model, state, dt=h, solver=solver)
+        effort.step(sim, 30)
+    else:
+        sim = wf.solve_static(model, load_steps=1, state=state, solver=solver, outputs=[effort]).simulation
+    assert sim.last is not None
+    low = float(sim.last.min_J[0])
+    away = float(np.abs(sim.displacements(body)).max())
+    told = effort.told | {"min_J": low}
+    if low <= 0.0:
+        return Answer(0.0, bound, "min_J <= 0 is reported", **told, note=f"stays so, {away:.2g} m off; reported")
+    return Answer(away, bound, "rest", **told, note="recovered" if away <= bound else "another equilibrium")
+
+
+def _add(kind: str, what: str) -> None:
+    """The cases of a kind of start: by statics, and by steps of backward Euler that are longer than its periods."""
+    refusal: dict[str, Sequence[str]] = {"float64": NAMED, "float32": NAMED}
+    for damped, way in ((False, "statics"), (True, "damped steps")):
+
+        def run(setting: Setting, value: str, damped: bool = damped) -> Answer:
+            return _run(setting, value, kind, damped)
+
+        run.__doc__ = f"{what}, by {way}: recovers, is refused by the name of an element, or says that J <= 0."
+        name, quick = (f"start-{kind}-damped", "none") if damped else (f"start-{kind}", "float64")
+        case(name, "Starts", values=ROWS, quick=quick, refusal=refusal)(run)
+
+
+_add("inverted", "A mirrored body")
+_add("flat", "A body pressed flat")
+_add("collapsed", "A body in one point")
+_add("random", "A scrambled body")
