@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["CASES", "Answer", "Case", "Setting", "case"]
+__all__ = ["CASES", "Answer", "Case", "Setting", "Skipped", "case", "label"]
+
+
+class Skipped(Exception):
+    """A row that can't be tried here; it counts neither way. The text, a few words, is its outcome."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a case runs on."""
+    """What a case runs on.
+
+    Attributes:
+        device: Warp device.
+        dtype: "float64" or "float32".
+        meshes: folder of mesh files that the package does not hold, or None.
+    """
 
     device: str
     dtype: str
+    meshes: pathlib.Path | None = None
+
+    def mesh(self, name: str) -> pathlib.Path:
+        """A file of the folder --meshes. Skipped where it is not there."""
+        if self.meshes is None or not (self.meshes / name).is_file():
+            raise Skipped("no mesh")
+        return self.meshes / name
 
     @property
     def single(self) -> bool:
@@ -82,6 +100,14 @@ class Case:
     refusal: dict[str, tuple[str, ...]]
     must: bool
     about: str
+
+
+def label(name: str, value: Any) -> str:
+    """What a row is called: NAME, or NAME/VALUE."""
+    if value is None:
+        return name
+    parts = value if isinstance(value, tuple) else (value,)
+    return f"{name}/{'-'.join(f'{x:g}' if isinstance(x, float) else str(x) for x in parts)}"
 
 
 CASES: dict[str, Case] = {}
