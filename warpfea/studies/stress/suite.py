@@ -175,7 +175,7 @@ def _cells(row: Mapping[str, Any]) -> dict[str, str]:
         value = row.get(name)
         if value is None:
             return "nan" if name == "error" and "bound" in row else "-"
-        return number(value, 3)
+        return str(value) if isinstance(value, int) else number(value, 3)
 
     return {
         "case": row["case"], "precision": row["precision"], "outcome": row["outcome"], "error": text("error"),
