@@ -101,7 +101,7 @@ class Count(Output):
             limits["error over the floor told"] = (error, 3.0 * self.floor)
         return Answer(
             float(error), bound, reference, newton=self.newton, pcg=self.pcg, halvings=self.halvings, limits=limits,
-            violation=self.violation or None, min_J=self.min_J if np.isfinite(self.min_J) else None, floor=self.floor, **more,
+            violation=self.violation or None, min_J=float(self.min_J), floor=self.floor, **more,
         )  # fmt: skip
 
     def open(self, sim: Any) -> None:
