@@ -60,7 +60,7 @@ def inverted_traction(setting: Setting, element: str) -> Answer:
     return found.count.answer(0.0, 0.0, "SVK softens: no state with J > 0", note=f"min J {found.count.min_J:.3g}")
 
 
-@case("inverted-report", "inside out", refusal={})
+@case("inverted-report", "inside out")
 def inverted_report(setting: Setting) -> Answer:
     """The same with inversion="report": the state is given, and the report says that it is inside out."""
     if "inversion" not in inspect.signature(wf.solve_static).parameters:

@@ -22,8 +22,8 @@ NEWTON = 15
 LONG = 1e3
 """Steps from here on, s, are static solutions: inertia is 1e-12 of the stiffness."""
 BOUNDS = {"float64": 1e-6, "float32": 6e-3}
-LINEAR = 1e-3
-"""What a linear solution leaves out at a sag of 6e-5 of the length, and more."""
+LINEAR = 2e-4
+"""What a linear solution may leave out at a sag of 6e-5 of the length."""
 EDGE = 10.0
 FALLING = {"rubber": wf.SVK(E=1e6, nu=0.3, density=1000.0), "steel": STEEL}
 
@@ -119,14 +119,14 @@ def long_soft(setting: Setting, h: float) -> Answer:
     refusal={"float32": ["float32"]},
 )  # fmt: skip
 def free_fall(setting: Setting, value: tuple[str, float]) -> Answer:
-    """A free cube of 10 m falls for one step, up to a million times its size."""
+    """A free cube of 10 m falls for three steps, up to a million times its size."""
     law, h = value
     b = wf.ModelBuilder(gravity=DOWN)
     mesh = wf.mesh.box((EDGE,) * 3, cells=(2, 2, 2))
     body = b.add_solid(mesh, material=FALLING[law], name="cube")
     sim = wf.Simulation(b.finalize(device=setting.device, dtype=setting.dtype), dt=h)
-    count = step(sim, 1)
-    velocity = sim.velocities(body)[0]
-    error = float(np.abs(velocity - np.array(DOWN) * h).max() / (9.81 * h))
+    count = step(sim, 3)
+    velocity = np.array(DOWN) * 3.0 * h
+    error = float(np.abs(sim.velocities(body)[0] - velocity).max() / np.abs(velocity).max())
     bound = 1e-5 if setting.single else 1e-10
     return count.answer(error, bound, "v = g t", limits={"halvings": (count.halvings, 0)}, largest_step=h)
