@@ -7,7 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["CASES", "Answer", "Case", "Setting", "Skipped", "case", "label"]
+__all__ = ["CASES", "DTYPES", "Answer", "Case", "Setting", "Skipped", "case", "label"]
+
+
+DTYPES = ("float64", "float32")
+"""Precisions."""
 
 
 class Skipped(Exception):
@@ -90,6 +94,8 @@ class Case:
         refusal: {dtype: texts}: there the case may end with an error of warpfea whose text holds one of `texts` instead
             of an answer; with `must`, has to.
         must: an answer fails: the case is to be refused.
+        about: what is tried, a line.
+        dtypes: precisions that the case is for.
     """
 
     name: str
@@ -100,6 +106,7 @@ class Case:
     refusal: dict[str, tuple[str, ...]]
     must: bool
     about: str
+    dtypes: tuple[str, ...] = DTYPES
 
 
 def label(name: str, value: Any) -> str:
@@ -116,14 +123,14 @@ CASES: dict[str, Case] = {}
 
 def case(
     name: str, group: str, *, values: Sequence[Any] = (None,), quick: str = "none",
-    refusal: dict[str, Sequence[str]] | None = None, must: bool = False,
+    refusal: dict[str, Sequence[str]] | None = None, must: bool = False, dtypes: Sequence[str] = DTYPES,
 ) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:  # fmt: skip
     """Add a function to `CASES`; see Case. The first line of its docstring says what is tried."""
 
     def add(run: Callable[..., Answer]) -> Callable[..., Answer]:
         texts = {dtype: tuple(t) for dtype, t in (refusal or {}).items()}
         about = (run.__doc__ or "").strip().splitlines()[0]
-        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must, about)
+        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must, about, tuple(dtypes))
         return run
 
     return add

@@ -22,12 +22,11 @@ from ...base.errors import Error, UsageError
 from ...base.names import did_you_mean
 from ...base.provenance import origin
 from ...base.writer import check_target
-from .case import CASES, Answer, Case, Setting, Skipped, label
+from .case import CASES, DTYPES, Answer, Case, Setting, Skipped, label
 
-__all__ = ["DTYPES", "Row", "attempt", "choose", "list_cases", "load_cases", "run_rows", "stress"]
+__all__ = ["Row", "attempt", "choose", "list_cases", "load_cases", "run_rows", "stress"]
 
 SCHEMA = 1
-DTYPES = ("float64", "float32")
 DONE, REFUSED, FAILED = "done", "refused", "FAILED"
 STDOUT = "-"
 NOTE = 120
@@ -75,11 +74,11 @@ def choose(cases: Mapping[str, Case], names: Sequence[str], quick: bool, dtypes:
         for value in case.values:
             called = {case.name, case.group, label(case.name, value)}
             for dtype in dtypes:
-                wanted = not quick or case.quick in ("both", dtype)
+                wanted = dtype in case.dtypes and (not quick or case.quick in ("both", dtype))
                 if wanted and (not names or called.intersection(names)):
                     rows.append(Row(case, value, dtype))
     if not rows:
-        raise UsageError("no row is left: none of these cases is in the quick suite in this precision")
+        raise UsageError("no row is left: none of these cases is for this precision or in the quick suite")
     return rows
 
 
