@@ -17,8 +17,12 @@ SIDE, ELEMENTS = 0.01, 32
 LAW = wf.SVK(E=1e9, nu=0.3, density=1000.0)
 EI = LAW.E * SIDE**4 / 12.0
 GJ = LAW.lame[1] * wf.Rectangle(SIDE, SIDE).torsion_ratio * wf.Rectangle(SIDE, SIDE).polar
-GREENHILL = 8.986
-"""Critical torque of a beam with both ends built in, times L / (E I): the first root of 2 (1 - cos m) = m sin m."""
+GREENHILL = 8.98682
+"""Critical torque of a beam with both ends built in, times L / (E I): the first root of 2 (1 - cos m) = m sin m.
+
+The turned end is free along the axis: where it is held, twisting tightens the beam, by E I_p (theta / L)^2 / 2, so much
+that it never buckles.
+"""
 
 
 @case(
@@ -39,13 +43,20 @@ def drive_jump(setting: Setting, angle: float) -> Answer:
 
 
 def twisted(setting: Setting, part: float) -> Answer:
-    """A beam with both ends built in, one turned to `part` of the critical torque; any stable equilibrium is right."""
+    """A beam with both ends built in, one turned to `part` of the critical torque; any stable equilibrium is right.
+
+    Force balance and stability are judged by the same model in float64.
+    """
     critical = GREENHILL * EI / GJ  # rad, with the torque G J theta / L
     b, body = beam(ELEMENTS, SIDE, LAW)
     turn = wf.Rotation(anchor=(1, 0, 0), axis=(1, 0, 0), angle=([0, 1], [0, part * critical]))
-    b.drive(body.end, rotation=turn, slots="position+section")
+    b.drive(body.end, rotation=turn, slots="section")
+    b.clamp(body.end, slots="position", components="yz")
     found = solve(b, setting, load_steps=20)
-    model, state = found.result.simulation.model, found.result.state
+    displacement = found.result.state.displacement.numpy().astype(float)
+    model = b.finalize(device=setting.device)
+    state = model.state()
+    state.displacement.assign(displacement)
     free = np.flatnonzero(model.free_slots.ravel())
     force = model.internal_force(state)[0].ravel()
     error = float(np.abs(force[free]).max() / np.abs(force).max())
@@ -53,11 +64,12 @@ def twisted(setting: Setting, part: float) -> Answer:
     values = np.linalg.eigvalsh(0.5 * (K + K.T))
     low = float(values[0] / values[-1])
     energy, straight = float(model.strain_energy(state)[0]), 0.5 * GJ * (part * critical) ** 2
-    across = float(np.abs(found.result.displacements(body)[0, :, 1:]).max())
+    across = float(np.abs(found.result.displacements(body)[0, :, 1:]).max())  # m
     flagged = bool(np.any(getattr(found.result.report, "unstable", False)))
-    limits = {"unstable and not told": (0.0 if flagged else -low, 1e-6 if setting.single else 1e-12)}
+    limits = {"unstable and not told": (0.0 if flagged else -low, 1e-12)}
     if part < 1.0:
-        limits |= {"energy off Saint-Venant's": (abs(energy / straight - 1.0), 0.02), "off the axis, m": (across, 1e-6)}
+        limits["energy off Saint-Venant's"] = (abs(energy / straight - 1.0), 0.02)
+        limits["off the axis, m"] = (across, 1e-2 * SIDE if setting.single else 1e-6)
     note = f"lowest eigenvalue {low:.2g} of the largest, {across:.2g} m off the axis, energy {energy / straight:.4f}"
     return found.count.answer(error, 1e-3 if setting.single else 1e-6, "equilibrium, stable by the tangent matrix",
                               limits=limits, note=note)  # fmt: skip
@@ -91,7 +103,7 @@ def steel_km(setting: Setting, cells: int) -> Answer:
         return b
 
     reference = solve(cube(), Setting(setting.device, "float64"), load_steps=1, tol=1e-10).tip
-    solver = wf.NewtonPCG(preconditioner="block-jacobi", max_pcg=20000, max_newton=50)
+    solver = wf.NewtonPCG(preconditioner="block-jacobi", max_halvings=2)
     found = solve(cube(), setting, load_steps=1, solver=solver)
     return found.count.answer(off(found.tip, reference), 1e-2 if setting.single else 3e-4, "float64, tol 1e-10")
 
