@@ -18,6 +18,7 @@ __all__ = [
     "BUILT_IN",
     "DOWN",
     "REFINED",
+    "SOUND",
     "STEEL",
     "Count",
     "Solved",
@@ -30,6 +31,8 @@ __all__ = [
 
 DOWN = (0.0, 0.0, -9.81)
 STEEL = wf.SVK(E=2e11, nu=0.3, density=7800.0)
+SOUND = 1e-12
+"""J that counts as positive."""
 REFINED = 1e-10
 """Relative residual of references that are solved in float64."""
 BUILT_IN = {
@@ -94,9 +97,14 @@ class Count(Output):
         floor = getattr(report, "floor", None)
         self.floor = max(self.floor, 0.0 if floor is None else float(np.max(floor)))
 
-    def answer(self, error: float, bound: float, reference: str, **more: Any) -> Answer:
-        """An answer with these counts; where a floor was told, the error may not exceed three times it."""
+    def answer(self, error: float, bound: float, reference: str, *, low: float | None = SOUND, **more: Any) -> Answer:
+        """An answer with these counts; where a floor was told, the error may not exceed three times it.
+
+        No step may have been accepted with J below `low` at a point; None: whatever J.
+        """
         limits = dict(more.pop("limits", {}))
+        if low is not None:
+            limits["J short of its least"] = (low - self.min_J, 0.0)
         if self.floor > 0.0:
             limits["error over the floor told"] = (error, 3.0 * self.floor)
         return Answer(
