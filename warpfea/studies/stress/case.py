@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -123,7 +123,7 @@ CASES: dict[str, Case] = {}
 
 def case(
     name: str, group: str, *, values: Sequence[Any] = (None,), quick: str = "none",
-    refusal: dict[str, Sequence[str]] | None = None, must: bool = False, dtypes: Sequence[str] = DTYPES,
+    refusal: Mapping[str, Sequence[str]] | None = None, must: bool = False, dtypes: Sequence[str] = DTYPES,
 ) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:  # fmt: skip
     """Add a function to `CASES`; see Case. The first line of its docstring says what is tried."""
 

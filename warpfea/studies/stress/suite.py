@@ -109,7 +109,13 @@ def attempt(row: Row, setting: Setting) -> dict[str, Any]:
     except Exception as error:
         line = traceback.format_exception_only(error)[-1].strip()
         outcome, passed, note = FAILED, False, line
-    out = {"case": row.label, "group": case.group, "precision": row.dtype, "outcome": outcome, "passed": passed}
+    out: dict[str, Any] = {
+        "case": row.label,
+        "group": case.group,
+        "precision": row.dtype,
+        "outcome": outcome,
+        "passed": passed,
+    }
     if answer is not None:
         out |= {
             "error": answer.error, "bound": answer.bound, "reference": answer.reference, "newton": answer.newton,

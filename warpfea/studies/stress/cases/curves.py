@@ -34,6 +34,8 @@ def curves(setting: Setting, turns: int) -> Answer:
     slope = np.column_stack([-RADIUS * turn * np.sin(turn * s), RADIUS * turn * np.cos(turn * s),
                              np.full(len(s), PITCH * turns)])  # fmt: skip
     exact = np.stack([slope[:-1], slope[1:]], axis=1) / elements  # dX/dxi of each element at both ends, m
+    assert beam.node_axes is not None
+    assert beam.frames is not None
     made = np.einsum("enck,enk->enc", beam.node_axes[beam.mesh.cells], beam.frames[:, :, :, 0])
     length = np.linalg.norm(exact, axis=2)
     across = np.linalg.norm(np.cross(made, exact), axis=2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 import warpfea as wf
@@ -128,6 +130,7 @@ def work(setting: Setting) -> Answer:
     mesh = wf.mesh.box((1.0, 1.0, 1e-3), cells=(12, 12, 1), element="T4")
     body = b.add_solid(mesh, material=wf.SVK(E=2e11, nu=0.3, density=7800.0), name="slivers")
     b.clamp(body.nodes("x-"))
-    solver = wf.NewtonPCG(preconditioner="block-jacobi", max_pcg=20000, max_work=100)
+    little: dict[str, Any] = {"max_work": 100}
+    solver = wf.NewtonPCG(preconditioner="block-jacobi", max_pcg=20000, **little)
     found = solve(b, setting, load_steps=1, solver=solver)
     return found.count.answer(0.0, 0.0, "100 products are too few", note=f"{found.count.pcg} PCG iterations")
