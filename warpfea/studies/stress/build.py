@@ -82,6 +82,8 @@ class Count(Output):
     violation: float = 0.0
     min_J: float = np.inf
     floor: float = 0.0
+    last_floor: float = 0.0
+    sum_of_floors: float = 0.0
     steps: int = 0
     seen: Any = field(default=None, repr=False)
 
@@ -95,18 +97,26 @@ class Count(Output):
         self.violation = max(self.violation, float(report.violation.max()) / size)
         self.min_J = min(self.min_J, float(report.min_J.min()))
         floor = getattr(report, "floor", None)
-        self.floor = max(self.floor, 0.0 if floor is None else float(np.max(floor)))
+        self.last_floor = 0.0 if floor is None else float(np.max(floor))
+        self.floor = max(self.floor, self.last_floor)
+        self.sum_of_floors += self.last_floor
 
-    def answer(self, error: float, bound: float, reference: str, *, low: float | None = SOUND, **more: Any) -> Answer:
-        """An answer with these counts; where a floor was told, the error may not exceed three times it.
+    def answer(
+        self, error: float, bound: float, reference: str, *, low: float | None = SOUND, told: float = 0.0, **more: Any
+    ) -> Answer:
+        """An answer with these counts.
 
-        No step may have been accepted with J below `low` at a point; None: whatever J.
+        Args:
+            low: no step may have been accepted with J below it at a point; None: whatever J.
+            told: estimate of the relative error that the reports gave, which the error may exceed threefold; 0: none.
+                Only where the reference is of the same mesh: `last_floor` of a static solution, `sum_of_floors` of a
+                motion.
         """
         limits = dict(more.pop("limits", {}))
         if low is not None:
             limits["J short of its least"] = (low - self.min_J, 0.0)
-        if self.floor > 0.0:
-            limits["error over the floor told"] = (error, 3.0 * self.floor)
+        if told > 0.0:
+            limits["error over the floor told"] = (error, 3.0 * told)
         return Answer(
             float(error), bound, reference, newton=self.newton, pcg=self.pcg, halvings=self.halvings, limits=limits,
             violation=self.violation or None, min_J=float(self.min_J), floor=self.floor, **more,

@@ -18,6 +18,7 @@ BOUNDS = {"float64": 3e-4, "float32": 6e-3}
 SOLIDS = ("T10-50", "T10-500", "H3843-50", "H3843-500", "T10-incompressible-50")
 STRUCTURES = ("3243-500", "3443-5000")
 LOAD_STEPS = 3
+SAME = "the same in float64, tol 1e-10"
 
 
 def thin(value: str) -> wf.ModelBuilder:
@@ -60,8 +61,8 @@ def thin_static(setting: Setting, value: str) -> Answer:
     if "incompressible" not in value:
         theory = {"off Euler and Bernoulli": (abs(found.tip[2] / -SAG - 1.0), 0.05)}
     bound = BOUNDS[setting.dtype]
-    told = "the same in float64, tol 1e-10"
-    return found.count.answer(off(found.tip, reference), bound, told, limits=theory)
+    error = off(found.tip, reference)
+    return found.count.answer(error, bound, SAME, told=found.count.last_floor, limits=theory)
 
 
 def falling(value: str, device: str, dtype: str, tol: float | None) -> tuple[np.ndarray, Count]:
@@ -86,4 +87,4 @@ def thin_dynamic(setting: Setting, value: str) -> Answer:
     """A clamped steel bar is let go under its weight, 0.3 s."""
     way, count = falling(value, setting.device, setting.dtype, None)
     error = off(way, refined_way(value, setting.device))
-    return count.answer(error, BOUNDS[setting.dtype], "the same in float64, tol 1e-10")
+    return count.answer(error, BOUNDS[setting.dtype], SAME, told=count.sum_of_floors)
