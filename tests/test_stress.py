@@ -215,6 +215,12 @@ def test_json_on_stdout_is_all_that_is_there(cases, capfd):
     assert len(json.loads(out)["rows"]) == 2
 
 
+def test_debug_raises_what_is_none_of_warpfeas(cases):
+    case("toy", "toys")(breaks)
+    with pytest.raises(ValueError, match="a defect"):
+        main(["stress", "--device", "cpu", "--debug"])
+
+
 def test_wrong_words_exit_2(cases, capfd, tmp_path):
     case("elastica", "statics", values=(10, 100))(right)
     code, _, err = stress(capfd, "--case", "elastika")

@@ -94,8 +94,11 @@ def list_cases(cases: Mapping[str, Case]) -> str:
     return table([["case", "quick", "what is tried [values]"], *out])
 
 
-def attempt(row: Row, setting: Setting) -> dict[str, Any]:
-    """Run a row and judge it: a dict that JSON can hold, `passed` True, False, or None where it was skipped."""
+def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
+    """Run a row and judge it: a dict that JSON can hold, `passed` True, False, or None where it was skipped.
+
+    With `debug` an error that is none of warpfea's is raised.
+    """
     case = row.case
     began = clock.perf_counter()
     answer: Answer | None = None
@@ -107,6 +110,8 @@ def attempt(row: Row, setting: Setting) -> dict[str, Any]:
     except Error as error:
         outcome, passed, note = _judge_error(case, error, setting.dtype)
     except Exception as error:
+        if debug:
+            raise
         line = traceback.format_exception_only(error)[-1].strip()
         outcome, passed, note = FAILED, False, line
     out: dict[str, Any] = {
@@ -164,7 +169,7 @@ def run_rows(
         if found is None:
             if live:
                 print(f"\r\x1b[K{k + 1}/{len(rows)} {row.label} {row.dtype} ...", end="", file=sys.stderr, flush=True)
-            found = attempt(row, Setting(device, row.dtype, meshes))
+            found = attempt(row, Setting(device, row.dtype, meshes), options.debug)
             content["rows"].append(found)
             if options.json and options.json != STDOUT:
                 write_json(options.json, content)
