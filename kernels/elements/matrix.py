@@ -115,7 +115,9 @@ def matrix_kernels(
                 Fdot = fn.velocity_gradient(block, V, point, elem)
                 rate = fn.strain_rate(block, local, Fdot, history, T(dq_dv), world, point, elem)
                 S += t.isotropic(rate, c[LAMBDA_V], c[ETA])
-        if mixed != 0 and form == 0:
+        if mixed == 2 and form == 0:
+            S += compression(S) * t.identity()
+        elif mixed == 1 and form == 0:
             ahead = fn.into_axes(block, fn.gradient_of(block, step, point, elem), point, elem)
             S += fn.foreseen(local, ahead, c, T(dq_dv))
         if wp.static(framed):
@@ -253,7 +255,7 @@ def matrix_kernels(
                 matrix[world, 3 * pair + axis, elem] = out[a]
 
     @wp.func
-    def elasticity(F: mat33, S: mat33, moduli: moduli9, c: coef, form: int, w: T) -> Tensor:
+    def elasticity(F: mat33, S: mat33, moduli: moduli9, c: coef, positive: bool, w: T) -> Tensor:
         """w dP_ik/dF_jl at [3 i + k, 3 j + l]: of S, of stresses linear in E (`moduli`), and of laws that need J > 0.
 
         With the shear moduli G and the other moduli D of `moduli`, the first two give S_kl delta_ij + D_kl F_ik F_jl +
@@ -294,7 +296,7 @@ def matrix_kernels(
                     dF = mat33()
                     dF[j, l] = w
                     dP = mat33()
-                    if form == 1:
+                    if positive:
                         dP = stand_in(F, dF, c)
                     else:
                         dP = m.increment(F - t.identity(), dF, c)
@@ -357,7 +359,7 @@ def matrix_kernels(
                     h[a] = block.gradient[point, a, elem]
                 for l in range(3):
                     H[3 * (a / P) + l, a % P] = h[a][l]
-            A = elasticity(F, S, moduli, c, form, fn.weight_of(block, point, elem))
+            A = elasticity(F, S, moduli, c, form == 1 or mixed[world] == 2, fn.weight_of(block, point, elem))
             for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
                 D = Products()
                 for i in range(9):

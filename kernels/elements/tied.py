@@ -374,7 +374,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             change = load(block, v, world, elem) - load(block, base, world, elem)
             e = foreseen(block, T(dq_dv[world]) * change, e, elem)
         stress = Ties()
-        if form != 1:
+        if form != 1 and mixed[world] != 2:
             stress = stresses(block, e, world, elem)
         if add == 0:
             for k in range(matrix.shape[2]):

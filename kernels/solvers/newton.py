@@ -216,11 +216,11 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             fail(ctl, world, FAIL_NAN)
         elif barred:
             fail(ctl, world, FAIL_LIMIT)
-        elif ctl.negative[world] != 0 and ctl.mixed[world] != 0:
+        elif ctl.negative[world] != 0 and ctl.mixed[world] == 1:
             if ctl.leaps[world] > 0:
                 ctl.restoring[world] = 1
             else:
-                ctl.mixed[world] = 0
+                ctl.mixed[world] = 2
                 ctl.tame[world] = 1
                 ctl.alpha[world] = f64(0.0)
         elif slope >= f64(0.0):
@@ -309,7 +309,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                     ctl.restoring[world] = 0
                     ctl.radius[world] = f64(SHRINK) * ctl.radius[world]
                     ctl.leaps[world] = 0
-                    ctl.mixed[world] = 0
+                    ctl.mixed[world] = 2
                     ctl.tame[world] = 1
             else:
                 ctl.iterations[world] = ctl.iterations[world] + 1

@@ -1,6 +1,7 @@
-"""The command line: `warpfea run | scenes | info | render | bench | study | profile`.
+"""The command line: `warpfea run | scenes | info | render | bench | study | stress | profile`.
 
-Exit codes: 0 done, 2 bad input or usage, 3 a step refused, 4 output failed, 130 interrupted (files valid), 1 a defect.
+Exit codes: 0 done, 2 bad input or usage, 3 a step refused or a case not met, 4 output failed, 130 interrupted (files
+valid), 1 a defect.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The options of the commands that measure: bench, study, profile."""
+"""The options of the commands that measure: bench, study, stress, profile."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
-from .arguments import Parser, add_general, call, count, counts, positive
+from .arguments import Once, Parser, add_general, call, count, counts, positive
 
-__all__ = ["add_bench", "add_profile", "add_study", "check_study"]
+__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "check_study"]
 
 PROFILE_EXAMPLES = """\
 examples:
@@ -34,6 +34,24 @@ how to read it:
   and too low for one that reads it several times; small problems stay in the caches, and come out above the rate of a
   copy. Where "of copy" is near 100 % for arrays much larger than the caches, memory is the limit; where it is low,
   arithmetic, scattered access or the launch itself is.
+"""
+
+STRESS_EXAMPLES = """\
+examples:
+  warpfea stress --quick                                the fast rows, in both precisions
+  warpfea stress --list                                 what there is
+  warpfea stress --case elastica --dtype float32        all rows of a case
+  warpfea stress --case elastica/1000                   one row
+  warpfea stress --json stress.json --resume            all of it; after Ctrl-C the same words go on
+
+outcomes:
+  done      the step or equilibrium was accepted, and is right: error within bound, iterations within theirs
+  refused   it was refused with an error that names why, where the case allows that
+  FAILED    an answer that is wrong, a refusal where an answer is due or for another reason, or another error
+  no mesh   it needs a file of --meshes; it counts neither way
+Seconds include the compilation of kernels that are not in Warp's cache.
+
+exit codes: 0 every row met its criterion, 3 one did not, 2 bad usage, 130 interrupted (the file is valid)
 """
 
 
@@ -156,6 +174,29 @@ def add_study(commands: Any) -> None:
             one.add_argument("--out", metavar=entry.out, help=what)
         add_general(one, "no bars, no table")
         one.set_defaults(command=call("study", "study"))
+
+
+def add_stress(commands: Any) -> None:
+    """`warpfea stress`."""
+    to = commands.add_parser(
+        "stress",
+        help="stiff and extreme cases, each against a criterion that can fail",
+        description="Run stiff and extreme cases: thin and stiff bodies in both precisions, elements about to turn "
+        "inside out, very long steps, large rotations, joints. Each answer is held to a closed form or to a reference.",
+        epilog=STRESS_EXAMPLES,
+    )
+    to.add_argument(
+        "--case", action="append", default=[], metavar="NAME", help="a case, a row NAME/VALUE or a group; repeatable"
+    )
+    to.add_argument("--list", action="store_true", help="the cases and what each tries; runs nothing")
+    to.add_argument("--quick", action="store_true", help="the fast rows only (minutes)")
+    to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
+    to.add_argument("--dtype", choices=("float64", "float32", "both"), default="both", help="precision (default both)")
+    to.add_argument("--meshes", metavar="FOLDER", help="meshes of the soft solids (mat.msh, ...); without: left out")
+    to.add_argument("--json", action=Once, metavar="FILE", help="rows with all numbers, kept after each; - for stdout")
+    to.add_argument("--resume", action="store_true", help="keep the rows that --json holds, of the same commit")
+    add_general(to, "no bars, no table: which rows failed, and the exit code")
+    to.set_defaults(command=call("stress", "stress"))
 
 
 def check_study(words: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
 from .arguments import Once, Parser, add_general, call, color_range, count, pair, positive, size, vector
-from .measuring import add_bench, add_profile, add_study, check_study
+from .measuring import add_bench, add_profile, add_stress, add_study, check_study
 
 __all__ = ["parse"]
 
@@ -56,7 +56,6 @@ A scene file is Python:
 
 
 LATER = {
-    "stress": "a suite of stiff and extreme cases",
     "sweep": "a sweep over parameters on many devices",
 }
 """Commands of a later version: not offered, but who tries one is told."""
@@ -80,6 +79,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     _add_render(commands)
     add_bench(commands)
     add_study(commands)
+    add_stress(commands)
     add_profile(commands, _add_model)
     if words and words[0] in LATER:
         raise UsageError(f"{words[0]}: {LATER[words[0]]} is not part of this version")
@@ -92,7 +92,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     arguments.words = list(words)
     if not hasattr(arguments, "command"):
         top.print_help()
-        names = "run, scenes, info, render, bench, study, profile"
+        names = "run, scenes, info, render, bench, study, stress, profile"
         raise UsageError(f"give a command: {names} ({top.prog} --help tells more)")
     return arguments
 

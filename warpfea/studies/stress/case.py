@@ -2,19 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["CASES", "Answer", "Case", "Setting", "case"]
+__all__ = ["CASES", "DTYPES", "Answer", "Case", "Setting", "Skipped", "case", "label"]
+
+
+DTYPES = ("float64", "float32")
+"""Precisions."""
+
+
+class Skipped(Exception):
+    """A row that can't be tried here; it counts neither way. The text, a few words, is its outcome."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a case runs on."""
+    """What a case runs on.
+
+    Attributes:
+        device: Warp device.
+        dtype: "float64" or "float32".
+        meshes: folder of mesh files that the package does not hold, or None.
+    """
 
     device: str
     dtype: str
+    meshes: pathlib.Path | None = None
+
+    def mesh(self, name: str) -> pathlib.Path:
+        """A file of the folder --meshes. Skipped where it is not there."""
+        if self.meshes is None or not (self.meshes / name).is_file():
+            raise Skipped("no mesh")
+        return self.meshes / name
 
     @property
     def single(self) -> bool:
@@ -72,6 +94,8 @@ class Case:
         refusal: {dtype: texts}: there the case may end with an error of warpfea whose text holds one of `texts` instead
             of an answer; with `must`, has to.
         must: an answer fails: the case is to be refused.
+        about: what is tried, a line.
+        dtypes: precisions that the case is for.
     """
 
     name: str
@@ -82,6 +106,15 @@ class Case:
     refusal: dict[str, tuple[str, ...]]
     must: bool
     about: str
+    dtypes: tuple[str, ...] = DTYPES
+
+
+def label(name: str, value: Any) -> str:
+    """What a row is called: NAME, or NAME/VALUE."""
+    if value is None:
+        return name
+    parts = value if isinstance(value, tuple) else (value,)
+    return f"{name}/{'-'.join(f'{x:g}' if isinstance(x, float) else str(x) for x in parts)}"
 
 
 CASES: dict[str, Case] = {}
@@ -90,14 +123,14 @@ CASES: dict[str, Case] = {}
 
 def case(
     name: str, group: str, *, values: Sequence[Any] = (None,), quick: str = "none",
-    refusal: dict[str, Sequence[str]] | None = None, must: bool = False,
+    refusal: Mapping[str, Sequence[str]] | None = None, must: bool = False, dtypes: Sequence[str] = DTYPES,
 ) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:  # fmt: skip
     """Add a function to `CASES`; see Case. The first line of its docstring says what is tried."""
 
     def add(run: Callable[..., Answer]) -> Callable[..., Answer]:
         texts = {dtype: tuple(t) for dtype, t in (refusal or {}).items()}
         about = (run.__doc__ or "").strip().splitlines()[0]
-        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must, about)
+        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must, about, tuple(dtypes))
         return run
 
     return add

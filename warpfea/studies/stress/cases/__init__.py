@@ -1,1 +1,1 @@
-"""The cases of the stress suite, by theme."""
+"""Cases of the stress suite, one module per theme; `suite.load_cases` imports them all."""

@@ -1,0 +1,16 @@
+"""`warpfea stress`: the suite of stiff and extreme cases."""
+
+from __future__ import annotations
+
+import argparse
+
+from . import DONE, NOT_CONVERGED
+
+__all__ = ["stress"]
+
+
+def stress(options: argparse.Namespace) -> int:
+    """Do `warpfea stress`: 3 where a row did not meet its criterion."""
+    from ..studies.stress import suite
+
+    return DONE if suite.stress(options) else NOT_CONVERGED

@@ -1,0 +1,137 @@
+"""Drives that jump, beams twisted past their critical torque."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import warpfea as wf
+
+from ..build import beam, off, solve, step
+from ..case import Answer, Setting, case
+
+NAMED = ["'crank'", "drive"]
+JUMP_STEP = 1e-3
+"""s."""
+WITHIN = {"ramp": (2.0, 3.0), "jump": (2.5, 2.500001)}
+"""When the drive turns, in steps: over a whole one, which halving resolves, or at once."""
+SIDE, ELEMENTS = 0.01, 32
+"""Of the twisted beam of 1 m, m."""
+LAW = wf.SVK(E=1e9, nu=0.3, density=1000.0)
+EI = LAW.E * SIDE**4 / 12.0
+GJ = LAW.lame[1] * wf.Rectangle(SIDE, SIDE).torsion_ratio * wf.Rectangle(SIDE, SIDE).polar
+GREENHILL = 8.98682
+"""Critical torque of a beam with both ends built in, times L / (E I): the first root of 2 (1 - cos m) = m sin m.
+
+The turned end is free along the axis: where it is held, twisting tightens the beam, by E I_p (theta / L)^2 / 2, so much
+that it never buckles.
+"""
+
+
+@case(
+    "drive-jump", "drives", quick="float64", refusal={"float64": NAMED, "float32": NAMED},
+    values=tuple((body, angle, how) for body in ("beam", "solid") for angle in (0.5, 4.0) for how in WITHIN),
+)  # fmt: skip
+def drive_jump(setting: Setting, value: tuple[str, float, str]) -> Answer:
+    """The drive of a joint turns by 0.5 or 4 rad in a step, evenly or at once: it arrives, or is refused by name."""
+    kind, angle, how = value
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    law = wf.SVK(E=2e7, nu=0.3, density=1100.0)
+    if kind == "beam":
+        line, section = [(0, 0, 0), (0.3, 0, 0)], wf.Rectangle(0.02, 0.02)
+        arm = b.add_beam(line, elements=4, section=section, normal=(0, 0, 1), material=law, name="arm")
+    else:
+        mesh = wf.mesh.box((0.3, 0.02, 0.02), cells=(6, 1, 1), origin=(0, -0.01, -0.01))
+        arm = b.add_solid(mesh, material=law, name="arm")
+    begin, end = (JUMP_STEP * at for at in WITHIN[how])
+    jump = ([0.0, begin, end, 1.0], [0.0, 0.0, angle, angle])
+    child = arm.start if kind == "beam" else arm.surface("x-")
+    joint = b.add_joint("revolute", parent=wf.GROUND, child=child, axis=(0, -1, 0), drive=jump, name="crank")
+    sim = wf.Simulation(b.finalize(device=setting.device, dtype=setting.dtype), dt=JUMP_STEP)
+    count = step(sim, 6)
+    error = abs(float(sim.joint_value(joint)[0]) / angle - 1.0)
+    told = "the angle of the drive"
+    return count.answer(error, 1e-3 if setting.single else 1e-6, told, note=f"min J {count.min_J:.3g}")
+
+
+def twisted(setting: Setting, part: float) -> Answer:
+    """A beam with both ends built in, one turned to `part` of the critical torque; any stable equilibrium is right.
+
+    Force balance and stability are judged by the same model in float64.
+    """
+    critical = GREENHILL * EI / GJ  # rad, with the torque G J theta / L
+    b, body = beam(ELEMENTS, SIDE, LAW)
+    turn = wf.Rotation(anchor=(1, 0, 0), axis=(1, 0, 0), angle=([0, 1], [0, part * critical]))
+    b.drive(body.end, rotation=turn, slots="section")
+    b.clamp(body.end, slots="position", components="yz")
+    found = solve(b, setting, load_steps=20)
+    displacement = found.result.state.displacement.numpy().astype(float)
+    model = b.finalize(device=setting.device)
+    state = model.state()
+    state.displacement.assign(displacement)
+    free = np.flatnonzero(model.free_slots.ravel())
+    force = model.internal_force(state)[0].ravel()
+    error = float(np.abs(force[free]).max() / np.abs(force).max())
+    K = model.tangent_matrix(state)[free][:, free].toarray().astype(float)
+    values = np.linalg.eigvalsh(0.5 * (K + K.T))
+    low = float(values[0] / values[-1])
+    energy, straight = float(model.strain_energy(state)[0]), 0.5 * GJ * (part * critical) ** 2
+    across = float(np.abs(found.result.displacements(body)[0, :, 1:]).max())  # m
+    flagged = bool(np.any(getattr(found.result.report, "unstable", False)))
+    limits = {"unstable and not told": (0.0 if flagged else -low, 1e-12)}
+    if part < 1.0:
+        limits["energy off Saint-Venant's"] = (abs(energy / straight - 1.0), 0.02)
+        limits["off the axis, m"] = (across, 1e-2 * SIDE if setting.single else 1e-6)
+    note = f"lowest eigenvalue {low:.2g} of the largest, {across:.2g} m off the axis, energy {energy / straight:.4f}"
+    return found.count.answer(error, 1e-3 if setting.single else 1e-6, "equilibrium, stable by the tangent matrix",
+                              limits=limits, note=note)  # fmt: skip
+
+
+@case("twist-below", "drives", values=(0.5, 0.9), quick="float64")
+def twist_below(setting: Setting, part: float) -> Answer:
+    """A slender beam twisted to a part of Greenhill's critical torque stays straight."""
+    return twisted(setting, part)
+
+
+@case(
+    "greenhill", "drives", values=(1.1, 1.5), quick="float64",
+    refusal={"float64": ["unstable"], "float32": ["unstable"]},
+)  # fmt: skip
+def greenhill(setting: Setting, part: float) -> Answer:
+    """The same past the critical torque: refused as unstable, told as such, or found on a stable branch."""
+    return twisted(setting, part)
+
+
+@case("steel-km", "limits", values=(2, 4), quick="float64", refusal={"float32": ["float32"]})
+def steel_km(setting: Setting, cells: int) -> Answer:
+    """A steel cube of 1 km under its weight, block Jacobi."""
+
+    def cube() -> wf.ModelBuilder:
+        b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+        law = wf.SVK(E=2e11, nu=0.3, density=7800.0)
+        body = b.add_solid(wf.mesh.box((1e3,) * 3, cells=(cells,) * 3), material=law, name="cube")
+        b.clamp(body.nodes("z-"))
+        b.add_probe("tip", body.surface("z+"))
+        return b
+
+    reference = solve(cube(), Setting(setting.device, "float64"), load_steps=1, tol=1e-10).tip
+    solver = wf.NewtonPCG(preconditioner="block-jacobi", max_halvings=2)
+    found = solve(cube(), setting, load_steps=1, solver=solver)
+    bound = 1e-2 if setting.single else 3e-4
+    return found.count.answer(off(found.tip, reference), bound, "float64, tol 1e-10", told=found.count.last_floor)
+
+
+@case(
+    "work", "limits", quick="float64", refusal={"float64": ["max_work"], "float32": ["max_work"]}, must=True,
+)  # fmt: skip
+def work(setting: Setting) -> Answer:
+    """A plate of slivers under its weight with little work allowed: refused when that is spent."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    mesh = wf.mesh.box((1.0, 1.0, 1e-3), cells=(12, 12, 1), element="T4")
+    body = b.add_solid(mesh, material=wf.SVK(E=2e11, nu=0.3, density=7800.0), name="slivers")
+    b.clamp(body.nodes("x-"))
+    little: dict[str, Any] = {"max_work": 100}
+    solver = wf.NewtonPCG(preconditioner="block-jacobi", max_pcg=20000, **little)
+    found = solve(b, setting, load_steps=1, solver=solver)
+    return found.count.answer(0.0, 0.0, "100 products are too few", note=f"{found.count.pcg} PCG iterations")

@@ -1,0 +1,111 @@
+"""Bars pressed, pulled and twisted until elements are about to turn inside out."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+
+import warpfea as wf
+
+from ..build import BUILT_IN, SOUND, bar, solve
+from ..case import Answer, Setting, Skipped, case
+
+SIZE = (1.0, 0.1, 0.1)
+CELLS = {"T4": (20, 2, 2), "T10": (20, 2, 2), "FN18": (20, 2, 2), "H3843": (20, 1, 1)}
+SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
+NEO_HOOKEAN = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
+INSIDE_OUT = {"float64": ["inside out"], "float32": ["inside out"]}
+MOVED = {"squeezed": -0.95, "stretched": 9.0}
+"""Travel of the far end along the bar, m."""
+TURNS = 4.0
+BALANCE = {"float64": 1e-6, "float32": 1e-3}
+"""Of the sum of the forces at both ends, over the larger."""
+LOWEST_J = 0.35
+"""Of the neo-Hookean bar pulled to tenfold, at integration points."""
+
+
+def forced(element: str, law: wf.SVK | wf.NeoHookean, how: str) -> tuple[wf.ModelBuilder, wf.Body]:
+    """A bar whose ends are held whole, one of them squeezed, stretched or twisted."""
+    b, body = bar(element, CELLS[element], SIZE, law)
+    slots = BUILT_IN[element]
+    if how == "twisted":
+        turn = wf.Rotation(anchor=(0, 0.05, 0.05), axis=(1, 0, 0), angle=([0, 1], [0, 2.0 * np.pi * TURNS]))
+        b.drive(body.nodes("x+"), rotation=turn, slots=slots)
+    else:
+        slots = slots.replace("all", "position")
+        b.drive(body.nodes("x+"), displacement=([0, 1], [(0, 0, 0), (MOVED[how], 0, 0)]), slots=slots)
+    return b, body
+
+
+def balance(setting: Setting, element: str, law: wf.SVK | wf.NeoHookean, how: str, low: float = SOUND) -> Answer:
+    """The answer of such a bar: the forces at its ends are opposite, and J >= `low` everywhere."""
+    b, body = forced(element, law, how)
+    found = solve(b, setting, load_steps=40)
+    ends = [found.result.reaction(body.nodes(side))[0] for side in ("x-", "x+")]
+    scale = max(float(np.abs(ends).max()), 1e-6 * law.lame[1] * SIZE[1] * SIZE[2])
+    error = float(np.abs(ends[0] + ends[1]).max()) / scale
+    count = found.count
+    told = "forces of both ends are opposite"
+    return count.answer(error, BALANCE[setting.dtype], told, low=low, note=f"min J {count.min_J:.3g}")
+
+
+@case("inverted-traction", "inside out", values=tuple(CELLS), quick="float64", refusal=INSIDE_OUT, must=True)
+def inverted_traction(setting: Setting, element: str) -> Answer:
+    """An SVK bar under a pressing traction ten times its modulus, which no admissible state carries."""
+    b, body = bar(element, CELLS[element], SIZE, SVK)
+    b.add_traction(body.surface("x+"), (-1e7, 0, 0))
+    found = solve(b, setting)
+    return found.count.answer(0.0, 0.0, "SVK softens: no state with J > 0", note=f"min J {found.count.min_J:.3g}")
+
+
+@case("inverted-report", "inside out")
+def inverted_report(setting: Setting) -> Answer:
+    """The same with inversion="report": the state is given, and the report says that it is inside out."""
+    if "inversion" not in inspect.signature(wf.solve_static).parameters:
+        raise Skipped("no option")
+    b, body = bar("T10", CELLS["T10"], SIZE, SVK)
+    b.add_traction(body.surface("x+"), (-1e7, 0, 0))
+    found = solve(b, setting, inversion="report")
+    end = found.result.reaction(body.nodes("x-"))[0]
+    load = 1e7 * SIZE[1] * SIZE[2]
+    limits = {"min J": (found.count.min_J, 0.0)}
+    error = float(np.abs(end - (load, 0.0, 0.0)).max()) / load
+    told = "the wall carries the load"
+    return found.count.answer(error, BALANCE[setting.dtype], told, low=None, limits=limits)
+
+
+@case("inverted-squeezed", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
+def inverted_squeezed(setting: Setting, element: str) -> Answer:
+    """An SVK bar squeezed to a twentieth: right with J > 0, or refused."""
+    return balance(setting, element, SVK, "squeezed")
+
+
+@case("inverted-stretched", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
+def inverted_stretched(setting: Setting, element: str) -> Answer:
+    """An SVK bar stretched to tenfold: right with J > 0, or refused."""
+    return balance(setting, element, SVK, "stretched")
+
+
+@case("inverted-twisted", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
+def inverted_twisted(setting: Setting, element: str) -> Answer:
+    """An SVK bar twisted by four turns: right with J > 0, or refused."""
+    return balance(setting, element, SVK, "twisted")
+
+
+@case("neo-squeezed", "inside out", values=tuple(CELLS))
+def neo_squeezed(setting: Setting, element: str) -> Answer:
+    """A neo-Hookean bar squeezed to a twentieth has to be found."""
+    return balance(setting, element, NEO_HOOKEAN, "squeezed")
+
+
+@case("neo-stretched", "inside out", values=tuple(CELLS))
+def neo_stretched(setting: Setting, element: str) -> Answer:
+    """A neo-Hookean bar stretched to tenfold has to be found, with J >= 0.35 at its points."""
+    return balance(setting, element, NEO_HOOKEAN, "stretched", LOWEST_J)
+
+
+@case("neo-twisted", "inside out", values=tuple(CELLS))
+def neo_twisted(setting: Setting, element: str) -> Answer:
+    """A neo-Hookean bar twisted by four turns has to be found."""
+    return balance(setting, element, NEO_HOOKEAN, "twisted")

@@ -1,0 +1,90 @@
+"""Thin bodies: statics and motion in both precisions, where rounding is felt first."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+import warpfea as wf
+
+from ..build import BUILT_IN, DOWN, REFINED, STEEL, Count, bar, beam, off, solve
+from ..case import Answer, Setting, case
+
+SAG = 0.05
+"""Deflection of the tip by Euler and Bernoulli's theory, of the length of 1 m."""
+BOUNDS = {"float64": 3e-4, "float32": 6e-3}
+"""Of the difference from a refined solution in float64: three times the floors that steps are accepted with."""
+SOLIDS = ("T10-50", "T10-500", "H3843-50", "H3843-500", "T10-incompressible-50")
+STRUCTURES = ("3243-500", "3443-5000")
+LOAD_STEPS = 3
+SAME = "the same in float64, tol 1e-10"
+
+
+def thin(value: str) -> wf.ModelBuilder:
+    """A bar, beam or strip of 1 m and L/t as in `value`, with the tip load that Euler's theory bends it by SAG with."""
+    element, slenderness = value.split("-")[0], float(value.split("-")[-1])
+    t = 1.0 / slenderness
+    E, nu = 2e11, 0.4999 if "incompressible" in value else 0.0 if element == "3443" else 0.3
+    law = wf.SVK(E=E, nu=nu, density=7800.0)
+    width = 0.25 if element == "3443" else t
+    force = 3.0 * E * width * t**3 / 12.0 * SAG  # N
+    if element == "3443":
+        b = wf.ModelBuilder(gravity=(0, 0, 0))
+        body = b.add_shell(wf.mesh.grid((1.0, width), cells=(16, 4)), thickness=t, material=law, name="strip")
+        b.clamp(body.edge("x-"), slots=BUILT_IN["3443"])
+        b.add_probe("tip", body.surface("x+"))
+    elif element == "3243":
+        b, body = beam(16, t, law)
+        b.add_point_load(body.end, (0, 0, -force))
+        return b
+    else:
+        b, body = bar(element, (20, 1, 1), (1.0, t, t), law)
+    b.add_traction(body.surface("x+"), (0, 0, -force / (width * t)))
+    return b
+
+
+@functools.cache
+def refined(value: str, device: str) -> np.ndarray:
+    """Displacement of the tip by a refined solution in float64 (3,), m."""
+    return solve(thin(value), Setting(device, "float64"), load_steps=LOAD_STEPS, tol=REFINED).tip
+
+
+@case(
+    "thin-static", "thin", values=(*SOLIDS, *STRUCTURES), quick="both", refusal={"float32": ["float32"]},
+)  # fmt: skip
+def thin_static(setting: Setting, value: str) -> Answer:
+    """Statics of bodies of slenderness 50 to 5000 bent by 5 % of their length."""
+    found = solve(thin(value), setting, load_steps=LOAD_STEPS)
+    reference = refined(value, setting.device)
+    theory = {}
+    if "incompressible" not in value:
+        theory = {"off Euler and Bernoulli": (abs(found.tip[2] / -SAG - 1.0), 0.05)}
+    bound = BOUNDS[setting.dtype]
+    error = off(found.tip, reference)
+    return found.count.answer(error, bound, SAME, told=found.count.last_floor, limits=theory)
+
+
+def falling(value: str, device: str, dtype: str, tol: float | None) -> tuple[np.ndarray, Count]:
+    """Way of the tip of a bar that is let go under its weight, for 60 steps of 5 ms (60, 3), m."""
+    t = 1.0 / float(value.split("-")[1])
+    b, _ = bar("T10", (20, 1, 1), (1.0, t, t), STEEL, DOWN)
+    sim = wf.Simulation(b.finalize(device=device, dtype=dtype), dt=5e-3, solver=wf.NewtonPCG(tol=tol, max_pcg=20000))
+    count = Count()
+    for _ in range(60):
+        count.add(sim.step(), sim.model.size)
+    return sim.probe("tip").displacement[0], count
+
+
+@functools.cache
+def refined_way(value: str, device: str) -> np.ndarray:
+    """The same by a refined solution in float64."""
+    return falling(value, device, "float64", REFINED)[0]
+
+
+@case("thin-dynamic", "thin", values=("T10-50", "T10-500"), quick="both", refusal={"float32": ["float32"]})
+def thin_dynamic(setting: Setting, value: str) -> Answer:
+    """A clamped steel bar is let go under its weight, 0.3 s."""
+    way, count = falling(value, setting.device, setting.dtype, None)
+    error = off(way, refined_way(value, setting.device))
+    return count.answer(error, BOUNDS[setting.dtype], SAME, told=count.sum_of_floors)

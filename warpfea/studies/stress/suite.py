@@ -1,0 +1,268 @@
+"""`warpfea stress`: chooses rows, runs them, judges what comes of each, prints and writes them."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import math
+import pathlib
+import pkgutil
+import sys
+import time as clock
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from ...base.console import number, plain, quiet_warp, table, write_json
+from ...base.errors import Error, UsageError
+from ...base.names import did_you_mean
+from ...base.provenance import origin
+from ...base.writer import check_target
+from .case import CASES, DTYPES, Answer, Case, Setting, Skipped, label
+
+__all__ = ["Row", "attempt", "choose", "list_cases", "load_cases", "run_rows", "stress"]
+
+SCHEMA = 1
+DONE, REFUSED, FAILED = "done", "refused", "FAILED"
+STDOUT = "-"
+NOTE = 120
+"""Characters of a note in the table; the file has it whole."""
+HEAD = (
+    "case", "precision", "outcome", "error", "bound", "Newton", "PCG", "largest step", "drift", "violation", "s",
+    "note",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case with one of its values, in one precision."""
+
+    case: Case
+    value: Any
+    dtype: str
+
+    @property
+    def label(self) -> str:
+        """NAME or NAME/VALUE."""
+        return label(self.case.name, self.value)
+
+
+def load_cases() -> dict[str, Case]:
+    """All cases by name, after every module of `cases` was imported."""
+    from . import cases
+
+    for module in sorted(found.name for found in pkgutil.iter_modules(cases.__path__)):
+        importlib.import_module(f"{cases.__name__}.{module}")
+    return CASES
+
+
+def choose(cases: Mapping[str, Case], names: Sequence[str], quick: bool, dtypes: Sequence[str]) -> list[Row]:
+    """The rows that `names` (cases, rows or groups; none: all) mean. UsageError for a name that is not there."""
+    known = dict.fromkeys(
+        [*cases, *(c.group for c in cases.values()), *(label(c.name, v) for c in cases.values() for v in c.values)]
+    )
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known) or f"; there are {', '.join(cases) or 'none'}"
+            raise UsageError(f"--case {name}: there is no such case{hint}")
+    rows = []
+    for case in cases.values():
+        for value in case.values:
+            called = {case.name, case.group, label(case.name, value)}
+            for dtype in dtypes:
+                wanted = dtype in case.dtypes and (not quick or case.quick in ("both", dtype))
+                if wanted and (not names or called.intersection(names)):
+                    rows.append(Row(case, value, dtype))
+    if not rows:
+        raise UsageError("no row is left: none of these cases is for this precision or in the quick suite")
+    return rows
+
+
+def list_cases(cases: Mapping[str, Case]) -> str:
+    """The cases by group, with their values and what is tried."""
+    out: list[list[str]] = []
+    for group in dict.fromkeys(case.group for case in cases.values()):
+        out.append([group])
+        for case in cases.values():
+            if case.group == group:
+                values = ", ".join(label("", value)[1:] for value in case.values if value is not None)
+                out.append([f"  {case.name}", case.quick, f"{case.about}{f' [{values}]' if values else ''}"])
+    return table([["case", "quick", "what is tried [values]"], *out])
+
+
+def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
+    """Run a row and judge it: a dict that JSON can hold, `passed` True, False, or None where it was skipped.
+
+    With `debug` an error that is none of warpfea's is raised.
+    """
+    case = row.case
+    began = clock.perf_counter()
+    answer: Answer | None = None
+    try:
+        answer = case.run(setting) if row.value is None else case.run(setting, row.value)
+        outcome, passed, note = _judge(case, answer)
+    except Skipped as reason:
+        outcome, passed, note = str(reason), None, ""
+    except Error as error:
+        outcome, passed, note = _judge_error(case, error, setting.dtype)
+    except Exception as error:
+        if debug:
+            raise
+        line = traceback.format_exception_only(error)[-1].strip()
+        outcome, passed, note = FAILED, False, line
+    out: dict[str, Any] = {
+        "case": row.label,
+        "group": case.group,
+        "precision": row.dtype,
+        "outcome": outcome,
+        "passed": passed,
+    }
+    if answer is not None:
+        out |= {
+            "error": answer.error, "bound": answer.bound, "reference": answer.reference, "newton": answer.newton,
+            "pcg": answer.pcg, "halvings": answer.halvings,
+            "limits": {name: {"value": v, "bound": b} for name, (v, b) in answer.limits.items()},
+            "largest_step": answer.largest_step, "drift": answer.drift, "violation": answer.violation,
+            "min_J": answer.min_J, "floor": answer.floor,
+        }  # fmt: skip
+    out |= {"wall_s": clock.perf_counter() - began, "note": note}
+    return dict(plain(out))
+
+
+def _judge(case: Case, answer: Answer) -> tuple[str, bool, str]:
+    """Outcome, whether it passes, and a note."""
+    if case.must:
+        return FAILED, False, f"accepted what is to be refused; {answer.note}".rstrip("; ")
+    if answer.passed:
+        return DONE, True, answer.note
+    over = [f"{name} {number(value)} > {number(bound)}" for name, (value, bound) in answer.limits.items()
+            if not value <= bound]  # fmt: skip
+    if not answer.error <= answer.bound:
+        over.insert(0, f"accepted wrong: error {number(answer.error)} > {number(answer.bound)}")
+    return FAILED, False, "; ".join([*over, answer.note]).rstrip("; ")
+
+
+def _judge_error(case: Case, error: Error, dtype: str) -> tuple[str, bool, str]:
+    """The same of a named error: it passes where it says what the case is to be refused for."""
+    text = " ".join(str(error).split())
+    expected = case.refusal.get(dtype, ())
+    if any(part in text for part in expected):
+        return REFUSED, True, text
+    told = f", which does not say {' or '.join(map(repr, expected))}" if expected else ""
+    return FAILED, False, f"refused{told}: {type(error).__name__}: {text}"
+
+
+def run_rows(
+    rows: Sequence[Row], device: str, meshes: pathlib.Path | None, content: dict[str, Any], options: argparse.Namespace
+) -> None:
+    """Run rows that `content["rows"]` does not hold yet; print each, and write the file after each."""
+    have = {(row["case"], row["precision"]): row for row in content["rows"]}
+    width = max(len(row.label) for row in rows)
+    live = sys.stderr.isatty() and not (options.quiet or options.no_progress)
+    _show(options, dict(zip(HEAD, HEAD)), width)
+    for k, row in enumerate(rows):
+        found = have.get((row.label, row.dtype))
+        if found is None:
+            if live:
+                print(f"\r\x1b[K{k + 1}/{len(rows)} {row.label} {row.dtype} ...", end="", file=sys.stderr, flush=True)
+            found = attempt(row, Setting(device, row.dtype, meshes), options.debug)
+            content["rows"].append(found)
+            if options.json and options.json != STDOUT:
+                write_json(options.json, content)
+        if live:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        _show(options, _cells(found), width)
+
+
+def _cells(row: Mapping[str, Any]) -> dict[str, str]:
+    """A row as text, by the heads of the table."""
+
+    def text(name: str) -> str:
+        value = row.get(name)
+        if value is None:
+            return "nan" if name == "error" and "bound" in row else "-"
+        return str(value) if isinstance(value, int) else number(value, 3)
+
+    return {
+        "case": row["case"], "precision": row["precision"], "outcome": row["outcome"], "error": text("error"),
+        "bound": text("bound"), "Newton": text("newton"), "PCG": text("pcg"), "largest step": text("largest_step"),
+        "drift": text("drift"), "violation": text("violation"), "s": f"{row['wall_s']:.1f}", "note": row["note"],
+    }  # fmt: skip
+
+
+def _show(options: argparse.Namespace, cells: Mapping[str, str], width: int) -> None:
+    """A line of the table on stdout."""
+    if not options.quiet and options.json != STDOUT:
+        first = [cells["case"].ljust(width), cells["precision"].ljust(9), cells["outcome"].ljust(8)]
+        middle = [cells[name].rjust(max(len(name), 8)) for name in HEAD[3:-1]]
+        note = cells["note"] if len(cells["note"]) <= NOTE else f"{cells['note'][: NOTE - 3]}..."
+        print("  ".join([*first, *middle, note]).rstrip(), flush=True)
+
+
+def _started(options: argparse.Namespace, settings: Mapping[str, Any], device: str) -> dict[str, Any]:
+    """What --json is to hold before the first row: the rows of the file to go on from, or none. UsageError."""
+    content = {"schema": SCHEMA, **origin(options.words, device), "settings": dict(settings), "rows": []}
+    path = pathlib.Path(options.json) if options.json and options.json != STDOUT else None
+    if not options.resume:
+        return content
+    if path is None:
+        raise UsageError("--resume goes on from the file of --json: name it")
+    if not path.exists():
+        return content
+    try:
+        before = json.loads(path.read_text())
+        same = (before["schema"], before["commit"], before["machine"]["device"]) == (
+            SCHEMA, content["commit"], content["machine"]["device"],
+        )  # fmt: skip
+        rows = [row for row in before["rows"] if row["case"] and row["precision"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UsageError(f"--resume: {path} is no file of warpfea stress") from None
+    if not same:
+        raise UsageError(f"--resume: {path} was made by another commit or on another device; begin anew without it")
+    return content | {"rows": rows}
+
+
+def stress(options: argparse.Namespace) -> bool:
+    """Do `warpfea stress`; whether every row met its criterion. UsageError, OutputError."""
+    cases = load_cases()
+    if options.list:
+        print(list_cases(cases))
+        return True
+    dtypes = DTYPES if options.dtype == "both" else (options.dtype,)
+    rows = choose(cases, options.case, options.quick, dtypes)
+    meshes = pathlib.Path(options.meshes) if options.meshes else None
+    if meshes is not None and not meshes.is_dir():
+        raise UsageError(f"--meshes {meshes}: no such folder")
+    if options.json and options.json != STDOUT:
+        check_target(options.json, (".json",))
+    with quiet_warp():
+        try:
+            device = str(wp.get_device(options.device) if options.device else wp.get_preferred_device())
+        except (ValueError, RuntimeError) as error:
+            raise UsageError(f"--device {options.device}: {error}") from None
+        settings = {"case": options.case, "quick": options.quick, "dtype": options.dtype, "meshes": meshes is not None}
+        content = _started(options, settings, device)
+        run_rows(rows, device, meshes, content, options)
+    if options.json == STDOUT:
+        write_json(STDOUT, content)
+    wanted = {(row.label, row.dtype) for row in rows}
+    results = [row for row in content["rows"] if (row["case"], row["precision"]) in wanted]
+    return _conclude(options, results)
+
+
+def _conclude(options: argparse.Namespace, results: Sequence[Mapping[str, Any]]) -> bool:
+    """Print how many rows met their criterion, and which did not."""
+    wrong = [f"{row['case']} {row['precision']}" for row in results if row["passed"] is False]
+    counted = sum(row["passed"] is not None for row in results)
+    seconds = math.fsum(row["wall_s"] for row in results)
+    if not options.quiet and options.json != STDOUT:
+        skipped = len(results) - counted
+        left_out = f", {skipped} left out" if skipped else ""
+        print(f"\n{counted - len(wrong)} of {counted} rows met their criterion{left_out}, {seconds:.0f} s")
+    if wrong:
+        print(f"not met: {', '.join(wrong)}", file=sys.stderr, flush=True)
+    return not wrong
