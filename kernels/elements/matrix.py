@@ -62,25 +62,6 @@ def matrix_kernels(
     Products = wp.types.matrix(shape=(27, P), dtype=T)
 
     @wp.func
-    def compression(S: mat33) -> T:
-        """An upper bound (Gershgorin) of the largest compressive principal value of S, Pa; 0 in tension."""
-        low = T(0.0)
-        for i in range(3):
-            low = wp.max(low, wp.abs(S[i, 0]) + wp.abs(S[i, 1]) + wp.abs(S[i, 2]) - wp.abs(S[i, i]) - S[i, i])
-        return low
-
-    @wp.func
-    def stand_in(F: mat33, dF: mat33, c: coef) -> mat33:
-        """A positive dP for laws whose tangent is indefinite far from rest: A C0 : sym(A^T dF).
-
-        C0 is the stiffness at rest, with c = (mu10, k, mu01), mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3; A is F
-        scaled to A : A = 3, so that the stiffness turns and stretches with the material.
-        """
-        A = wp.sqrt(T(3.0) / wp.ddot(F, F)) * F
-        mu = T(2.0) * (c[0] + c[2])
-        return A * t.isotropic(t.sym(wp.transpose(A) * dF), wp.max(c[1] - mu * T(2.0) / T(3.0), T(0.0)), mu)
-
-    @wp.func
     def point_state(
         block: Block,
         U: Local,
@@ -100,7 +81,7 @@ def matrix_kernels(
         `form` 0: S with its viscous part; 1: without it, and with compression removed. Of laws that need J > 0, S is
         the viscous part alone; their elastic tangent comes whole from `increment` or `stand_in`. `mixed`: S is that of
         the linear prediction (mixed integration points, Magisano, Leonetti and Garcea 2017), `step` the last change of
-        the slots, m; see `foreseen`.
+        the slots, m; see `foreseen`. `mixed` 2: without compression, as with `form` 1, but with the viscous part.
         """
         G = fn.gradient_of(block, U, point, elem)
         local = fn.into_axes(block, G, point, elem)
@@ -109,14 +90,14 @@ def matrix_kernels(
         if wp.static(not needs_J):
             S = m.stiffness(t.green(local), c)
             if form == 1:
-                S += compression(S) * t.identity()
+                S += fn.compression(S) * t.identity()
         if wp.static(damping == "incremental" or damping == "rate"):
             if form == 0:
                 Fdot = fn.velocity_gradient(block, V, point, elem)
                 rate = fn.strain_rate(block, local, Fdot, history, T(dq_dv), world, point, elem)
                 S += t.isotropic(rate, c[LAMBDA_V], c[ETA])
         if mixed == 2 and form == 0:
-            S += compression(S) * t.identity()
+            S += fn.compression(S) * t.identity()
         elif mixed == 1 and form == 0:
             ahead = fn.into_axes(block, fn.gradient_of(block, step, point, elem), point, elem)
             S += fn.foreseen(local, ahead, c, T(dq_dv))
@@ -144,7 +125,7 @@ def matrix_kernels(
     ) -> Local:
         """Change of an element's slots by the last iteration, m; zeros where it is not wanted."""
         step = Local()
-        if mixed != 0:
+        if mixed == 1:
             step = T(dq_dv) * (fn.load(block, v, world, elem) - fn.load(block, base, world, elem))
         return step
 
@@ -183,6 +164,7 @@ def matrix_kernels(
         block: Block,
         dq_dv: wp.array(dtype=wp.float64),
         lines: wp.array3d(dtype=vec3),
+        mixed: wp.array(dtype=wp.int32),
         form: int,
         add: int,
         active: wp.array(dtype=wp.int32),
@@ -232,8 +214,8 @@ def matrix_kernels(
             else:
                 if wp.static(damping == "incremental" or damping == "rate"):
                     dP += F * t.isotropic(B, cv[0], cv[1])
-                if form == 1:
-                    dP += stand_in(F, wp.outer(unit, h), c)
+                if form == 1 or mixed[world] == 2:
+                    dP += fn.stand_in(F, wp.outer(unit, h), c)
                 else:
                     dP += m.increment(F - t.identity(), wp.outer(unit, h), c)
             if wp.static(framed):
@@ -297,7 +279,7 @@ def matrix_kernels(
                     dF[j, l] = w
                     dP = mat33()
                     if positive:
-                        dP = stand_in(F, dF, c)
+                        dP = fn.stand_in(F, dF, c)
                     else:
                         dP = m.increment(F - t.identity(), dF, c)
                     for i in range(3):

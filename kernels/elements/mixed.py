@@ -16,7 +16,7 @@ def mixed_product(dtype: str, law: str, slots: int, points: int, affine: bool, f
     """The kernel for one kind of element block, without viscosity; arguments as those of `element_kernels`."""
     fn: _types.SimpleNamespace = point_functions(dtype, law, slots, affine, None, framed)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
-    Block = fn.Block
+    Block, t = fn.Block, fn.tensors
     form = "affine" if affine else "framed" if framed else "table"
     module = kernel_module(f"element_{dtype}_{law}_{slots}_{points}_{form}_mixed")
 
@@ -33,7 +33,7 @@ def mixed_product(dtype: str, law: str, slots: int, points: int, affine: bool, f
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p (N); `base`: v at the iterate before, for worlds that are `mixed`."""
+        """K p (N); `base`: v at the iterate before, for worlds that are `mixed`; 2: positive semi-definite instead."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -42,17 +42,23 @@ def mixed_product(dtype: str, law: str, slots: int, points: int, affine: bool, f
         U = fn.load(block, u, world, elem)
         P = fn.load(block, direction, world, elem)
         step = fn.Local()
-        if mixed[world] != 0:
+        if mixed[world] == 1:
             step = dq * (fn.load(block, v, world, elem) - fn.load(block, base, world, elem))
         f = fn.Local()
         for point in range(block.gradient.shape[0]):
             G = fn.gradient_of(block, U, point, elem)
             dG = fn.gradient_of(block, P, point, elem)
             dP = fn.point_increment(block, G, dG, mat33(), history, c, dq, world, point, elem)
-            if mixed[world] != 0:
+            local = fn.into_axes(block, G, point, elem)
+            if mixed[world] == 1:
                 ahead = fn.into_axes(block, fn.gradient_of(block, step, point, elem), point, elem)
-                S = fn.foreseen(fn.into_axes(block, G, point, elem), ahead, c, dq)
-                dP += dG * fn.out_of_axes(block, S, point, elem)
+                dP += dG * fn.out_of_axes(block, fn.foreseen(local, ahead, c, dq), point, elem)
+            elif mixed[world] == 2:
+                if wp.static(fn.needs_J):
+                    change = fn.into_axes(block, dG, point, elem)
+                    dP = fn.out_of_axes(block, fn.stand_in(t.identity() + local, change, c), point, elem)
+                else:
+                    dP += fn.compression(fn.law.stiffness(t.green(local), c)) * dG
             f = fn.scatter(block, f, dP, point, elem)
         fn.store(block, f, world, elem, contribution)
 

@@ -217,6 +217,25 @@ def point_functions(
         return change
 
     @wp.func
+    def compression(S: mat33) -> T:
+        """An upper bound (Gershgorin) of the largest compressive principal value of S, Pa; 0 in tension."""
+        low = T(0.0)
+        for i in range(3):
+            low = wp.max(low, wp.abs(S[i, 0]) + wp.abs(S[i, 1]) + wp.abs(S[i, 2]) - wp.abs(S[i, i]) - S[i, i])
+        return low
+
+    @wp.func
+    def stand_in(F: mat33, dF: mat33, c: coef) -> mat33:
+        """A positive dP for laws whose tangent is indefinite far from rest: A C0 : sym(A^T dF).
+
+        C0 is the stiffness at rest, with c = (mu10, k, mu01), mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3; A is F
+        scaled to A : A = 3, so that the stiffness turns and stretches with the material.
+        """
+        A = wp.sqrt(T(3.0) / wp.ddot(F, F)) * F
+        mu = T(2.0) * (c[0] + c[2])
+        return A * t.isotropic(t.sym(wp.transpose(A) * dF), wp.max(c[1] - mu * T(2.0) / T(3.0), T(0.0)), mu)
+
+    @wp.func
     def point_increment(
         block: Block,
         G: mat33,
@@ -270,6 +289,6 @@ def point_functions(
         weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
         into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,
         strain_rate=strain_rate, vertex_jacobian=vertex_jacobian, point_increment=point_increment,
-        foreseen=foreseen,
+        foreseen=foreseen, compression=compression, stand_in=stand_in,
         tangent_force=tangent_force,
     )  # fmt: skip

@@ -202,9 +202,11 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             return
         U = load(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
-        if mixed[world] != 0:
+        if mixed[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
             e = foreseen(block, T(dq_dv[world]) * change, e, elem)
+        if mixed[world] == 2:
+            e = Ties()
         P = load(block, direction, world, elem)
         store(block, tangent_force(block, P, x1, x2, e, world, elem), world, elem, contribution)
 
@@ -268,7 +270,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         a = block.X_first[tie, elem] + da
         d = block.X_second[tie, elem] + dd
         shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
-        if mixed[world] != 0:
+        if mixed[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
             factor = T(dq_dv[world]) * T(dq_dv[world])
             shear -= factor * wp.dot(line(block.first, change, tie, elem), line(block.second, change, tie, elem))
@@ -277,7 +279,12 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         lines[world, 2 * NT + tie, elem] = vec3(shear, T(0.0), T(0.0))
 
     @wp.kernel(module=matrix_module)
-    def prepare_stress(block: Block, active: wp.array(dtype=wp.int32), lines: wp.array3d(dtype=vec3)):
+    def prepare_stress(
+        block: Block,
+        mixed: wp.array(dtype=wp.int32),
+        active: wp.array(dtype=wp.int32),
+        lines: wp.array3d(dtype=vec3),
+    ):
         """s = mu A e of the ties, in the first components of the rows 3 NT + tie."""
         world, tie, elem = wp.tid()
         if active[world] == 0:
@@ -287,6 +294,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         for k in range(W):
             s += block.coupling[tie, k, elem] * lines[world, 2 * NT + first + k, elem][0]
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        if mixed[world] == 2:
+            mu = T(0.0)  # no geometric part
         lines[world, 3 * NT + tie, elem] = vec3(mu * s, T(0.0), T(0.0))
 
     @wp.kernel(module=matrix_module)
@@ -294,6 +303,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         block: Block,
         dq_dv: wp.array(dtype=wp.float64),
         lines: wp.array3d(dtype=vec3),
+        mixed: wp.array(dtype=wp.int32),
         form: int,
         add: int,
         active: wp.array(dtype=wp.int32),
@@ -370,7 +380,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                 second[row, a % P] = s
                 for i in range(3):
                     B[3 * row + i, a % P] = f * d2[i] + s * d1[i]
-        if mixed[world] != 0:
+        if mixed[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
             e = foreseen(block, T(dq_dv[world]) * change, e, elem)
         stress = Ties()

@@ -221,8 +221,8 @@ class Assembled:
                 points = (m.worlds, block.points, block.count)
                 launch(elements.prepare_matrix, points, [*state, lines])
                 if block.key.tying and not projected:
-                    launch(elements.prepare_stress, points, [block.data, active, lines])
-                args = [block.data, dq_dv, lines, int(projected), int(k > 0), active, matrix]
+                    launch(elements.prepare_stress, points, [block.data, w.newton.mixed, active, lines])
+                args = [block.data, dq_dv, lines, w.newton.mixed, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (m.worlds, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
             args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]

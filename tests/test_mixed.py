@@ -1,0 +1,104 @@
+"""Mixed integration points: H with the stress of the linear prediction, by matrix and by elements."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpfea as wf
+from warpfea.simulation.statics import begin_static
+
+LAWS = {
+    "svk": wf.SVK(E=1e6, nu=0.3, density=1000.0),
+    "neo_hookean": wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0),
+}
+
+
+def static(kind: str, operator: str, device: str = "cpu", dtype: str = "float64") -> wf.Simulation:
+    """A static loop of a short body, before its first load step."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    if kind == "beam":
+        section = wf.Rectangle(0.1, 0.1)
+        body = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=2, section=section, normal=(0, 0, 1), material=LAWS["svk"])
+        b.clamp(body.start)
+    else:
+        body = b.add_solid(wf.mesh.box((1, 0.3, 0.3), cells=(2, 1, 1), element="T10"), material=LAWS[kind])
+        b.clamp(body.nodes("x-"))
+    solver = wf.NewtonPCG(operator=operator)
+    return begin_static(b.finalize(device=device, dtype=dtype), load_steps=1, solver=solver)
+
+
+def placed(sim: wf.Simulation, mixed: int, amount: float = 0.02) -> np.ndarray:
+    """Put an iterate and the one before into the work arrays; returns a direction (1, slots, 3)."""
+    w, rng = sim.stepper.work, np.random.default_rng(3)
+    shape = w.u.numpy().shape
+    kind = w.u.numpy().dtype
+    free = sim.model.free_host
+    before = amount * rng.standard_normal(shape) * free
+    now = before + amount * rng.standard_normal(shape) * free
+    w.base.assign(before.astype(kind))
+    w.v.assign(now.astype(kind))
+    w.u.assign(now.astype(kind))
+    w.step.dq_dv.fill_(1.0)
+    w.step.mass_factor.zero_()
+    w.newton.mixed.fill_(mixed)
+    return rng.standard_normal(shape) * free
+
+
+def product(sim: wf.Simulation, direction: np.ndarray) -> np.ndarray:
+    """H p on the free components at the iterate in the work arrays."""
+    w, residual = sim.stepper.work, sim.stepper.newton.residual
+    on = wp.ones(1, dtype=wp.int32, device=sim.model.device)
+    w.p.assign(direction.astype(w.p.numpy().dtype))
+    residual.take(on)
+    residual.product(w.p, w.Hp, on)
+    return w.Hp.numpy().astype(float) * sim.model.free_host
+
+
+@pytest.mark.parametrize("mixed", [1, 2])
+@pytest.mark.parametrize("kind", ["svk", "neo_hookean", "beam"])
+def test_matrix_and_elements_agree(kind: str, mixed: int) -> None:
+    """Both operators are the same H, and another one than that of the iterate alone."""
+    results = {}
+    for operator in ("matrix", "elements"):
+        sim = static(kind, operator)
+        p = placed(sim, mixed)
+        results[operator] = product(sim, p)
+        sim.stepper.work.newton.mixed.zero_()
+        results[operator, "plain"] = product(sim, p)
+    size = np.abs(results["matrix"]).max()
+    np.testing.assert_allclose(results["elements"], results["matrix"], atol=1e-12 * size)
+    assert np.abs(results["matrix"] - results["matrix", "plain"]).max() > 1e-3 * size
+
+
+@pytest.mark.parametrize("kind", ["svk", "neo_hookean", "beam"])
+def test_stress_is_that_of_the_linear_prediction(kind: str) -> None:
+    """What it differs by from the stress of the iterate is of second order in the last step."""
+    sim = static(kind, "matrix")
+    p = placed(sim, 1, amount=1e-3)
+    w = sim.stepper.work
+    now, before = w.v.numpy(), w.base.numpy()
+    difference = []
+    for part in (1.0, 0.5):
+        w.base.assign(now - part * (now - before))
+        w.newton.mixed.fill_(1)
+        mixed = product(sim, p)
+        w.newton.mixed.zero_()
+        difference.append(np.sum(p * (mixed - product(sim, p))))
+    assert difference[0] / difference[1] == pytest.approx(4.0, rel=0.05)
+
+
+@pytest.mark.parametrize("kind", ["svk", "neo_hookean", "beam"])
+def test_positive_matrix_has_no_negative_curvature(kind: str) -> None:
+    """Where the linear prediction is indefinite, H is replaced by one that is positive semi-definite."""
+    sim = static(kind, "matrix")
+    placed(sim, 2, amount=0.1)
+    on = wp.ones(1, dtype=wp.int32)
+    residual = sim.stepper.newton.residual
+    residual.take(on)
+    dense = residual.assembled.matrix(residual.matrix).toarray()
+    low, high = np.linalg.eigvalsh(0.5 * (dense + dense.T))[[0, -1]]
+    assert low > -1e-9 * high
+    sim.stepper.work.newton.mixed.zero_()
+    residual.take(on)
+    dense = residual.assembled.matrix(residual.matrix).toarray()
+    assert np.linalg.eigvalsh(dense)[0] < -1e-6 * high
