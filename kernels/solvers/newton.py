@@ -257,7 +257,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if ctl.searching[world] != 0 and ctl.wish[world] == 1:
             ctl.wish[world] = 2
             most = ctl.dq_dv[world] * ctl.turn[world]
-            ctl.alpha[world] = wp.min(f64(1.0), ctl.radius[world] / wp.max(most, f64(1.0e-300)))
+            ctl.alpha[world] = wp.min(ctl.alpha[world], ctl.radius[world] / wp.max(most, f64(1.0e-300)))
 
     @wp.kernel(module=module)
     def judge_trial(ctl: Control):
@@ -291,7 +291,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.searches[world] = REUSED_SEARCH
         stands = alpha == f64(0.0) or ctl.restoring[world] != 0
         wishes = finite and not (good or stands or reused) and ctl.searches[world] == 0
-        wishes = wishes and ctl.wish[world] == 0 and ctl.negative[world] == 0 and ctl.tame[world] == 0
+        wishes = wishes and ctl.wish[world] == 0 and ctl.negative[world] == 0
+        wishes = wishes and (ctl.tame[world] == 0 or ctl.mixed[world] == 2)
         leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or leap:
             ctl.searching[world] = 0

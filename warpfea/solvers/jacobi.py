@@ -141,8 +141,9 @@ class JacobiLoop(NewtonLoop):
         options: Jacobi,
         *,
         constraint_tol: float,
+        inversion: str = "refuse",
     ) -> None:
-        super().__init__(at, options.newton, constraint_tol=constraint_tol)
+        super().__init__(at, options.newton, constraint_tol=constraint_tol, inversion=inversion)
         model, work = at.model, at.work
         self.methods = {"solver": "jacobi"}
         # multipliers are changed once, when the step is accepted: no outer loop, and convergence looks at violations
@@ -175,7 +176,7 @@ class JacobiLoop(NewtonLoop):
         """Modules that the loop launches, except those of the reductions and of the constraints."""
         return super().modules() | {self.own.module}
 
-    def _solve(self) -> None:
+    def _solve(self, first: bool = False) -> None:
         """Iterate from the residual at hand, and tell the rule of the preconditioner what that cost and gained."""
         w = self.work
         self.launch(self.own.begin, self.model.worlds, [w.newton, self.control])
