@@ -221,7 +221,7 @@ def slender(dtype, elements=256):
 
 def test_what_rounding_takes_is_given_back_and_no_more():
     """A steel wire in float32: the last pivots are rounding."""
-    sim = wf.Simulation(slender("float32"), dt=1e-3, ledger=False)
+    sim = wf.Simulation(slender("float32", elements=64), dt=1e-3, ledger=False)
     for _ in range(3):
         sim.step()
     assert 0.0 <= sim.stepper.newton.preconditioner.band.shift.numpy()[0] < 1e-4

@@ -127,7 +127,8 @@ def test_it_stops_early_within_the_tolerance(soft):
 def test_a_swinging_bar_gains_no_energy(soft):
     """Backward Euler only loses; four iterations may not add to that."""
     model, _ = soft
-    sim = wf.Simulation(model, dt=1e-2, solver=wf.Jacobi(iterations=4))
+    # what it leaves turns an element of so soft a bar inside out
+    sim = wf.Simulation(model, dt=1e-2, solver=wf.Jacobi(iterations=4), inversion="report")
     largest = 0.0
     for _ in range(100):
         sim.step()

@@ -150,7 +150,8 @@ def test_driven_rotation_goes_round(integrator):
     b, body = one(material=wf.SVK(E=1e5, nu=0.3, density=1000.0, damping=wf.KelvinVoigt(100.0)))
     anchor, axis = np.array([0, 0.25, 0.125]), np.array([1.0, 0, 0])
     b.drive(body.nodes("x-"), rotation=wf.Rotation(anchor=anchor, axis=2 * axis, angle=([0, 0.1], [0, 2.5 * np.pi])))
-    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3, integrator=integrator)
+    # whirled so fast, so soft a body turns inside out
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3, integrator=integrator, inversion="report")
     sim.step(50)
     nodes = body.nodes("x-").indices
     arm = body.mesh.points[nodes] - anchor

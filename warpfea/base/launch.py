@@ -48,11 +48,14 @@ class Launcher:
     Attributes:
         recorder: does the launches, if set; they are not counted then.
         label: the part that launches belong to. parts: those there are: `PARTS`, and what terms add.
+        rare_launches: those that only a hard step does; they are not among `launches`.
     """
 
     def __init__(self, device: Any) -> None:
         self.device = device
         self.launches = 0
+        self.rare_launches = 0
+        self.rarely = False
         self.kernels: set[str] = set()
         self.modules: set[str] = set()
         self.recorder: Recorder | None = None
@@ -90,6 +93,15 @@ class Launcher:
         finally:
             self.label = outer
 
+    @contextmanager
+    def rare(self) -> Iterator[None]:
+        """Launches within are for hard steps alone: a condition on the device leads to them."""
+        outer, self.rarely = self.rarely, True
+        try:
+            yield
+        finally:
+            self.rarely = outer
+
     def _do(
         self, launch: Callable[..., Any], kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int
     ) -> None:
@@ -102,7 +114,10 @@ class Launcher:
             do()
 
     def _count(self, kernel: wp.Kernel) -> None:
-        self.launches += 1
+        if self.rarely:
+            self.rare_launches += 1
+        else:
+            self.launches += 1
         self.kernels.add(kernel_name(kernel))
         self.modules.add(kernel.module.name)
 

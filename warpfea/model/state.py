@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ArraySpec", "State", "words_of"]
 
-MEMORY = ("preconditioner", "operator", "predictor", "potential")
+MEMORY = ("preconditioner", "operator", "predictor")
 """What names of arrays begin with that solvers remember; a state can do without."""
 
 

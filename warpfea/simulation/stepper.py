@@ -96,6 +96,7 @@ class Stepper:
         self.backup = state.like() if solver.max_halvings > 0 else None
         self._load_modules()
         self.start_terms()
+        self._measure_potential(None)
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -158,6 +159,22 @@ class Stepper:
         m = self.model
         flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
         self.newton.forget(wp.array(flags, dtype=wp.int32, device=m.device))
+        self._measure_potential(flags)
+
+    def _measure_potential(self, flags: np.ndarray | None) -> None:
+        """Strain energy of the state in the chosen worlds, by which first iterates are judged."""
+        m, w = self.model, self.work
+        flags = np.ones(m.worlds, dtype=np.int32) if flags is None else flags
+        active: wp.array = wp.array(flags, dtype=wp.int32, device=m.device)
+        w.u.assign(self.state.displacement)
+        residual = self.newton.residual
+        with self.launch.rare():
+            residual.elements.force(self.at, active)
+            residual.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
+        energy = w.newton.potential.numpy()
+        chosen = flags != 0
+        energy[chosen] = w.newton.elem_sums.numpy()[0][chosen]
+        w.newton.potential.assign(energy)
 
     def _record(self) -> wp.Graph:
         with wp.ScopedCapture(device=self.model.device) as capture:
@@ -264,7 +281,8 @@ class Stepper:
         for term in self.terms:
             term.begin(self.at, running)
         self.newton.run()
-        wp.capture_if(w.newton.any_turned, self._look_for_inversion)
+        with launch.rare():
+            wp.capture_if(w.newton.any_turned, self._look_for_inversion)
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
         self.commit()
 

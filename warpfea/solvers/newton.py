@@ -202,7 +202,6 @@ class NewtonLoop:
 
     def register(self, state: State) -> None:
         """Make what the solvers keep from step to step part of the state."""
-        self.work.newton.potential = state.register("potential", wp.float64)
         self.preconditioner.register(state)
         self.residual.register(state)
 
@@ -250,7 +249,7 @@ class NewtonLoop:
         choose = bool(self.candidates) and first
         self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
         if choose:
-            wp.capture_if(w.newton.any_choice, self._choose)
+            self._rarely(w.newton.any_choice, self._choose)
         self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
 
@@ -298,7 +297,7 @@ class NewtonLoop:
         launch(k.set_base, self.dim, [w.newton, w.v, w.base, w.best])
         launch(k.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
-        wp.capture_if(w.newton.any_strict, self._measure_floor)
+        self._rarely(w.newton.any_strict, self._measure_floor)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg, self.max_work])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
@@ -319,7 +318,7 @@ class NewtonLoop:
         launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.judge_trial, self.model.worlds, [w.newton])
-        wp.capture_if(w.newton.any_wish, self._plan_leap)
+        self._rarely(w.newton.any_wish, self._plan_leap)
         if self.terms.traits.stored:
             self._each("adopt", w.newton.stepped)
         self._any(w.newton.searching, self.searching)
@@ -330,6 +329,11 @@ class NewtonLoop:
         w = self.work
         self.residual.elements.measure_turn(self.at, w.direction, w.newton.searching)
         self.launch(self.kernels.plan_leap, self.model.worlds, [w.newton])
+
+    def _rarely(self, flag: wp.array, do: Callable[[], None]) -> None:
+        """Do what hard steps alone need, where the flag is set."""
+        with self.launch.rare():
+            wp.capture_if(flag, do)
 
     def _each(self, what: str, flags: wp.array) -> None:
         """Call a method of all terms."""

@@ -92,7 +92,7 @@ class Workspace:
         C = model.component_count
         sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
         self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
-        skip: tuple[str, ...] = ("violation", "negative", "potential")  # of others
+        skip: tuple[str, ...] = ("violation", "negative")  # of others
         skip += () if traits.gated else ("outer", "open")
         skip += () if traits.stored else ("term_sums", "stepped")
         skip += () if traits.limited else ("limit",)
