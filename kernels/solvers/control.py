@@ -94,11 +94,11 @@ def control_struct():
         fixed_forcing: wp.int32  # all solves go as far as the first, whatever Newton's method needs
         tol: wp.float64
         eps: wp.float64
+        any_hard: wp.array(dtype=wp.int32)  # a world needs what most steps do not: any of the flags below
         # where full steps are taken although Phi rises, see judging.py
         leaps: wp.array(dtype=wp.int32)  # such steps since the best iterate
         mixed: wp.array(dtype=wp.int32)  # H has the stress of the linear prediction
         wish: wp.array(dtype=wp.int32)  # 1: such a step is wanted, how long may it be? 2: the trial is one
-        any_wish: wp.array(dtype=wp.int32)
         turn: wp.array(dtype=wp.float64)  # largest gradient of the direction
         radius: wp.array(dtype=wp.float64)  # most that such a step may turn or stretch an element
         tame: wp.array(dtype=wp.int32)  # the next step must satisfy Armijo
@@ -107,7 +107,7 @@ def control_struct():
         best_phi: wp.array(dtype=wp.float64)
         best_norm: wp.array(dtype=wp.float64)
         # where rounding stops the residual
-        strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left
+        strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left; 2: it has been done
         strict_count: wp.array(dtype=wp.int32)
         eta: wp.array(dtype=wp.float64)  # that error, over the size of the solution; of the last such solve
         last_eta: wp.array(dtype=wp.float64)
@@ -115,13 +115,11 @@ def control_struct():
         floor_bound: wp.float64  # largest that is
         floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, component, lane]
         negative: wp.array(dtype=wp.int32)  # the last solve met a direction without positive curvature
-        any_strict: wp.array(dtype=wp.int32)
         # the first iterate
         potential: wp.array(dtype=wp.float64)  # strain energy of the state, J
         choose: wp.array(dtype=wp.int32)  # it is to be chosen among others
-        any_choice: wp.array(dtype=wp.int32)
-        turned: wp.array(dtype=wp.int32)  # the iterate turned an element inside out
-        any_turned: wp.array(dtype=wp.int32)
+        suspect: wp.array(dtype=wp.int32)  # the accepted iterate has J <= 0 somewhere
+        turned: wp.array(dtype=wp.int32)  # it turned an element inside out
         refuse_inversion: wp.int32
         rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
         max_iterations: wp.int32

@@ -138,14 +138,14 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         ctl.active[world] = 0
         ctl.searching[world] = 0
         if ctl.refuse_inversion != 0 and ctl.min_J[world] <= f64(0.0):
-            wp.atomic_max(ctl.any_turned, 0, 1)
+            ctl.suspect[world] = 1
+            wp.atomic_max(ctl.any_hard, 0, 1)
 
     @wp.func
     def ask(ctl: Control, world: int):
         """Let the next solve tell how large an error the residual stands for; see `judge_floor`."""
         ctl.strict[world] = 1
         ctl.mixed[world] = 0
-        wp.atomic_max(ctl.any_strict, 0, 1)
 
     @wp.func
     def give_up(ctl: Control, world: int, why: int):

@@ -107,7 +107,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if stage == 1:
             if hopeless(ctl, world):
                 ctl.choose[world] = 1
-                wp.atomic_max(ctl.any_choice, 0, 1)
+                wp.atomic_max(ctl.any_hard, 0, 1)
                 return
         start(ctl, world)
         if stage == 2 and ctl.fixed_forcing == 0:
@@ -118,8 +118,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         """Flag the worlds where the first iterate just evaluated is the best yet: J > 0 before Phi."""
         world = wp.tid()
         better[world] = 0
-        if first != 0 and world == 0:
-            ctl.any_choice[0] = 0
         if ctl.choose[world] == 0:
             return
         phi = objective(ctl, world)
@@ -140,6 +138,32 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if ctl.active[world] != 0:
             ctl.limit[world] = f64(1.0)
 
+    @wp.func
+    def open_search(ctl: Control, world: int):
+        """See whether the direction leads anywhere."""
+        ctl.searching[world] = 1
+        barred = False
+        if wp.static(limited):
+            barred = not ctl.limit[world] > f64(0.0)
+        if not wp.isfinite(ctl.slope[world]):
+            fail(ctl, world, FAIL_NAN)
+        elif barred:
+            fail(ctl, world, FAIL_LIMIT)
+        elif ctl.negative[world] != 0 and ctl.mixed[world] == 1:
+            if ctl.leaps[world] > 0:
+                ctl.restoring[world] = 1
+            else:
+                ctl.mixed[world] = 2
+                ctl.tame[world] = 1
+                ctl.alpha[world] = f64(0.0)
+        elif ctl.slope[world] >= f64(0.0):
+            if ctl.reused[world] != 0:
+                ctl.alpha[world] = f64(0.0)
+            elif ctl.leaps[world] > 0:
+                ctl.restoring[world] = 1
+            else:
+                fail(ctl, world, FAIL_CURVATURE)
+
     @wp.kernel(module=module)
     def judge_floor(ctl: Control):
         """The error that a residual stands for, over the size of the solution, of the worst component.
@@ -147,10 +171,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv).
         """
         world = wp.tid()
-        if world == 0:
-            ctl.any_strict[0] = 0
-        if ctl.strict[world] == 0:
+        if ctl.strict[world] != 2:
             return
+        ctl.strict[world] = 0
         dq = ctl.dq_dv[world]
         worst = f64(0.0)
         for c in range(ctl.components):
@@ -169,6 +192,17 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                         eta = dq * step / wp.max(size, f64(1.0e-300))
                 worst = wp.max(worst, eta)
         ctl.eta[world] = worst
+        if worst <= ctl.floor_bound:
+            ctl.floor[world] = wp.max(ctl.floor[world], worst)
+            accept(ctl, world)
+            return
+        tries = ctl.strict_count[world] + 1
+        ctl.strict_count[world] = tries
+        if worst < f64(1.0e30) and (tries >= TRIES or (tries > 1 and worst > f64(0.5) * ctl.last_eta[world])):
+            give_up(ctl, world, FAIL_FLOOR)
+            return
+        ctl.last_eta[world] = worst
+        open_search(ctl, world)
 
     @wp.kernel(module=module)
     def begin_search(ctl: Control, pcg: PCG, max_work: int):
@@ -177,8 +211,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if ctl.active[world] == 0:
             ctl.searching[world] = 0
             return
-        slope = ctl.slope_sum[0, world]
-        ctl.slope[world] = slope
+        ctl.slope[world] = ctl.slope_sum[0, world]
         ctl.alpha[world] = f64(1.0)
         if wp.static(limited):
             ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
@@ -193,43 +226,15 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if wp.static(gated):
             if ctl.classical == 0:
                 ctl.outer[world] = ctl.outer[world] + 1
-        barred = False
-        if wp.static(limited):
-            barred = not ctl.limit[world] > f64(0.0)
-        strict = ctl.strict[world]
-        ctl.strict[world] = 0
-        if strict != 0:
-            eta = ctl.eta[world]
-            if eta <= ctl.floor_bound:
-                ctl.floor[world] = wp.max(ctl.floor[world], eta)
-                accept(ctl, world)
-                return
-            tries = ctl.strict_count[world] + 1
-            ctl.strict_count[world] = tries
-            if eta < f64(1.0e30) and (tries >= TRIES or (tries > 1 and eta > f64(0.5) * ctl.last_eta[world])):
-                give_up(ctl, world, FAIL_FLOOR)
-                return
-            ctl.last_eta[world] = eta
-        if pcg.total[world] >= max_work:
+        if ctl.strict[world] != 0 and pcg.total[world] < max_work:
+            # the error that is left is judged before the direction is followed
+            ctl.strict[world] = 2
+            ctl.searching[world] = 0
+            wp.atomic_max(ctl.any_hard, 0, 1)
+        elif pcg.total[world] >= max_work:
             give_up(ctl, world, FAIL_WORK)
-        elif not wp.isfinite(slope):
-            fail(ctl, world, FAIL_NAN)
-        elif barred:
-            fail(ctl, world, FAIL_LIMIT)
-        elif ctl.negative[world] != 0 and ctl.mixed[world] == 1:
-            if ctl.leaps[world] > 0:
-                ctl.restoring[world] = 1
-            else:
-                ctl.mixed[world] = 2
-                ctl.tame[world] = 1
-                ctl.alpha[world] = f64(0.0)
-        elif slope >= f64(0.0):
-            if ctl.reused[world] != 0:
-                ctl.alpha[world] = f64(0.0)
-            elif ctl.leaps[world] > 0:
-                ctl.restoring[world] = 1
-            else:
-                fail(ctl, world, FAIL_CURVATURE)
+        else:
+            open_search(ctl, world)
 
     @wp.func
     def watch(ctl: Control, world: int, old_phi: f64, old_norm: f64):
@@ -252,10 +257,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     def plan_leap(ctl: Control):
         """Length of a step that may raise Phi: no element turns or stretches by more than the radius."""
         world = wp.tid()
-        if world == 0:
-            ctl.any_wish[0] = 0
-        if ctl.searching[world] != 0 and ctl.wish[world] == 1:
+        if ctl.active[world] != 0 and ctl.wish[world] == 1:
             ctl.wish[world] = 2
+            ctl.searching[world] = 1
             most = ctl.dq_dv[world] * ctl.turn[world]
             ctl.alpha[world] = wp.min(ctl.alpha[world], ctl.radius[world] / wp.max(most, f64(1.0e-300)))
 
@@ -331,7 +335,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 watch(ctl, world, old_phi, old_norm)
         elif wishes:
             ctl.wish[world] = 1
-            wp.atomic_max(ctl.any_wish, 0, 1)
+            ctl.searching[world] = 0
+            wp.atomic_max(ctl.any_hard, 0, 1)
         elif ctl.leaps[world] > 0:
             ctl.restoring[world] = 1
         else:

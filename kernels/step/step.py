@@ -74,6 +74,7 @@ def step_kernels(
         step.first_refusal[world] = 0
         newton.active[world] = step.running[world]
         newton.searching[world] = 0
+        newton.suspect[world] = 0
         newton.turned[world] = 0
         if step.running[world] == 0:
             return  # `refused` keeps the verdict of a world that failed earlier in this step
@@ -180,8 +181,6 @@ def step_kernels(
     def end_attempt(step: Step, newton: Newton):
         """Accept the substep, or refuse it and halve."""
         world = wp.tid()
-        if world == 0:
-            newton.any_turned[0] = 0
         if step.running[world] == 0:
             return
         if newton.turned[world] != 0 and newton.failed[world] == 0:

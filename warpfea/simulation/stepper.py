@@ -20,7 +20,6 @@ from ..kernels.step.step import step_kernels
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_loop
 from ..terms.checks import check_measured
-from ..terms.elements import Elements
 from ..terms.term import At, Term
 from ..terms.workspace import Workspace
 from .integrators import Integrator
@@ -281,8 +280,6 @@ class Stepper:
         for term in self.terms:
             term.begin(self.at, running)
         self.newton.run()
-        with launch.rare():
-            wp.capture_if(w.newton.any_turned, self._look_for_inversion)
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
         self.commit()
 
@@ -291,11 +288,6 @@ class Stepper:
         m, w, state = self.model, self.work, self.state
         args = [w.step, w.newton, kind, m.is_position, m.topology.free, state.displacement, state.velocity]
         self.launch(self.kernels.candidate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
-
-    @labelled("residual")
-    def _look_for_inversion(self) -> None:
-        """Flag the worlds that the attempt turned inside out."""
-        self.terms.find(Elements).look_for_inversion(self.at, self.work.step.running)
 
     @labelled("commit")
     def commit(self) -> None:

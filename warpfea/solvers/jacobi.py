@@ -182,6 +182,7 @@ class JacobiLoop(NewtonLoop):
         self.launch(self.own.begin, self.model.worlds, [w.newton, self.control])
         self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
+        self._rarely(self._look_for_inversion)
         self.launch(self.own.tell, self.model.worlds, [w.newton, self.control, w.pcg, w.step.running])
         self.preconditioner.judge(w.newton.active)
         w.newton.active.zero_()

@@ -248,8 +248,7 @@ class NewtonLoop:
         w = self.work
         choose = bool(self.candidates) and first
         self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
-        if choose:
-            self._rarely(w.newton.any_choice, self._choose)
+        self._rarely(self._choose if choose else self._look_for_inversion)
         self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
 
@@ -269,6 +268,7 @@ class NewtonLoop:
         self.preconditioner.renew(choose)
         self._open(choose)
         launch(k.begin, self.model.worlds, [w.newton, 2])
+        self._look_for_inversion()
 
     def _judge_outer(self) -> None:
         w = self.work
@@ -297,43 +297,50 @@ class NewtonLoop:
         launch(k.set_base, self.dim, [w.newton, w.v, w.base, w.best])
         launch(k.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
-        self._rarely(w.newton.any_strict, self._measure_floor)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg, self.max_work])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
+        self._rarely(self._search_on)
         self.preconditioner.follow(active)
         self._each("follow", active)
         self._any(active, self.iterating)
 
-    def _measure_floor(self) -> None:
-        """How large an error the residuals stand for, where that was asked."""
+    @labelled("control")
+    def _search_on(self) -> None:
+        """What hard steps need: how large an error a residual stands for, how far a step may go that Armijo's rule would
+        cut, the searches that follow, and whether an accepted iterate is inside out."""
         m, w, k = self.model, self.work, self.kernels
         args = [w.newton, m.component_slot_start, m.component_slot, m.component_element_start, m.component_element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
         self.launch(k.floor_partial, (m.worlds, m.component_count, LANES), args)
         self.launch(k.judge_floor, m.worlds, [w.newton])
+        self._any(w.newton.searching, self.searching)
+        wp.capture_while(self.searching, self._search)
+        self.residual.elements.measure_turn(self.at, w.direction, w.newton.active)
+        self.launch(k.plan_leap, m.worlds, [w.newton])
+        self._any(w.newton.searching, self.searching)
+        wp.capture_while(self.searching, self._search)
+        self._look_for_inversion()
+
+    def _look_for_inversion(self) -> None:
+        """Flag the worlds whose accepted iterate turned an element inside out."""
+        w = self.work
+        self.residual.elements.look_for_inversion(self.at, w.newton.suspect)
+        w.newton.any_hard.zero_()
 
     def _search(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
         launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.judge_trial, self.model.worlds, [w.newton])
-        self._rarely(w.newton.any_wish, self._plan_leap)
         if self.terms.traits.stored:
             self._each("adopt", w.newton.stepped)
         self._any(w.newton.searching, self.searching)
 
-    @labelled("control")
-    def _plan_leap(self) -> None:
-        """How far a step may go that Armijo's rule would cut."""
-        w = self.work
-        self.residual.elements.measure_turn(self.at, w.direction, w.newton.searching)
-        self.launch(self.kernels.plan_leap, self.model.worlds, [w.newton])
-
-    def _rarely(self, flag: wp.array, do: Callable[[], None]) -> None:
-        """Do what hard steps alone need, where the flag is set."""
+    def _rarely(self, do: Callable[[], None]) -> None:
+        """Do what hard steps alone need."""
         with self.launch.rare():
-            wp.capture_if(flag, do)
+            wp.capture_if(self.work.newton.any_hard, do)
 
     def _each(self, what: str, flags: wp.array) -> None:
         """Call a method of all terms."""

@@ -141,7 +141,7 @@ class Workspace:
             "elem_sums": (2, worlds),
             "slope_sum": (1, worlds),
             "tangent_sum": (1, worlds),
-            **dict.fromkeys(("any_active", "any_running", "any_strict", "any_choice", "any_turned", "any_wish"), (1,)),
+            **dict.fromkeys(("any_active", "any_running", "any_hard"), (1,)),
         } | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array) and name not in skip:
