@@ -1,4 +1,7 @@
-"""The committed table of `warpfea bench --scenes`: no scene launches, compiles or holds more than it did before.
+"""The committed table of `warpfea bench --scenes`: no scene records or compiles more than it did before.
+
+Before, steps were cut by Armijo's rule alone and began where the predictor said; some scenes take an iteration more or
+less since, all together fewer.
 
 After a change that is meant to alter them, make the table anew (it keeps what it is compared with):
 
@@ -17,7 +20,9 @@ from warpfea.studies.bench import scenes as bench
 
 PATH = pathlib.Path(__file__).resolve().parent / "results" / "scenes_cpu.json"
 LABELS = [case.label for case in bench.cases()]
-COSTS = ("launches", "per_step", "modules", "bytes")
+COSTS = ("launches", "modules")
+BYTES = 1.03
+"""Most that a scene may hold over what it did: a field more, the best iterate of a step."""
 
 
 def content():
@@ -50,8 +55,17 @@ def test_costs_no_more_than_before(tables, label):
     for name in COSTS:
         assert (now[name] is None) == (before[name] is None), name
         assert now[name] is None or now[name] <= before[name], (name, now[name], before[name])
-    for name in ("newton", "pcg"):
-        assert now[name] == before[name], name
+    assert now["bytes"] <= BYTES * before["bytes"]
+
+
+def test_all_scenes_take_fewer_iterations_than_before(tables):
+    """In all; none of them takes one and 6 % more Newton iterations."""
+    for name in ("newton", "pcg", "per_step"):
+        new, old = (sum(row[name] or 0 for row in table.values()) for table in tables)
+        assert new <= old, (name, new, old)
+    now, before = tables
+    for label, row in now.items():
+        assert row["newton"] <= 1.06 * before[label]["newton"] + 1, label
 
 
 @pytest.mark.parametrize("label", ["cantilever", "slider_crank", "loads rate auto"])

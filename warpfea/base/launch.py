@@ -116,8 +116,8 @@ class Launcher:
     def _count(self, kernel: wp.Kernel) -> None:
         if self.rarely:
             self.rare_launches += 1
-        else:
-            self.launches += 1
+            return
+        self.launches += 1
         self.kernels.add(kernel_name(kernel))
         self.modules.add(kernel.module.name)
 

@@ -20,6 +20,7 @@ from ..kernels.solvers.control import (
     FAIL_NAN,
     FAIL_WORK,
 )
+from ..kernels.solvers.judging import NEAR
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
 
@@ -85,6 +86,9 @@ def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
         return f"the step has taken {spent}", hint
     if code == FAIL_INVERTED:
         return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
+    near = float(work.newton.floor_excess.numpy()[world]) <= NEAR
+    if code in UNSTABLE and dtype == "float32" and near:
+        return "float32 can't hold this case: what is left of the residual is within rounding", "; take float64"
     if sim.integrator.static and code in UNSTABLE and int(work.newton.negative.numpy()[world]):
         return f"{REASONS[code]}: the equilibrium is unstable there (it buckles or snaps through)", (
             "; find what follows by a motion with damping, or prescribe displacements in place of loads"
