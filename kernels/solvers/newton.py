@@ -7,8 +7,18 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module
-from .control import FAIL_CONSTRAINT, FAIL_CURVATURE, FAIL_FLOOR, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_LINE_SEARCH, FAIL_NAN
-from .control import FAIL_WORK, LANES, control_struct
+from .control import (
+    FAIL_CONSTRAINT,
+    FAIL_CURVATURE,
+    FAIL_FLOOR,
+    FAIL_JACOBIAN,
+    FAIL_LIMIT,
+    FAIL_LINE_SEARCH,
+    FAIL_NAN,
+    FAIL_WORK,
+    LANES,
+    control_struct,
+)
 from .judging import TRIES, judging_functions
 from .pcg import pcg_struct
 from .vectors import vector_kernels

@@ -14,8 +14,9 @@ from ..model.assembly import require_density
 from ..model.state import State
 from ..model.topology import check_static_supports
 from ..solvers import NewtonPCG
+from .checks import check_model
 from .integrators import INTEGRATORS
-from .simulation import Simulation, StepReport, check_model
+from .simulation import Simulation, StepReport
 
 if TYPE_CHECKING:
     from ..model.model import Model
