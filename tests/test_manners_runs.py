@@ -340,6 +340,10 @@ def test_an_element_turned_inside_out_is_told(tmp_path, capfd):
     assert sim.min_J == min(steps)
     crushed = bar(wf.SVK(E=10.0, nu=0.3, density=1000.0), gravity=(-300.0, 0, 0))[0].finalize(device="cpu")
     sim = wf.Simulation(crushed, dt=2e-3)
+    with pytest.raises(wf.ConvergenceError, match="inside out"):
+        sim.run(0.1)
+    assert sim.min_J > 0
+    sim = wf.Simulation(crushed, dt=2e-3, inversion="report")
     sim.run(0.1, on_step=lambda s: s.min_J > 0)
     assert sim.min_J <= 0
     source = SimpleNamespace(label="bar", parameters={})
@@ -397,9 +401,12 @@ def test_the_summary_says_that_rounding_set_the_limit():
     sim = wf.Simulation(bar()[0].finalize(device="cpu", dtype="float32"), dt=2e-3)
     sim.step()
     summary = summarize(SimpleNamespace(label="bar", parameters={}), sim, status="done", wall_s=0.0)
-    for residual, told in ((1e-6, False), (0.1, True)):
-        sim.max_residual = summary["max_residual"] = residual
-        assert ("(at the limit of rounding)" in human(summary, sim, [])) == told
+    assert (summary["floored_steps"], summary["max_floor"]) == (0, 0.0)
+    assert "rounding" not in human(summary, sim, [])
+    summary |= {"floored_steps": 1, "max_floor": 1.234e-3}
+    text = "1 of 1 steps end where rounding stops the residual; largest estimated error 0.0012"
+    assert text in human(summary, sim, [])
+    summary["floored_steps"] = 0
     summary["steps"] = 0
     assert "residual up to" not in human(summary, sim, [])
     assert "no step was accepted" in human(summary, sim, [])

@@ -110,6 +110,7 @@ class Simulation(Results):
         self.last: StepReport | None = None
         self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough", "floored")}
         self.max_residual = 0.0
+        self.max_floor = 0.0
         self.min_J = math.inf
         self.max_violation = 0.0
         self._load: np.ndarray | None = None
@@ -200,6 +201,7 @@ class Simulation(Results):
         self.totals["floored"] += good & (self.last.floor > 0.0)
         if good.any():
             self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
+            self.max_floor = max(self.max_floor, float(self.last.floor[good].max()))
             self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
             self.min_J = min(self.min_J, float(self.last.min_J[good].min()))
         if self._recorded:
