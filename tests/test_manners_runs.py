@@ -349,6 +349,11 @@ def test_an_element_turned_inside_out_is_told(tmp_path, capfd):
     source = SimpleNamespace(label="bar", parameters={})
     summary = summarize(source, sim, status="done", wall_s=0.0)
     assert f"an element turned inside out: J = {sim.min_J:.3g}; take a finer mesh" in human(summary, sim, [])
+    stiffening = bar(wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0))[0].finalize(device="cpu")
+    sim = wf.Simulation(stiffening, dt=2e-3)
+    sim.step()
+    summary = summarize(source, sim, status="done", wall_s=0.0) | {"min_J": -0.1}
+    assert "J = -0.1 at a vertex of an element: take a finer mesh or smaller loads" in human(summary, sim, [])
 
 
 def test_what_was_not_written_is_not_listed(tmp_path, capfd, monkeypatch):

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..base.console import number, plain, table
 from ..base.provenance import versions
+from ..kernels.elements.materials import ANY_J
 from ..model.model import Model
 from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
@@ -133,8 +134,7 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
         end = f"ended at t = {number(s['t_end'], 6)} s, the whole steps nearest to t_end = {number(t_end, 6)} s"
         rows.insert(5, ["", end])
     if s["min_J"] is not None and s["min_J"] <= 0.0:
-        text = f"an element turned inside out: J = {number(s['min_J'], 3)}; "
-        rows.append(["WARNING", text + "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"])
+        rows.append(["WARNING", _inverted(s["min_J"], sim.model)])
     if s["rough_steps"]:
         reached = s["steps"] - s["rough_steps"]
         tol = number(sim.solver.tolerance(s["dtype"]))
@@ -169,6 +169,14 @@ def box_text(box: Sequence[Sequence[float]]) -> str:
 def mass_text(mass: float | None) -> str:
     """A mass for reading."""
     return "no density" if mass is None else f"{number(mass)} kg"
+
+
+def _inverted(J: float, model: Model) -> str:
+    """What to say of J <= 0: laws that need J > 0 forbid it at the quadrature points, not at the vertices."""
+    if any(block.key.law in ANY_J for block in model.blocks):
+        advice = "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"
+        return f"an element turned inside out: J = {number(J, 3)}; {advice}"
+    return f"J = {number(J, 3)} at a vertex of an element: take a finer mesh or smaller loads"
 
 
 def _iterations(s: dict[str, Any], sim: Simulation) -> str:
