@@ -124,6 +124,7 @@ CASES = {
     "tolerance": (lambda: wf.NewtonPCG(tol=2.0), wf.ModelError, r"tol = 2.0"),
     "max_newton": (lambda: wf.NewtonPCG(max_newton=0), wf.ModelError, r"max_newton = 0"),
     "load steps": (lambda: wf.solve_static(model_of(), load_steps=0), wf.ModelError, r"load_steps = 0"),
+    "load steps by name": (lambda: wf.solve_static(model_of(), load_steps="all"), wf.ModelError, r"'all' .* or 'auto'"),
     "static unsupported": (lambda: static_of(lambda b, s: None), wf.ModelError, r"'bar' is not supported.* 6 rigid"),
     "static hinge": (
         lambda: static_of(lambda b, s: b.clamp(s.nodes(lambda X: (X[:, 0] < 1e-9) & (X[:, 1] < 1e-9)))),

@@ -271,6 +271,44 @@ def test_statics_of_a_scene_has_ten_load_steps(folder, capfd):
     assert json.loads(out)["steps"] == 10
 
 
+def test_statics_takes_the_whole_load_at_once_with_auto(folder, capfd):
+    code, out, _ = run(capfd, *STATIC, *LIGHT, "--load-steps", "auto", "--json", "-")
+    summary = json.loads(out)
+    assert (code, summary["steps"], summary["load"]) == (0, 1, 1.0)
+    code, _, err = run(capfd, *STATIC, *LIGHT, "--load-steps", "some")
+    assert code == 2
+    assert "'some' is neither a positive whole number nor auto" in err
+
+
+CRUSHED = ["run", "part.msh", "--material", "svk:E=10,nu=0.3,density=1000", "--gravity", "-300,0,0", "--clamp", "x-"]
+CRUSHED += ["--device", "cpu", "--dt", "2e-3", "--t-end", "0.1"]
+
+
+def test_inversion_is_refused_or_told(folder, capfd):
+    code, out, err = run(capfd, *CRUSHED, "--json", "a.json")
+    assert code == 3
+    assert "an element turned inside out (J <= 0)" in err
+    assert json.loads((folder / "a.json").read_text())["min_J"] > 0
+    assert "WARNING" not in out
+    code, out, _ = run(capfd, *CRUSHED, "--inversion", "report", "--json", "a.json")
+    assert code == 0
+    assert json.loads((folder / "a.json").read_text())["min_J"] <= 0
+    assert "an element turned inside out: J = -" in out
+    code, _, err = run(capfd, *CRUSHED, "--inversion", "maybe")
+    assert code == 2
+    assert "--inversion" in err
+
+
+def test_steps_that_rounding_ends_are_told(folder, capfd):
+    words = [*STATIC[:4], "x-", "--traction", "x+:0,0,-1", *STATIC[-2:], *LIGHT, "--dtype", "float32", "--tol", "1e-7"]
+    code, out, _ = run(capfd, *words, "--json", "a.json")
+    summary = json.loads((folder / "a.json").read_text())
+    assert code == 0
+    assert 0 < summary["floored_steps"] <= summary["steps"] == 10
+    assert 0 < summary["max_floor"] < 2e-3
+    assert f"{summary['floored_steps']} of 10 steps end where rounding stops the residual" in out
+
+
 def test_statics_that_fails_exits_3(folder, capfd):
     code, out, err = run(capfd, "run", "mine.py:bursts", "--static", "--device", "cpu", "--json", "a.json")
     assert code == 3

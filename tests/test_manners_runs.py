@@ -347,6 +347,11 @@ def test_an_element_turned_inside_out_is_told(tmp_path, capfd):
     source = SimpleNamespace(label="bar", parameters={})
     summary = summarize(source, sim, status="done", wall_s=0.0)
     assert f"an element turned inside out: J = {sim.min_J:.3g}; take a finer mesh" in human(summary, sim, [])
+    stiffening = bar(wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0))[0].finalize(device="cpu")
+    sim = wf.Simulation(stiffening, dt=2e-3)
+    sim.step()
+    summary = summarize(source, sim, status="done", wall_s=0.0) | {"min_J": -0.1}
+    assert "J = -0.1 at a vertex of an element: take a finer mesh or smaller loads" in human(summary, sim, [])
 
 
 def test_what_was_not_written_is_not_listed(tmp_path, capfd, monkeypatch):
@@ -399,9 +404,12 @@ def test_the_summary_says_that_rounding_set_the_limit():
     sim = wf.Simulation(bar()[0].finalize(device="cpu", dtype="float32"), dt=2e-3)
     sim.step()
     summary = summarize(SimpleNamespace(label="bar", parameters={}), sim, status="done", wall_s=0.0)
-    for residual, told in ((1e-6, False), (0.1, True)):
-        sim.max_residual = summary["max_residual"] = residual
-        assert ("(at the limit of rounding)" in human(summary, sim, [])) == told
+    assert (summary["floored_steps"], summary["max_floor"]) == (0, 0.0)
+    assert "rounding" not in human(summary, sim, [])
+    summary |= {"floored_steps": 1, "max_floor": 1.234e-3}
+    text = "1 of 1 steps end where rounding stops the residual; largest estimated error 0.0012"
+    assert text in human(summary, sim, [])
+    summary["floored_steps"] = 0
     summary["steps"] = 0
     assert "residual up to" not in human(summary, sim, [])
     assert "no step was accepted" in human(summary, sim, [])

@@ -156,3 +156,25 @@ def test_iteration_caps_give_an_error_not_a_wrong_step():
     sim = wf.Simulation(model, dt=1e-2, solver=wf.NewtonPCG(max_newton=1, max_pcg=3, max_halvings=2))
     with pytest.raises(wf.ConvergenceError, match="did not converge after 2 halvings"):
         sim.step()
+
+
+def test_the_whole_load_at_once_is_halved_where_it_is_refused():
+    b, body = box(SOFT, cells=(4, 1, 1))
+    b.clamp(body.nodes("x-"))
+    b.add_traction(body.surface("x+"), (0, 0, -2e4))
+    model = b.finalize(device="cpu")
+    expected = wf.solve_static(model, load_steps=1).displacements(body)
+    for newton, halved in ((50, False), (6, True)):
+        result = wf.solve_static(model, load_steps="auto", solver=wf.NewtonPCG(max_newton=newton))
+        assert (result.simulation.steps, result.report.halvings[0] > 0) == (1, halved)
+        np.testing.assert_allclose(result.displacements(body), expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_a_refusal_by_rounding_is_not_halved():
+    """A load step that single precision can't hold is given up at once, and the message says so."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    bar = b.add_solid(wf.mesh.box((1, 0.01, 0.01), cells=(20, 1, 1), element="T10"), material=wf.SVK(E=2e11, nu=0.3))
+    b.clamp(bar.nodes("x-"))
+    b.add_traction(bar.surface("x+"), (0, 0, -2.5e5))
+    with pytest.raises(wf.ConvergenceError, match=r"float32 can't hold this case: .* after 0 halvings.*take float64"):
+        wf.solve_static(b.finalize(device="cpu", dtype="float32"), load_steps=3)

@@ -65,8 +65,8 @@ def element_kernels(
     ):
         """Internal force contributions (N), Eqs. (32) and (70), strain energy and viscous potential (J) by element.
 
-        `lanes` threads share the quadrature points of an element. The smallest J goes to `min_J`, and for laws that need
-        J > 0 that of the points to `domain_J`: at the vertices, which count in `min_J`, such a law has no barrier.
+        `lanes` threads share the quadrature points of an element. The smallest J goes to `min_J`, and for laws that
+        need J > 0 that of the points to `domain_J`: at the vertices, which count in `min_J`, they have no barrier.
         """
         world, index = wp.tid()
         if active[world] == 0:

@@ -95,7 +95,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
 
     @wp.func
     def foreseen(block: Block, step: Local, e: Ties, elem: int) -> Ties:
-        """The shears of the linear prediction from the iterate before, m^2; `step` is the last change of the slots, m."""
+        """The shears of the linear prediction from the iterate before, m^2; `step`: the last change of the slots, m."""
         out = e
         for t in range(NT):
             out[t] = out[t] - wp.dot(line(block.first, step, t, elem), line(block.second, step, t, elem))
@@ -115,9 +115,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         return s
 
     @wp.func
-    def tangent_force(
-        block: Block, P: Local, x1: TieVectors, x2: TieVectors, e: Ties, world: int, elem: int
-    ) -> Local:
+    def tangent_force(block: Block, P: Local, x1: TieVectors, x2: TieVectors, e: Ties, world: int, elem: int) -> Local:
         """Forces for a change P of the slots, with x_a, x_b and the shears e of the geometric part, N."""
         de = Ties()
         for t in range(NT):

@@ -6,8 +6,16 @@ import types as _types
 import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
-from .control import FAIL_CONSTRAINT, FAIL_FLOOR, FAIL_ITERATIONS, FAIL_JACOBIAN, FAIL_LINE_SEARCH, FAIL_NAN
-from .control import FAIL_CURVATURE, control_struct
+from .control import (
+    FAIL_CONSTRAINT,
+    FAIL_CURVATURE,
+    FAIL_FLOOR,
+    FAIL_ITERATIONS,
+    FAIL_JACOBIAN,
+    FAIL_LINE_SEARCH,
+    FAIL_NAN,
+    control_struct,
+)
 
 __all__ = ["judging_functions"]
 

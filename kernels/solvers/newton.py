@@ -7,8 +7,18 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module
-from .control import FAIL_CONSTRAINT, FAIL_CURVATURE, FAIL_FLOOR, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_LINE_SEARCH, FAIL_NAN
-from .control import FAIL_WORK, LANES, control_struct
+from .control import (
+    FAIL_CONSTRAINT,
+    FAIL_CURVATURE,
+    FAIL_FLOOR,
+    FAIL_JACOBIAN,
+    FAIL_LIMIT,
+    FAIL_LINE_SEARCH,
+    FAIL_NAN,
+    FAIL_WORK,
+    LANES,
+    control_struct,
+)
 from .judging import TRIES, judging_functions
 from .pcg import pcg_struct
 from .vectors import vector_kernels
@@ -263,6 +273,64 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             most = ctl.dq_dv[world] * ctl.turn[world]
             ctl.alpha[world] = wp.min(ctl.alpha[world], ctl.radius[world] / wp.max(most, f64(1.0e-300)))
 
+    @wp.func
+    def take(ctl: Control, world: int, stands: bool, leap: bool):
+        """End the search with the trial: its norms, the tolerance of the next solve, convergence.
+
+        `stands`: the trial is the iterate itself or the best one. `leap`: it may have raised Phi.
+        """
+        old_norm = ctl.norm[world]
+        old_phi = ctl.phi[world]
+        ctl.searching[world] = 0
+        measure(ctl, world)
+        ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+        if wp.static(stored):
+            ctl.stepped[world] = 1
+            more = ctl.term_sums[1, world] - ctl.term_sums[0, world]
+            ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
+        ctl.phi_magnitude[world] = magnitude(ctl, world)
+        if stands:
+            if ctl.reused[world] != 0:
+                ctl.reused[world] = 2
+            if ctl.restoring[world] != 0:
+                ctl.restoring[world] = 0
+                ctl.radius[world] = f64(SHRINK) * ctl.radius[world]
+                ctl.leaps[world] = 0
+                ctl.mixed[world] = 2
+                ctl.tame[world] = 1
+        else:
+            ctl.iterations[world] = ctl.iterations[world] + 1
+            if ctl.tame[world] != 0:
+                ctl.tame[world] = 0
+                ctl.mixed[world] = 1
+        ctl.total_iterations[world] = ctl.total_iterations[world] + 1
+        ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
+        ctl.reduction[world] = ratio
+        eta = f64(0.9) * ratio * ratio
+        guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
+        if guard > f64(0.1):
+            eta = wp.max(eta, guard)
+        if ctl.fixed_forcing == 0 and not stands:
+            ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
+        settle(ctl, world)
+        if not stands and (leap or ctl.leaps[world] > 0):
+            watch(ctl, world, old_phi, old_norm)
+
+    @wp.func
+    def shorten(ctl: Control, world: int, reused: bool):
+        """Go on with half the step, or end the search; `reused`: the operator is of an earlier iterate."""
+        ctl.wish[world] = 0
+        ctl.searches[world] = ctl.searches[world] + 1
+        ctl.alpha[world] = f64(0.5) * ctl.alpha[world]
+        if reused and ctl.searches[world] > REUSED_SEARCH:
+            # not the iterate is to blame: stand still, and go on with an operator of its own
+            ctl.alpha[world] = f64(0.0)
+        if ctl.searches[world] > MAX_SEARCH:
+            why = FAIL_LINE_SEARCH
+            if ctl.domain_J[world] <= f64(0.0):
+                why = FAIL_JACOBIAN
+            fail(ctl, world, why)
+
     @wp.kernel(module=module)
     def judge_trial(ctl: Control):
         """Armijo on Phi while it is not blind, else the sign of the slope; then convergence."""
@@ -299,40 +367,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         wishes = wishes and (ctl.tame[world] == 0 or ctl.mixed[world] == 2)
         leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or leap:
-            ctl.searching[world] = 0
-            measure(ctl, world)
-            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
-            if wp.static(stored):
-                ctl.stepped[world] = 1
-                more = ctl.term_sums[1, world] - ctl.term_sums[0, world]
-                ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
-            ctl.phi_magnitude[world] = magnitude(ctl, world)
-            if stands:
-                if reused:
-                    ctl.reused[world] = 2
-                if ctl.restoring[world] != 0:
-                    ctl.restoring[world] = 0
-                    ctl.radius[world] = f64(SHRINK) * ctl.radius[world]
-                    ctl.leaps[world] = 0
-                    ctl.mixed[world] = 2
-                    ctl.tame[world] = 1
-            else:
-                ctl.iterations[world] = ctl.iterations[world] + 1
-                if ctl.tame[world] != 0:
-                    ctl.tame[world] = 0
-                    ctl.mixed[world] = 1
-            ctl.total_iterations[world] = ctl.total_iterations[world] + 1
-            ratio = norm / wp.max(old_norm, f64(1.0e-300))
-            ctl.reduction[world] = ratio
-            eta = f64(0.9) * ratio * ratio
-            guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
-            if guard > f64(0.1):
-                eta = wp.max(eta, guard)
-            if ctl.fixed_forcing == 0 and not stands:
-                ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
-            settle(ctl, world)
-            if not stands and (leap or ctl.leaps[world] > 0):
-                watch(ctl, world, old_phi, old_norm)
+            take(ctl, world, stands, leap)
         elif wishes:
             ctl.wish[world] = 1
             ctl.searching[world] = 0
@@ -340,17 +375,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         elif ctl.leaps[world] > 0:
             ctl.restoring[world] = 1
         else:
-            ctl.wish[world] = 0
-            ctl.searches[world] = ctl.searches[world] + 1
-            ctl.alpha[world] = f64(0.5) * alpha
-            if reused and ctl.searches[world] > REUSED_SEARCH:
-                # not the iterate is to blame: stand still, and go on with an operator of its own
-                ctl.alpha[world] = f64(0.0)
-            if ctl.searches[world] > MAX_SEARCH:
-                why = FAIL_LINE_SEARCH
-                if ctl.domain_J[world] <= f64(0.0):
-                    why = FAIL_JACOBIAN
-                fail(ctl, world, why)
+            shorten(ctl, world, reused)
 
     @wp.kernel(module=module)
     def judge_outer(ctl: Control, running: wp.array(dtype=wp.int32), tol: f64, limit: int):

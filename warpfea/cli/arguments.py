@@ -20,6 +20,7 @@ __all__ = [
     "count",
     "counts",
     "existing",
+    "load_steps",
     "numbers",
     "pair",
     "positive",
@@ -77,6 +78,16 @@ def count(text: str) -> int:
     if not (text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
     return int(text)
+
+
+def load_steps(text: str) -> int:
+    """A number of load steps; "auto": one, which the solver halves where it is refused."""
+    if text == "auto":
+        return 1
+    try:
+        return count(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a positive whole number nor auto") from None
 
 
 def counts(text: str) -> list[int]:

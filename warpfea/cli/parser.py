@@ -9,7 +9,7 @@ from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
-from .arguments import Once, Parser, add_general, call, color_range, count, pair, positive, size, vector
+from .arguments import Once, Parser, add_general, call, color_range, count, load_steps, pair, positive, size, vector
 from .measuring import add_bench, add_profile, add_stress, add_study, check_study
 
 __all__ = ["parse"]
@@ -141,6 +141,12 @@ def _add_model(to: argparse.ArgumentParser) -> None:
         help="of a step, by default newton-pcg; jacobi: few cheap iterations, what is left is told",
     )
     how.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
+    how.add_argument(
+        "--inversion",
+        choices=("refuse", "report"),
+        default="refuse",
+        help="a step that turns an element inside out is refused (default), or passes where the law allows it",
+    )
 
 
 def _add_run(commands: Any) -> None:
@@ -153,7 +159,12 @@ def _add_run(commands: Any) -> None:
     _add_model(to)
     to.add_argument("--t-end", type=positive, metavar="S", help="end time, s (default: the scene's)")
     to.add_argument("--static", action="store_true", help="static equilibrium in place of a motion")
-    to.add_argument("--load-steps", type=count, metavar="N", help="of --static (default 10)")
+    to.add_argument(
+        "--load-steps",
+        type=load_steps,
+        metavar="N",
+        help="of --static (default 10); auto: the whole load at once, halved where it is refused",
+    )
     out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
     out.add_argument(
         "--usd", action=Once, metavar="FILE", help="animation (.usdc, .usda) with stress and displacement; validated"

@@ -34,7 +34,7 @@ class Source:
         label: what the user wrote.
         scene: the scene. values: what it is called with.
         parameters: what a summary says.
-        dt, integrator, dtype, device, tol, solver: of the run.
+        dt, integrator, dtype, device, tol, solver, inversion: of the run.
         load_steps, static_tol: of statics; None: a motion, the solver's default.
     """
 
@@ -48,6 +48,7 @@ class Source:
     device: str | None
     tol: float | None
     solver: str
+    inversion: str
     load_steps: int | None = None
     static_tol: float | None = None
 
@@ -68,10 +69,19 @@ class Source:
         """The simulation, or with load steps that of statics; shows a bar while kernels compile."""
         if self.load_steps is not None:
             with compile_bar(show) as bar:
-                return begin_static(model, load_steps=self.load_steps, tol=self.static_tol, on_compile=bar)
+                return begin_static(
+                    model, load_steps=self.load_steps, tol=self.static_tol, inversion=self.inversion, on_compile=bar
+                )
         solver = SOLVERS[self.solver](tol=self.tol)
         with compile_bar(show) as bar:
-            return Simulation(model, dt=self.dt, integrator=self.integrator, solver=solver, on_compile=bar)
+            return Simulation(
+                model,
+                dt=self.dt,
+                integrator=self.integrator,
+                solver=solver,
+                inversion=self.inversion,
+                on_compile=bar,
+            )
 
 
 def progress(options: argparse.Namespace) -> bool | None:
@@ -145,6 +155,7 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         device=options.device,
         tol=options.tol or found.tol,
         solver=options.solver,
+        inversion=options.inversion,
         load_steps=(options.load_steps or 10) if getattr(options, "static", False) else None,
         static_tol=options.tol,
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..base.console import number, plain, table
 from ..base.provenance import versions
+from ..kernels.elements.materials import ANY_J
 from ..model.model import Model
 from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
@@ -36,6 +37,8 @@ KEYS = (
     "max_residual",
     "min_J",
     "rough_steps",
+    "floored_steps",
+    "max_floor",
     "mass",
     "bounding_box",
     "energies",
@@ -58,9 +61,11 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     `analysis` is "dynamic" or "static"; `t_end` the time that was reached, of statics `load` the part of the load, 0 to
     1, with `steps` load steps; `mass` is null where a density is missing, `bounding_box` that of the reference;
     `wall_s` are the seconds from building to the closing of files, `compile_s` those of them in which the simulation
-    was made; `min_J` is the smallest det F of any step, null where there is none; `rough_steps`
-    are those accepted short of the tolerance (Jacobi); energies and probes are the last values,
-    of statics the strain energy alone; `violation` is the largest of the constraints in any step, m.
+    was made; `min_J` is the smallest det F of any step, null where there is none; `rough_steps` are
+    those accepted short of the tolerance (Jacobi), `floored_steps` those whose residual rounding stopped above it,
+    and `max_floor` the largest error that was estimated there (`StepReport.floor`), 0 without such steps; energies and
+    probes are the last values, of statics the strain energy alone; `violation` is the largest of the constraints in any
+    step, m.
     """
     probes = {}
     for probe in sim.model.probes:
@@ -92,6 +97,8 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
         "max_residual": sim.max_residual,
         "min_J": sim.min_J if sim.min_J < NO_J else None,
         "rough_steps": int(sim.totals["rough"].sum()),
+        "floored_steps": int(sim.totals["floored"].sum()),
+        "max_floor": sim.max_floor,
         "mass": sim.model.mass,
         "bounding_box": model_box(sim.model),
         "energies": {name: float(values[0]) for name, values in energies.items()},
@@ -120,12 +127,14 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
         ["time", f"{s['wall_s']:.1f} s, of which {s['compile_s']:.1f} s for kernels and set-up"],
         ["iterations", _iterations(s, sim)],
     ]
+    if s["floored_steps"]:
+        end = f"{s['floored_steps']} of {s['steps']} steps end where rounding stops the residual"
+        rows.append(["", f"{end}; largest estimated error {_text(s['max_floor'], 2)}"])
     if t_end is not None and s["t_end"] is not None and abs(s["t_end"] - t_end) > 1e-9 * abs(t_end):
         end = f"ended at t = {number(s['t_end'], 6)} s, the whole steps nearest to t_end = {number(t_end, 6)} s"
         rows.insert(5, ["", end])
     if s["min_J"] is not None and s["min_J"] <= 0.0:
-        text = f"an element turned inside out: J = {number(s['min_J'], 3)}; "
-        rows.append(["WARNING", text + "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"])
+        rows.append(["WARNING", _inverted(s["min_J"], sim.model)])
     if s["rough_steps"]:
         reached = s["steps"] - s["rough_steps"]
         tol = number(sim.solver.tolerance(s["dtype"]))
@@ -162,13 +171,19 @@ def mass_text(mass: float | None) -> str:
     return "no density" if mass is None else f"{number(mass)} kg"
 
 
+def _inverted(J: float, model: Model) -> str:
+    """What to say of J <= 0: laws that need J > 0 forbid it at the quadrature points, not at the vertices."""
+    if any(block.key.law in ANY_J for block in model.blocks):
+        advice = "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"
+        return f"an element turned inside out: J = {number(J, 3)}; {advice}"
+    return f"J = {number(J, 3)} at a vertex of an element: take a finer mesh or smaller loads"
+
+
 def _iterations(s: dict[str, Any], sim: Simulation) -> str:
     """Iterations, and what is left of the equations."""
     if s["steps"] == 0:
         return "no step was accepted"
     text = f"{_counts(s, sim)} per step, residual up to {_text(s['max_residual'], 2)}"
-    if s["dtype"] == "float32" and not s["rough_steps"] and sim.max_residual > sim.solver.tolerance(s["dtype"]):
-        text += " (at the limit of rounding)"
     return text + (f", violation up to {_text(s['violation'], 2)} m" if sim.model.constraints else "")
 
 

@@ -206,13 +206,16 @@ class Model:
     def _upload_components(self) -> None:
         """Slots and elements by component; with one component the lists are empty and stand for all in order."""
         of_element = np.concatenate([self.component[b.connectivity[:, 0]] for b in self.blocks])
-        for name, of in (("slot", self.component), ("element", of_element)):
-            edges = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=self.component_count))])
-            order = np.argsort(of, kind="stable") if self.component_count > 1 else np.zeros(0)
-            setattr(self, f"component_{name}_start", self.array("components", edges, wp.int32))
-            setattr(self, f"component_{name}", self.array("components", order, wp.int32))
+        self.component_slot_start, self.component_slot = self._by_component(self.component)
+        self.component_element_start, self.component_element = self._by_component(of_element)
         if self.component_count > 1:
             self.component_of_slot = self.array("components", self.component, wp.int32)
+
+    def _by_component(self, of: np.ndarray) -> tuple[wp.array, wp.array]:
+        """Where each component begins in a list of what belongs to component `of`, and that list."""
+        edges = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=self.component_count))])
+        order = np.argsort(of, kind="stable") if self.component_count > 1 else np.zeros(0)
+        return self.array("components", edges, wp.int32), self.array("components", order, wp.int32)
 
     def graph(self) -> sp.csr_matrix:
         """Which slots share an element."""

@@ -83,6 +83,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "dt": sim.dt,
         "steps": sim.steps,
         "max_residual": sim.max_residual,
+        "max_floor": sim.max_floor,
         "max_violation": sim.max_violation,
         "min_J": sim.min_J if math.isfinite(sim.min_J) else None,
         "probes": [probe.name for probe in sim.model.probes],
@@ -134,6 +135,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     sim.totals = {name: np.array(a) for name, a in totals.items()}
     sim.steps = int(meta["steps"])
     sim.max_residual = float(meta["max_residual"])
+    sim.max_floor = float(meta.get("max_floor", 0.0))
     sim.max_violation = float(meta.get("max_violation", 0.0))
     sim.min_J = math.inf if meta.get("min_J") is None else float(meta["min_J"])
     sim._history = list(history)

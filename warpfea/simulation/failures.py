@@ -51,7 +51,8 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     work = sim.stepper.work
     code = int(sim.last.failure[world])
     time = float(sim.last.time[world])
-    halvings = min(int(sim.last.halvings[world]), sim.solver.max_halvings)
+    # the last refusal was not followed by a halving
+    halvings = min(int(sim.last.halvings[world]) - 1, sim.solver.max_halvings)
     if code == FAIL_CONSTRAINT:
         return _unsatisfied(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1

@@ -22,6 +22,7 @@ from ..model.joints import Joint
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
+from .checks import check_choice, check_constraint_tol, check_dt, check_model, check_state, check_steps
 from .failures import check_closed, step_error
 from .reports import JointRecord, ProbeRecord, StepReport, describe, idle_report
 from .results import Results
@@ -32,19 +33,6 @@ if TYPE_CHECKING:
     from ..model.model import Model
 
 __all__ = ["JointRecord", "ProbeRecord", "Simulation", "StepReport"]
-
-
-def check_model(model: Any) -> None:
-    """Raise ModelError for what is not a Model, such as a builder."""
-    from ..model.model import Model
-
-    if not isinstance(model, Model):
-        raise ModelError(f"expected a Model, got {type(model).__name__}; builder.finalize() makes one")
-
-
-def _check_dt(value: Any) -> None:
-    if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
-        raise ModelError(f"dt = {value!r} must be a positive finite time (s)")
 
 
 class Simulation(Results):
@@ -94,24 +82,17 @@ class Simulation(Results):
         check_model(model)
         if not scheme.static:
             require_density(model.bodies, "motion")
-        if inversion not in ("refuse", "report"):
-            raise ModelError(f"inversion = {inversion!r} is neither 'refuse' nor 'report'")
-        if on_failure not in (None, "raise", "freeze"):
-            raise ModelError(f"on_failure = {on_failure!r} is neither 'raise' nor 'freeze'")
-        _check_dt(dt)
+        check_choice("inversion", inversion, "refuse", "report")
+        if on_failure is not None:
+            check_choice("on_failure", on_failure, "raise", "freeze")
+        check_dt(dt)
         if constraint_tol is None:
             constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
-        if not (isinstance(constraint_tol, (int, float, np.floating)) and 0.0 < constraint_tol < 1.0):
-            raise ModelError(f"constraint_tol = {constraint_tol!r} must lie between 0 and 1")
+        check_constraint_tol(constraint_tol)
 
         self.model = model
         self.state = model.state() if state is None else state
-        got, expected = self.state.displacement, (model.worlds, model.slots)
-        if got.shape != expected or got.dtype != model.types.vec3 or got.device != model.device:
-            raise ModelError(
-                f"the state is of another model: displacement {got.shape} of {got.dtype.__name__} on {got.device}, "
-                f"expected {expected} of {model.types.vec3.__name__} on {model.device}"
-            )
+        check_state(model, self.state)
         self.integrator, self.solver = scheme, options
         self.on_failure, self.record = on_failure, record
         began = clock.perf_counter()
@@ -129,6 +110,7 @@ class Simulation(Results):
         self.last: StepReport | None = None
         self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough", "floored")}
         self.max_residual = 0.0
+        self.max_floor = 0.0
         self.min_J = math.inf
         self.max_violation = 0.0
         self._load: np.ndarray | None = None
@@ -147,7 +129,7 @@ class Simulation(Results):
 
     @dt.setter
     def dt(self, value: float) -> None:
-        _check_dt(value)
+        check_dt(value)
         self._dt = float(value)
         self.stepper.set_dt(self._dt)
 
@@ -181,8 +163,7 @@ class Simulation(Results):
             ConstraintError: the same, and it is the constraints that can't be satisfied; it names them.
             ModelError: `count` is not a positive whole number.
         """
-        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
-            raise ModelError(f"step({count!r}): the number of steps must be a whole number, at least 1")
+        check_steps(count)
         for _ in range(count):
             self.stepper.run()
             report = self.stepper.work.report.numpy()
@@ -220,6 +201,7 @@ class Simulation(Results):
         self.totals["floored"] += good & (self.last.floor > 0.0)
         if good.any():
             self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
+            self.max_floor = max(self.max_floor, float(self.last.floor[good].max()))
             self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
             self.min_J = min(self.min_J, float(self.last.min_J[good].min()))
         if self._recorded:

@@ -14,8 +14,9 @@ from ..model.assembly import require_density
 from ..model.state import State
 from ..model.topology import check_static_supports
 from ..solvers import NewtonPCG
+from .checks import check_model
 from .integrators import INTEGRATORS
-from .simulation import Simulation, StepReport, check_model
+from .simulation import Simulation, StepReport
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -80,7 +81,7 @@ class StaticResult:
 def solve_static(
     model: Model,
     *,
-    load_steps: int = 10,
+    load_steps: int | str = 10,
     tol: float | None = None,
     solver: NewtonPCG | None = None,
     state: State | None = None,
@@ -95,7 +96,7 @@ def solve_static(
     it; laws over time are taken at it. A load step that fails is halved. Viscosity plays no part.
 
     Args:
-        load_steps: number of load steps.
+        load_steps: number of load steps; "auto": the whole load at once, halved where it is refused.
         tol: relative residual, by default the solver's.
         solver: NewtonPCG options; by default with room for slender bodies, max_pcg = 20000.
         constraint_tol, inversion: as of Simulation.
@@ -120,7 +121,7 @@ def solve_static(
 def begin_static(
     model: Model,
     *,
-    load_steps: int = 10,
+    load_steps: int | str = 10,
     tol: float | None = None,
     solver: NewtonPCG | None = None,
     state: State | None = None,
@@ -129,8 +130,9 @@ def begin_static(
     on_compile: Callable[[int, int, str], None] | None = None,
 ) -> Simulation:
     """The loop of `solve_static` before its first load step; ModelError as there. `on_compile` as of Simulation."""
-    if isinstance(load_steps, bool) or not (isinstance(load_steps, (int, np.integer)) and load_steps >= 1):
-        raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number")
+    count = 1 if isinstance(load_steps, str) and load_steps == "auto" else load_steps
+    if isinstance(count, (bool, str)) or not (isinstance(count, (int, np.integer)) and count >= 1):
+        raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number, or 'auto'")
     check_model(model)
     if np.any(model.terms.dead.gravity_host):
         require_density(model.bodies, "gravity")
@@ -145,7 +147,7 @@ def begin_static(
     start = model.state() if state is None else state.like()
     start.time.zero_()
     return Simulation(
-        model, start, dt=1.0 / load_steps, integrator=INTEGRATORS["static"], solver=options, ledger=False,
+        model, start, dt=1.0 / count, integrator=INTEGRATORS["static"], solver=options, ledger=False,
         on_failure="raise", constraint_tol=constraint_tol, inversion=inversion, on_compile=on_compile,
     )  # fmt: skip
 
