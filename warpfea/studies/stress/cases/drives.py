@@ -96,7 +96,7 @@ def twist_below(setting: Setting, part: float) -> Answer:
 
 @case(
     "greenhill", "drives", values=(1.1, 1.5), quick="float64",
-    refusal={"float64": ["unstable"], "float32": ["unstable"]},
+    refusal={"float64": ["unstable"], "float32": ["unstable", "float32"]},
 )  # fmt: skip
 def greenhill(setting: Setting, part: float) -> Answer:
     """The same past the critical torque: refused as unstable, told as such, or found on a stable branch."""

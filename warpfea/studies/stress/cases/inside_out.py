@@ -17,7 +17,8 @@ SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 NEO_HOOKEAN = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
 REASONS = ["inside out", "unstable there"]
 """A limit point, past which a bar snaps into a state that is inside out, may be told instead of that state."""
-INSIDE_OUT = {"float64": REASONS, "float32": REASONS}
+INSIDE_OUT = {"float64": REASONS, "float32": [*REASONS, "float32"]}
+COARSE = {"float32": ["float32"]}
 MOVED = {"squeezed": -0.95, "stretched": 9.0}
 """Travel of the far end along the bar, m."""
 TURNS = 4.0
@@ -100,19 +101,19 @@ def inverted_twisted(setting: Setting, element: str) -> Answer:
     return balance(setting, element, SVK, "twisted")
 
 
-@case("neo-squeezed", "inside out", values=tuple(CELLS))
+@case("neo-squeezed", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_squeezed(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar squeezed to a twentieth has to be found."""
     return balance(setting, element, NEO_HOOKEAN, "squeezed")
 
 
-@case("neo-stretched", "inside out", values=tuple(CELLS))
+@case("neo-stretched", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_stretched(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar stretched to tenfold has to be found, with J >= 0.35 at its points."""
     return balance(setting, element, NEO_HOOKEAN, "stretched", LOWEST_J)
 
 
-@case("neo-twisted", "inside out", values=tuple(CELLS))
+@case("neo-twisted", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_twisted(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar twisted by four turns has to be found."""
     return balance(setting, element, NEO_HOOKEAN, "twisted")
