@@ -47,7 +47,7 @@ def annulus(X: np.ndarray) -> np.ndarray:
     return np.column_stack([X[:, 0] * np.cos(angle), X[:, 0] * np.sin(angle), X[:, 2]])
 
 
-@case("annular", "bending", values=(10, "auto"), quick="float64", refusal={"float32": ["float32"]})
+@case("annular", "bending", values=(3, "auto"), quick="float64", refusal={"float32": ["float32"]})
 def annular(setting: Setting, load_steps: int | str) -> Answer:
     """The slit annular plate of Sze: one side of the slit is lifted by 0.8 N/m while the other is held."""
     if load_steps == "auto" and "auto" not in (wf.solve_static.__doc__ or ""):

@@ -13,9 +13,14 @@ from ..case import Answer, Setting, Skipped, case
 
 SIZE = (1.0, 0.1, 0.1)
 CELLS = {"T4": (20, 2, 2), "T10": (20, 2, 2), "FN18": (20, 2, 2), "H3843": (20, 1, 1)}
+PULLED = CELLS | {"T10": (10, 1, 1), "FN18": (10, 1, 1)}
+"""Of the neo-Hookean bar pulled to tenfold, which takes minutes with finer ones."""
 SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 NEO_HOOKEAN = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
-INSIDE_OUT = {"float64": ["inside out"], "float32": ["inside out"]}
+REASONS = ["inside out", "unstable there"]
+"""A limit point, past which a bar snaps into a state that is inside out, may be told instead of that state."""
+INSIDE_OUT = {"float64": REASONS, "float32": [*REASONS, "float32"]}
+COARSE = {"float32": ["float32"]}
 MOVED = {"squeezed": -0.95, "stretched": 9.0}
 """Travel of the far end along the bar, m."""
 TURNS = 4.0
@@ -25,9 +30,18 @@ LOWEST_J = 0.35
 """Of the neo-Hookean bar pulled to tenfold, at integration points."""
 
 
+def pressed(element: str) -> tuple[wf.ModelBuilder, wf.Body]:
+    """An SVK bar pressed by ten times its modulus, guided along its axis so that it can't buckle or turn over."""
+    b, body = bar(element, CELLS[element], SIZE, SVK)
+    b.clamp(body.nodes(lambda X: X[:, 0] > -1.0), slots="all", components="yz")
+    b.add_traction(body.surface("x+"), (-1e7, 0, 0))
+    return b, body
+
+
 def forced(element: str, law: wf.SVK | wf.NeoHookean, how: str) -> tuple[wf.ModelBuilder, wf.Body]:
     """A bar whose ends are held whole, one of them squeezed, stretched or twisted."""
-    b, body = bar(element, CELLS[element], SIZE, law)
+    cells = PULLED if law is NEO_HOOKEAN and how == "stretched" else CELLS
+    b, body = bar(element, cells[element], SIZE, law)
     slots = BUILT_IN[element]
     if how == "twisted":
         turn = wf.Rotation(anchor=(0, 0.05, 0.05), axis=(1, 0, 0), angle=([0, 1], [0, 2.0 * np.pi * TURNS]))
@@ -52,10 +66,8 @@ def balance(setting: Setting, element: str, law: wf.SVK | wf.NeoHookean, how: st
 
 @case("inverted-traction", "inside out", values=tuple(CELLS), quick="float64", refusal=INSIDE_OUT, must=True)
 def inverted_traction(setting: Setting, element: str) -> Answer:
-    """An SVK bar under a pressing traction ten times its modulus, which no admissible state carries."""
-    b, body = bar(element, CELLS[element], SIZE, SVK)
-    b.add_traction(body.surface("x+"), (-1e7, 0, 0))
-    found = solve(b, setting)
+    """A guided SVK bar under a pressing traction ten times its modulus, which no admissible state carries."""
+    found = solve(pressed(element)[0], setting)
     return found.count.answer(0.0, 0.0, "SVK softens: no state with J > 0", note=f"min J {found.count.min_J:.3g}")
 
 
@@ -64,13 +76,12 @@ def inverted_report(setting: Setting) -> Answer:
     """The same with inversion="report": the state is given, and the report says that it is inside out."""
     if "inversion" not in inspect.signature(wf.solve_static).parameters:
         raise Skipped("no option")
-    b, body = bar("T10", CELLS["T10"], SIZE, SVK)
-    b.add_traction(body.surface("x+"), (-1e7, 0, 0))
+    b, body = pressed("T10")
     found = solve(b, setting, inversion="report")
-    end = found.result.reaction(body.nodes("x-"))[0]
+    end = found.result.reaction(body.nodes("x-"))[0, 0]
     load = 1e7 * SIZE[1] * SIZE[2]
     limits = {"min J": (found.count.min_J, 0.0)}
-    error = float(np.abs(end - (load, 0.0, 0.0)).max()) / load
+    error = abs(end / load - 1.0)
     told = "the wall carries the load"
     return found.count.answer(error, BALANCE[setting.dtype], told, low=None, limits=limits)
 
@@ -93,19 +104,19 @@ def inverted_twisted(setting: Setting, element: str) -> Answer:
     return balance(setting, element, SVK, "twisted")
 
 
-@case("neo-squeezed", "inside out", values=tuple(CELLS))
+@case("neo-squeezed", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_squeezed(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar squeezed to a twentieth has to be found."""
     return balance(setting, element, NEO_HOOKEAN, "squeezed")
 
 
-@case("neo-stretched", "inside out", values=tuple(CELLS))
+@case("neo-stretched", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_stretched(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar stretched to tenfold has to be found, with J >= 0.35 at its points."""
     return balance(setting, element, NEO_HOOKEAN, "stretched", LOWEST_J)
 
 
-@case("neo-twisted", "inside out", values=tuple(CELLS))
+@case("neo-twisted", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_twisted(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar twisted by four turns has to be found."""
     return balance(setting, element, NEO_HOOKEAN, "twisted")

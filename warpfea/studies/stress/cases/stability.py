@@ -76,7 +76,7 @@ def snap_through(setting: Setting, value: str) -> Answer:
                   note=f"apex from {RISE:g} to {got:.5f} m")  # fmt: skip
 
 
-@case("lateral-buckling", "Stability", values=("0.97", "1.03"), quick="float64")
+@case("lateral-buckling", "Stability", values=("0.97", "1.03"), quick="float64", refusal={"float32": ("float32",)})
 def lateral_buckling(setting: Setting, value: str) -> Answer:
     """A strip on edge, 1 x 0.04 x 0.004 m, under 0.97 and 1.03 of the load that buckles it sideways.
 
