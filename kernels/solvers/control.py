@@ -111,12 +111,15 @@ def control_struct():
         strict_count: wp.array(dtype=wp.int32)
         eta: wp.array(dtype=wp.float64)  # that error, over the size of the solution; of the last such solve
         last_eta: wp.array(dtype=wp.float64)
-        floor: wp.array(dtype=wp.float64)  # the largest eta that was accepted in this step, 0: none
+        floor: wp.array(dtype=wp.float64)  # the eta that was accepted in this attempt, 0: none
         floor_bound: wp.float64  # largest that is
         floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, component, lane]
         negative: wp.array(dtype=wp.int32)  # the last solve met a direction without positive curvature
         # the first iterate
+        bent: wp.array(dtype=wp.int32)  # a solve of this attempt did
         potential: wp.array(dtype=wp.float64)  # strain energy of the state, J
+        potential_start: wp.array(dtype=wp.float64)  # of the state that the step began from
+        step_floor: wp.array(dtype=wp.float64)  # the largest floor of the accepted substeps
         choose: wp.array(dtype=wp.int32)  # it is to be chosen among others
         suspect: wp.array(dtype=wp.int32)  # the accepted iterate has J <= 0 somewhere
         turned: wp.array(dtype=wp.int32)  # it turned an element inside out

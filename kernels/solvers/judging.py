@@ -176,10 +176,11 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         most = f64(SETTLING) * ctl.floor_bound
         limit = ctl.max_iterations * (1 + ctl.choose[world])  # twice as many from far away
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
+        near = ctl.floor_excess[world] <= f64(NEAR) and ctl.strict_count[world] < TRIES
         still = ctl.reduction[world] > f64(STALLED) and ctl.reused[world] == 0
         if ctl.excess[world] <= f64(1.0):
             accept(ctl, world)
-        elif ctl.iterations[world] > 0 and still and settling and ctl.floor_excess[world] <= f64(NEAR):
+        elif near and ctl.iterations[world] > 0 and still and settling:
             ask(ctl, world)
         elif ctl.iterations[world] >= limit:
             give_up(ctl, world, FAIL_ITERATIONS)
@@ -191,7 +192,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             ask(ctl, world)
             ctl.alpha[world] = f64(0.0)
-        elif ctl.strict_count[world] > 0 and ctl.eta[world] < f64(1.0e30):
+        elif (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE) and ctl.eta[world] < f64(1.0e30):
             give_up(ctl, world, FAIL_FLOOR)
         else:
             give_up(ctl, world, why)

@@ -85,6 +85,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.strict[world] = 0
         ctl.strict_count[world] = 0
         ctl.negative[world] = 0
+        ctl.bent[world] = 0
         ctl.eta[world] = f64(1.0e30)
         ctl.slope[world] = f64(0.0)
         if ctl.domain_J[world] <= f64(0.0):
@@ -151,6 +152,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     @wp.func
     def open_search(ctl: Control, world: int):
         """See whether the direction leads anywhere."""
+        ctl.bent[world] = wp.max(ctl.bent[world], ctl.negative[world])
         ctl.searching[world] = 1
         barred = False
         if wp.static(limited):
@@ -196,7 +198,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                     step = wp.max(step, ctl.floor_sums[3, world, c, lane])
                     size = wp.max(size, ctl.floor_sums[4, world, c, lane])
                 eta = f64(1.0e30)
-                if ctl.negative[world] == 0 and wp.isfinite(work) and work >= f64(0.0):
+                if ctl.negative[world] == 0 and wp.isfinite(work) and work > f64(0.0):
                     eta = wp.sqrt(work * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
                     if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * size:
                         eta = dq * step / wp.max(size, f64(1.0e-300))
@@ -208,8 +210,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return
         tries = ctl.strict_count[world] + 1
         ctl.strict_count[world] = tries
-        if worst < f64(1.0e30) and (tries >= TRIES or (tries > 1 and worst > f64(0.5) * ctl.last_eta[world])):
-            give_up(ctl, world, FAIL_FLOOR)
+        known = worst < f64(1.0e30)
+        if tries >= TRIES or (known and tries > 1 and worst > f64(0.5) * ctl.last_eta[world]):
+            give_up(ctl, world, wp.where(known, FAIL_FLOOR, FAIL_CURVATURE))
             return
         ctl.last_eta[world] = worst
         open_search(ctl, world)
@@ -313,7 +316,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if ctl.fixed_forcing == 0 and not stands:
             ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
         settle(ctl, world)
-        if not stands and (leap or ctl.leaps[world] > 0):
+        if not stands and ctl.strict[world] == 0 and (leap or ctl.leaps[world] > 0):
             watch(ctl, world, old_phi, old_norm)
 
     @wp.func
@@ -391,6 +394,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return
         ctl.outer[world] = ctl.outer[world] + 1
         ctl.iterations[world] = 0
+        ctl.suspect[world] = 0
+        ctl.turned[world] = 0
         ctl.active[world] = 1
         ctl.stepped[world] = 1
 

@@ -148,7 +148,9 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.first_norm[world] = norm
         ctl.iterations[world] = 0
         ctl.negative[world] = 0
-        ctl.strict[world] = newton.strict[world]
+        strict = newton.strict[world] != 0
+        # the linear prediction must be that of the whole step, too
+        ctl.strict[world] = wp.where(strict or newton.mixed[world] == 1, 1, 0)
         ctl.energy[world] = f64(0.0)
         ctl.seen[world] = f64(0.0)
         goal = newton.forcing[world] * newton.solve_norm[world]
@@ -165,12 +167,14 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.target[world] = wp.max(goal, least)
         if newton.fixed_forcing != 0:
             ctl.target[world] = newton.forcing[world] * norm
-        if newton.strict[world] != 0:
+        if ctl.strict[world] != 0:
             # a residual of rough roundings hides the smooth error: its norm is no guide to when that is found
             ctl.target[world] = f64(0.0)
         if norm > ctl.target[world] and rz > f64(0.0) and ctl.max_iterations > 0:
             ctl.active[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)
+        elif strict:
+            ctl.negative[world] = 1  # a preconditioner that is not positive finds no error
 
     @wp.kernel(module=module)
     def update(
@@ -224,7 +228,8 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
                 energy = ctl.energy[world]
                 more = more and energy - ctl.seen[world] > f64(STRICT_GAIN) * energy
                 ctl.seen[world] = energy
-            if not pHp > f64(0.0):
+            cut = ctl.strict[world] != 0 and count >= ctl.max_iterations
+            if cut or not (pHp > f64(0.0) and rz >= f64(0.0)):
                 ctl.negative[world] = 1
             if more and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
                 wp.atomic_max(ctl.any_active, 0, 1)

@@ -51,7 +51,8 @@ def step_kernels(
         step.refused[world] = 0
         newton.total_iterations[world] = 0
         newton.rough[world] = 0
-        newton.floor[world] = f64(0.0)
+        newton.step_floor[world] = f64(0.0)
+        newton.potential_start[world] = newton.potential[world]
         if wp.static(gated):
             newton.outer[world] = 0
         pcg.total[world] = 0
@@ -74,6 +75,7 @@ def step_kernels(
         step.first_refusal[world] = 0
         newton.active[world] = step.running[world]
         newton.searching[world] = 0
+        newton.floor[world] = f64(0.0)
         newton.suspect[world] = 0
         newton.turned[world] = 0
         if step.running[world] == 0:
@@ -188,6 +190,7 @@ def step_kernels(
         if newton.failed[world] == 0:
             step.accepted[world] = 1
             step.total_J[world] = wp.min(step.total_J[world], newton.min_J[world])
+            newton.step_floor[world] = wp.max(newton.step_floor[world], newton.floor[world])
             part = step.part[world] + 1
             level = step.level[world]
             while level > 0 and part % 2 == 0:
@@ -207,9 +210,8 @@ def step_kernels(
         step.halvings[world] = step.halvings[world] + 1
         level = step.level[world] + 1
         why = newton.failed[world]
-        hopeless = why == FAIL_WORK
-        if wp.static(static):
-            hopeless = hopeless or why == FAIL_FLOOR  # a smaller load step is as ill-conditioned
+        # a shorter step has no more digits, and is another motion
+        hopeless = why == FAIL_WORK or why == FAIL_FLOOR
         if hopeless or level > step.max_halvings:
             step.status[world] = wp.static(STATUS["failed"])
             step.running[world] = 0
@@ -219,12 +221,13 @@ def step_kernels(
             wp.atomic_max(step.any_running, 0, 1)
 
     @wp.kernel(module=module)
-    def failed_now(step: Step, flags: wp.array(dtype=wp.int32)):
+    def failed_now(step: Step, newton: Newton, flags: wp.array(dtype=wp.int32)):
         """Flags of the worlds whose step failed for good: accepted substeps of it are taken back."""
         world = wp.tid()
         flags[world] = 0
         if step.status[world] == wp.static(STATUS["failed"]) and step.refused[world] == 1:
             flags[world] = 1
+            newton.potential[world] = newton.potential_start[world]
 
     @wp.kernel(module=module)
     def commit(
@@ -270,7 +273,7 @@ def step_kernels(
         report[world, 10] = f64(0.0)
         report[world, 11] = newton.force[world]
         report[world, 12] = f64(newton.rough[world])
-        report[world, 13] = newton.floor[world]
+        report[world, 13] = newton.step_floor[world]
         if wp.static(gated):
             largest = f64(0.0)
             for c in range(newton.components):

@@ -249,7 +249,7 @@ class Stepper:
     def _report(self) -> None:
         """Undo a failed step, and tell of the step."""
         m, w, launch = self.model, self.work, self.launch
-        launch(self.kernels.failed_now, m.worlds, [w.step, w.newton.active])
+        launch(self.kernels.failed_now, m.worlds, [w.step, w.newton, w.newton.active])
         if self.backup is not None:
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
         self.newton.forget(w.newton.active)
