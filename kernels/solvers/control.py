@@ -108,12 +108,13 @@ def control_struct():
         best_norm: wp.array(dtype=wp.float64)
         # where rounding stops the residual
         strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left; 2: it has been done
+        rounds: wp.array(dtype=wp.int32)  # linear solves of this attempt
         strict_count: wp.array(dtype=wp.int32)
         eta: wp.array(dtype=wp.float64)  # that error, over the size of the solution; of the last such solve
         last_eta: wp.array(dtype=wp.float64)
         floor: wp.array(dtype=wp.float64)  # the eta that was accepted in this attempt, 0: none
         floor_bound: wp.float64  # largest that is
-        floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, component, lane]
+        floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, part, lane]
         negative: wp.array(dtype=wp.int32)  # the last solve met a direction without positive curvature
         # the first iterate
         bent: wp.array(dtype=wp.int32)  # a solve of this attempt did

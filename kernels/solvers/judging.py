@@ -27,6 +27,8 @@ NEAR = 1.0e3
 """Roundings of the positions, as they change the residual, within which a stall may be put down to rounding."""
 SETTLING = 10.0
 """A residual can only be at its floor when the last step was below this many accepted errors."""
+FAR = 3
+"""An attempt that begins far from its end may take so many times more iterations."""
 TRIES = 3
 """Solves that may find the error of a stalled iterate too large before the step is given up."""
 
@@ -174,7 +176,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
         step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
         most = f64(SETTLING) * ctl.floor_bound
-        limit = ctl.max_iterations * (1 + ctl.choose[world])  # twice as many from far away
+        limit = ctl.max_iterations * (1 + FAR * ctl.choose[world])
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
         near = ctl.floor_excess[world] <= f64(NEAR) and ctl.strict_count[world] < TRIES
         still = ctl.reduction[world] > f64(STALLED) and ctl.reused[world] == 0

@@ -11,6 +11,7 @@ from .control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
     FAIL_FLOOR,
+    FAIL_ITERATIONS,
     FAIL_JACOBIAN,
     FAIL_LIMIT,
     FAIL_LINE_SEARCH,
@@ -19,7 +20,7 @@ from .control import (
     LANES,
     control_struct,
 )
-from .judging import TRIES, judging_functions
+from .judging import FAR, TRIES, judging_functions
 from .pcg import pcg_struct
 from .vectors import vector_kernels
 
@@ -35,6 +36,8 @@ LEAPS = 5
 equilibrium over iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
 TURN, SHRINK = 0.5, 0.4
 """Most that such a step turns or stretches an element, and what remains of it when the best iterate was restored."""
+ROUNDS = 3
+"""Linear solves of an attempt, over its iterations: those that lead to no step are bounded too."""
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1
@@ -86,6 +89,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.strict_count[world] = 0
         ctl.negative[world] = 0
         ctl.bent[world] = 0
+        ctl.rounds[world] = 0
         ctl.eta[world] = f64(1.0e30)
         ctl.slope[world] = f64(0.0)
         if ctl.domain_J[world] <= f64(0.0):
@@ -177,31 +181,36 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 fail(ctl, world, FAIL_CURVATURE)
 
     @wp.kernel(module=module)
-    def judge_floor(ctl: Control):
-        """The error that a residual stands for, over the size of the solution, of the worst component.
+    def judge_floor(ctl: Control, component_of_part: wp.array(dtype=wp.int32)):
+        """The error that a residual stands for, over the size of the solution, of the worst body.
 
-        With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv).
+        With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); each body
+        by itself, or a soft one would hide behind a stiff one that a joint ties it to.
         """
         world = wp.tid()
         if ctl.strict[world] != 2:
             return
         ctl.strict[world] = 0
         dq = ctl.dq_dv[world]
+        largest, whole = f64(0.0), f64(0.0)
+        for part in range(component_of_part.shape[0]):
+            for lane in range(LANES):
+                whole += ctl.floor_sums[0, world, part, lane]
+                largest = wp.max(largest, ctl.floor_sums[4, world, part, lane])
         worst = f64(0.0)
-        for c in range(ctl.components):
-            if ctl.quiet[world, c] == 0:
-                work, kinetic, strain, step, size = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
+        for part in range(component_of_part.shape[0]):
+            if ctl.quiet[world, component_of_part[part]] == 0:
+                work, kinetic, strain, step = f64(0.0), f64(0.0), f64(0.0), f64(0.0)
                 for lane in range(LANES):
-                    work += ctl.floor_sums[0, world, c, lane]
-                    kinetic += ctl.floor_sums[1, world, c, lane]
-                    strain += ctl.floor_sums[2, world, c, lane]
-                    step = wp.max(step, ctl.floor_sums[3, world, c, lane])
-                    size = wp.max(size, ctl.floor_sums[4, world, c, lane])
+                    work += ctl.floor_sums[0, world, part, lane]
+                    kinetic += ctl.floor_sums[1, world, part, lane]
+                    strain += ctl.floor_sums[2, world, part, lane]
+                    step = wp.max(step, ctl.floor_sums[3, world, part, lane])
                 eta = f64(1.0e30)
-                if ctl.negative[world] == 0 and wp.isfinite(work) and work > f64(0.0):
-                    eta = wp.sqrt(work * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
-                    if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * size:
-                        eta = dq * step / wp.max(size, f64(1.0e-300))
+                if ctl.negative[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
+                    eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
+                    if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * largest:
+                        eta = dq * step / wp.max(largest, f64(1.0e-300))
                 worst = wp.max(worst, eta)
         ctl.eta[world] = worst
         if worst <= ctl.floor_bound:
@@ -228,6 +237,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.alpha[world] = f64(1.0)
         if wp.static(limited):
             ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
+        ctl.rounds[world] = ctl.rounds[world] + 1
         ctl.searches[world] = 0
         ctl.wish[world] = 0
         ctl.turn[world] = f64(0.0)
@@ -246,6 +256,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             wp.atomic_max(ctl.any_hard, 0, 1)
         elif pcg.total[world] >= max_work:
             give_up(ctl, world, FAIL_WORK)
+        elif ctl.rounds[world] > ROUNDS * (1 + FAR * ctl.choose[world]) * ctl.max_iterations:
+            give_up(ctl, world, FAIL_ITERATIONS)
         else:
             open_search(ctl, world)
 

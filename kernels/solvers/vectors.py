@@ -108,12 +108,12 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         energy: wp.array3d(dtype=f64),
         sums: wp.array4d(dtype=f64),
     ):
-        """Strided partial sums of FLOOR_ROWS over the slots and elements of a component; empty lists: all there are."""
-        world, component, lane = wp.tid()
+        """Strided partial sums of FLOOR_ROWS over the slots and elements of a part; empty lists: all there are."""
+        world, part, lane = wp.tid()
         if ctl.strict[world] != 2:
             return
         work, kinetic, strain, step, size = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
-        for k in range(start[component] + lane, start[component + 1], LANES):
+        for k in range(start[part] + lane, start[part + 1], LANES):
             i = k
             if slot.shape[0] > 0:
                 i = slot[k]
@@ -122,16 +122,16 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
             kinetic += f64(wp.dot(inertia[world, i], v[world, i] - v_tilde[world, i]))
             step = wp.max(step, f64(wp.max(wp.abs(p))))
             size = wp.max(size, f64(wp.max(wp.abs(u[world, i]))))
-        for k in range(element_start[component] + lane, element_start[component + 1], LANES):
+        for k in range(element_start[part] + lane, element_start[part + 1], LANES):
             e = k
             if element.shape[0] > 0:
                 e = element[k]
             strain += energy[0, world, e]
-        sums[0, world, component, lane] = work
-        sums[1, world, component, lane] = kinetic
-        sums[2, world, component, lane] = strain
-        sums[3, world, component, lane] = step
-        sums[4, world, component, lane] = size
+        sums[0, world, part, lane] = work
+        sums[1, world, part, lane] = kinetic
+        sums[2, world, part, lane] = strain
+        sums[3, world, part, lane] = step
+        sums[4, world, part, lane] = size
 
     @wp.kernel(module=module)
     def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):

@@ -204,18 +204,26 @@ class Model:
         return term and term.tables
 
     def _upload_components(self) -> None:
-        """Slots and elements by component; with one component the lists are empty and stand for all in order."""
-        of_element = np.concatenate([self.component[b.connectivity[:, 0]] for b in self.blocks])
-        self.component_slot_start, self.component_slot = self._by_component(self.component)
-        self.component_element_start, self.component_element = self._by_component(of_element)
-        if self.component_count > 1:
-            self.component_of_slot = self.array("components", self.component, wp.int32)
+        """Slots by component, and slots and elements by part: bodies that joints tie are parts of one component.
 
-    def _by_component(self, of: np.ndarray) -> tuple[wp.array, wp.array]:
-        """Where each component begins in a list of what belongs to component `of`, and that list."""
-        edges = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=self.component_count))])
-        order = np.argsort(of, kind="stable") if self.component_count > 1 else np.zeros(0)
-        return self.array("components", edges, wp.int32), self.array("components", order, wp.int32)
+        With one component or part the lists are empty and stand for all in order.
+        """
+
+        def lists(of: np.ndarray, count: int) -> tuple[wp.array, wp.array]:
+            edges = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=count))])
+            order = np.argsort(of, kind="stable") if count > 1 else np.zeros(0)
+            return self.array("components", edges, wp.int32), self.array("components", order, wp.int32)
+
+        self.part_count = int(self.part.max()) + 1
+        of_element = np.concatenate([self.part[b.connectivity[:, 0]] for b in self.blocks])
+        self.part_slot_start, self.part_slot = lists(self.part, self.part_count)
+        self.part_element_start, self.part_element = lists(of_element, self.part_count)
+        of_part = np.zeros(self.part_count)
+        of_part[self.part] = self.component
+        self.component_of_part = self.array("components", of_part, wp.int32)
+        if self.component_count > 1:
+            self.component_start, self.component_slot = lists(self.component, self.component_count)
+            self.component_of_slot = self.array("components", self.component, wp.int32)
 
     def graph(self) -> sp.csr_matrix:
         """Which slots share an element."""

@@ -310,10 +310,10 @@ class NewtonLoop:
         """What hard steps need: how large an error a residual stands for, how far a step may go that Armijo's rule would
         cut, the searches that follow, and whether an accepted iterate is inside out."""
         m, w, k = self.model, self.work, self.kernels
-        args = [w.newton, m.component_slot_start, m.component_slot, m.component_element_start, m.component_element]
+        args = [w.newton, m.part_slot_start, m.part_slot, m.part_element_start, m.part_element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
-        self.launch(k.floor_partial, (m.worlds, m.component_count, LANES), args)
-        self.launch(k.judge_floor, m.worlds, [w.newton])
+        self.launch(k.floor_partial, (m.worlds, m.part_count, LANES), args)
+        self.launch(k.judge_floor, m.worlds, [w.newton, m.component_of_part])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self.residual.elements.measure_turn(self.at, w.direction, w.newton.active)

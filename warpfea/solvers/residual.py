@@ -218,7 +218,7 @@ class Residual:
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         if m.component_count > 1:
-            args = [m.component_slot_start, m.component_slot, w.rows, active, w.component_partial]
+            args = [m.component_start, m.component_slot, w.rows, active, w.component_partial]
             launch(self.newton.component_partial, (m.worlds, m.component_count, LANES), args)
             sums = (COMPONENT_ROWS, m.worlds, m.component_count)
             launch(self.newton.component_sum, sums, [w.component_partial, active, w.newton.component_sums])

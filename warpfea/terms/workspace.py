@@ -99,7 +99,7 @@ class Workspace:
         self.newton = self.struct(
             control_struct(), B, skip=skip,
             history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
-            term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, C, LANES),
+            term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.part_count, LANES),
         )  # fmt: skip
         self.newton.components = C
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
