@@ -125,6 +125,7 @@ def control_struct():
         suspect: wp.array(dtype=wp.int32)  # the accepted iterate has J <= 0 somewhere
         turned: wp.array(dtype=wp.int32)  # it turned an element inside out
         refuse_inversion: wp.int32
+        linear_stress: wp.int32  # all stresses are linear in the Green-Lagrange strain
         rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
         max_iterations: wp.int32
         components: wp.int32

@@ -149,8 +149,9 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.iterations[world] = 0
         ctl.negative[world] = 0
         strict = newton.strict[world] != 0
-        # the linear prediction must be that of the whole step, too
-        ctl.strict[world] = wp.where(strict or newton.mixed[world] == 1, 1, 0)
+        # a linear prediction must be that of the whole step, too; of other laws it is none so far away
+        whole = newton.mixed[world] == 1 and newton.linear_stress != 0
+        ctl.strict[world] = wp.where(strict or whole, 1, 0)
         ctl.energy[world] = f64(0.0)
         ctl.seen[world] = f64(0.0)
         goal = newton.forcing[world] * newton.solve_norm[world]

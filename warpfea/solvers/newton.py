@@ -12,6 +12,7 @@ import warp as wp
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.launch import labelled
+from ..kernels.elements.materials import ANY_J
 from ..kernels.solvers.control import LANES
 from ..kernels.solvers.newton import newton_kernels
 from .direct import Direct
@@ -190,6 +191,7 @@ class NewtonLoop:
         ctl.max_iterations = options.max_newton
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
+        ctl.linear_stress = int(all(block.key.law in ANY_J for block in model.blocks))
         self.max_work = options.max_work
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.nonpotential = int(traits.nonpotential or rate)
@@ -307,8 +309,8 @@ class NewtonLoop:
 
     @labelled("control")
     def _search_on(self) -> None:
-        """What hard steps need: how large an error a residual stands for, how far a step may go that Armijo's rule would
-        cut, the searches that follow, and whether an accepted iterate is inside out."""
+        """What hard steps need: the error that a residual stands for, the length of steps that Armijo's rule would cut,
+        the searches that follow, and whether an accepted iterate is inside out."""
         m, w, k = self.model, self.work, self.kernels
         args = [w.newton, m.part_slot_start, m.part_slot, m.part_element_start, m.part_element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]

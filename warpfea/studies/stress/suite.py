@@ -23,11 +23,12 @@ from ...base.names import did_you_mean
 from ...base.provenance import origin
 from ...base.writer import check_target
 from .case import CASES, DTYPES, Answer, Case, Setting, Skipped, label
+from .misses import reason_for
 
 __all__ = ["Row", "attempt", "choose", "list_cases", "load_cases", "run_rows", "stress"]
 
 SCHEMA = 1
-DONE, REFUSED, FAILED = "done", "refused", "FAILED"
+DONE, REFUSED, FAILED, MISSED = "done", "refused", "FAILED", "missed"
 STDOUT = "-"
 NOTE = 120
 """Characters of a note in the table; the file has it whole."""
@@ -114,6 +115,9 @@ def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
             raise
         line = traceback.format_exception_only(error)[-1].strip()
         outcome, passed, note = FAILED, False, line
+    known = reason_for(row.label, row.dtype, setting.device)
+    if known and passed is False:
+        outcome, passed, note = MISSED, None, f"{known} ({note})"
     out: dict[str, Any] = {
         "case": row.label,
         "group": case.group,
