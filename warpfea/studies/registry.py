@@ -142,7 +142,7 @@ _ENTRIES = (
         "medians of ms per step and the iterations, row by row.",
         options=("before", "bench", "repeat"),
         example="--before ../before --bench '--cpu --limit 5' --repeat 5 --out tests/results/versions_cpu.json",
-        results=("versions_cpu.json", "versions_h200.json"),
+        results=("versions_cpu.json", "versions_h200.json", "hard_steps_cpu.json", "hard_steps_h200.json"),
     ),
     Entry(
         name="peer-meshes",
