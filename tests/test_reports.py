@@ -34,7 +34,7 @@ def test_every_result_is_of_a_study_or_a_benchmark():
     for path in RESULTS.glob("*.json"):
         content = json.loads(path.read_text())
         words = content["command"] if "command" in content else next(iter(content["parts"].values()))["command"]
-        assert (path.name in known) != words.startswith("warpfea bench"), path.name
+        assert (path.name in known) != words.startswith(("warpfea bench", "warpfea stress")), path.name
 
 
 @pytest.mark.parametrize("name", STUDIES)
