@@ -17,7 +17,7 @@ from warpfea.studies.stress.suite import choose, load_cases
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 FILES = {"stress_cpu.json": "cpu", "stress_h200.json": "cuda:0"}
-SPEED = {"hard_steps_h200.json": ("--peer", 1.05, 1.10, 13), "hard_steps_cpu.json": ("--cpu", 1.05, 1.15, 15)}
+SPEED = {"hard_steps_h200.json": ("--peer", 1.05, 1.10, 13), "hard_steps_cpu.json": ("--cpu", 1.05, 1.10, 12)}
 
 
 def content(name):
