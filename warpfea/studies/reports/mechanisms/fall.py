@@ -81,7 +81,7 @@ def _beside_an_impact(device, tie, integrator):
 
     pair = Pair(device, tie, E=2e9, extra=extra)
     dt, steps = 1e-2, 5
-    options = {"max_newton": 3}  # so that the impact halves steps
+    options: dict[str, Any] = {"max_newton": 3}  # so that the impact halves steps
     sim = wf.Simulation(pair.model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(**options))
     row = {"case": "beside an impact", "joint": tie, "second": "T10", "integrator": integrator, "E": 2e9, "dt": dt,
            "solver": options, "error": None}  # fmt: skip
