@@ -94,7 +94,7 @@ def test_a_rounded_corner_is_none():
         r = 0.02 * 2 / math.pi
         return (min(s, 0.5) + r * math.sin(a), max(s - 0.52, 0.0) + r * (1 - math.cos(a)), 0.0)
 
-    geometry(curve, 200)
+    assert geometry(curve, 200) is not None
 
 
 @pytest.mark.parametrize(("turns", "elements"), [(1, 1), (1, 3), (10, 10), (100, 50)])
