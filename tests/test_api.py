@@ -153,8 +153,8 @@ def test_errors_derive_from_one():
     names = ["MeshError", "ModelError", "ConvergenceError", "ConstraintError", "PenetrationError", "CapacityError"]
     for name in [*names, "CheckpointError", "OutputError"]:
         assert issubclass(getattr(wf, name), wf.Error)
-    with pytest.raises(NotImplementedError, match="HalfSpace"):
-        getattr(wf, "HalfSpace")  # noqa: B009
+    with pytest.raises(NotImplementedError, match="TriMesh"):
+        getattr(wf, "TriMesh")  # noqa: B009
 
 
 def test_joints():

@@ -150,8 +150,8 @@ def test_bad_input(case, tmp_path, monkeypatch):
 
 
 LATER = {
-    "add_collider": lambda b, s: b.add_collider(None),
-    "add_contact": lambda b, s: b.add_contact(s, None),
+    "add_contact": lambda b, s: b.add_contact(s),
+    "TriMesh": lambda b, s: wf.TriMesh,
     "energy_momentum": lambda b, s: wf.Simulation(b.finalize(device="cpu"), dt=1.0, integrator="energy_momentum"),
     "set_parameter": lambda b, s: b.finalize(device="cpu").set_parameter("bar.E", 1.0),
     "contact_force": lambda b, s: b.finalize(device="cpu").contact_force(None),

@@ -52,6 +52,7 @@ from .builder.scene import scene  # noqa: E402
 from .elements.sections import Rectangle  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
 from .model.bodies import Body  # noqa: E402
+from .model.contacts import Box, Capsule, Cylinder, HalfSpace, Sphere  # noqa: E402
 from .model.description import Rotation  # noqa: E402
 from .model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noqa: E402
 from .model.joints import Joint  # noqa: E402
@@ -69,14 +70,18 @@ __all__ = [
     "GROUND",
     "SVK",
     "Body",
+    "Box",
     "CapacityError",
+    "Capsule",
     "Checkpoint",
     "CheckpointError",
     "ConstraintError",
     "ConvergenceError",
+    "Cylinder",
     "ElementSet",
     "Error",
     "GIFWriter",
+    "HalfSpace",
     "Jacobi",
     "Joint",
     "KelvinVoigt",
@@ -96,6 +101,7 @@ __all__ = [
     "Rectangle",
     "Rotation",
     "Simulation",
+    "Sphere",
     "State",
     "StepReport",
     "SurfaceSet",
@@ -110,12 +116,7 @@ __all__ = [
 
 
 _LATER = {
-    "HalfSpace": "contact",
-    "Sphere": "contact",
-    "Box": "contact",
-    "Capsule": "contact",
-    "Cylinder": "contact",
-    "TriMesh": "contact",
+    "TriMesh": "rigid triangle meshes",
     "Control": "controls between steps",
     "GeneralizedAlpha": "generalised-alpha steps",
 }

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from ..base.console import quiet_warp
 from ..base.errors import ModelError
 from ..elements.sections import Rectangle
 from ..materials import Material
-from ..model.assembly import require_density
 from ..model.bodies import Body
+from ..model.contacts import Collider, Contact, Shape
 from ..model.description import BodyForce, Description, Rotation
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint
@@ -24,7 +22,8 @@ from . import loads
 from .attachments import Ground
 from .beams import beam_geometry
 from .bodies import MeshLike, as_mesh, make_solid, make_structure, unused_name
-from .checks import owner_of, slot_field, vector, warn_implausible
+from .checks import check_densities, owner_of, vector, warn_implausible
+from .contacts import make_collider, make_contact
 from .joints import make_constraint, make_joint
 from .shells import shell_geometry
 from .supports import clamp_support, drive_supports
@@ -53,12 +52,7 @@ class ModelBuilder:
         self._terms: list[Callable[[Model], Term | None]] = []
 
     def __repr__(self) -> str:
-        d = self.description
-        count = len(d.dead_loads) + len(d.pressures) + len(d.moments) + len(d.body_forces)
-        counts = {"support": len(d.supports), "load": count, "joint": len(d.joints), "probe": len(d.probes)}
-        parts = [repr(body) for body in self.bodies] if len(self.bodies) <= 3 else [f"{len(self.bodies)} bodies"]
-        parts += [f"{n} {what}{'s' * (n > 1)}" for what, n in counts.items() if n]
-        return f"ModelBuilder({', '.join(parts)})" if parts else "ModelBuilder(no bodies)"
+        return f"ModelBuilder({self.description.summary() or 'no bodies'})"
 
     # bodies
 
@@ -68,17 +62,10 @@ class ModelBuilder:
         return self.description.bodies
 
     def add_solid(
-        self,
-        mesh: MeshLike,
-        *,
-        material: Material | dict[str, Material],
-        element: str | None = None,
-        quadrature: str | None = None,
-        scale: float = 1.0,
-        transform: Any = None,
-        initial: Any = None,
+        self, mesh: MeshLike, *, material: Material | dict[str, Material], element: str | None = None,
+        quadrature: str | None = None, scale: float = 1.0, transform: Any = None, initial: Any = None,
         name: str | None = None,
-    ) -> Body:
+    ) -> Body:  # fmt: skip
         """Add a solid body.
 
         Args:
@@ -105,18 +92,9 @@ class ModelBuilder:
         return self._add(make_solid(name, mesh, material, element, quadrature), initial)
 
     def add_beam(
-        self,
-        curve: Any,
-        *,
-        elements: int,
-        section: Rectangle,
-        normal: Any,
-        material: Material,
-        integration: str | None = None,
-        corners: str = "error",
-        initial: Any = None,
-        name: str | None = None,
-    ) -> Body:
+        self, curve: Any, *, elements: int, section: Rectangle, normal: Any, material: Material,
+        integration: str | None = None, corners: str = "error", initial: Any = None, name: str | None = None,
+    ) -> Body:  # fmt: skip
         """Add a beam of ANCF 3243 elements; node sets "start" and "end", also as beam.start and beam.end.
 
         Args:
@@ -143,19 +121,10 @@ class ModelBuilder:
         return self._add(make_structure(name, mesh, "3243", material, integration, axes, frames, section), initial)
 
     def add_shell(
-        self,
-        mesh: MeshLike,
-        *,
-        thickness: float,
-        material: Material | dict[str, Material],
-        integration: str | None = None,
-        normals: Any = None,
-        corners: str = "error",
-        scale: float = 1.0,
-        transform: Any = None,
-        initial: Any = None,
-        name: str | None = None,
-    ) -> Body:
+        self, mesh: MeshLike, *, thickness: float, material: Material | dict[str, Material],
+        integration: str | None = None, normals: Any = None, corners: str = "error", scale: float = 1.0,
+        transform: Any = None, initial: Any = None, name: str | None = None,
+    ) -> Body:  # fmt: skip
         """Add a shell of ANCF 3443 elements on the mid-surface of quads.
 
         Args:
@@ -187,10 +156,7 @@ class ModelBuilder:
 
     def _add(self, body: Body, initial: Any) -> Body:
         body.index = len(self.bodies)
-        if initial is not None:
-            body.initial_displacement = slot_field(body, initial, f"body {body.name!r}: initial") - slot_field(
-                body, lambda X: X, ""
-            )
+        loads.start_from(body, initial)
         self.bodies.append(body)
         return body
 
@@ -215,14 +181,9 @@ class ModelBuilder:
         self.description.supports.append(clamp_support(body, nodes, slots, components))
 
     def drive(
-        self,
-        nodes: NodeSet,
-        *,
-        displacement: Any = None,
-        rotation: Rotation | None = None,
-        components: str = "xyz",
+        self, nodes: NodeSet, *, displacement: Any = None, rotation: Rotation | None = None, components: str = "xyz",
         slots: str | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Move nodes on a prescribed path.
 
         Args:
@@ -305,17 +266,9 @@ class ModelBuilder:
     # joints
 
     def add_joint(
-        self,
-        kind: str,
-        *,
-        parent: Any,
-        child: Any,
-        anchor: Any = None,
-        axis: Any = None,
-        axis2: Any = None,
-        drive: Any = None,
-        name: str | None = None,
-    ) -> Joint:
+        self, kind: str, *, parent: Any, child: Any, anchor: Any = None, axis: Any = None, axis2: Any = None,
+        drive: Any = None, name: str | None = None,
+    ) -> Joint:  # fmt: skip
         """Tie two bodies, or a body and the ground, by a joint.
 
         Args:
@@ -393,15 +346,65 @@ class ModelBuilder:
         self.description.joints.append(joint)
         return joint
 
-    # parts of later versions
+    # contact
 
-    def add_collider(self, *args: Any, **options: Any) -> Any:
-        """Contact is not part of this version."""
-        raise NotImplementedError("add_collider: contact is not part of this version")
+    def add_collider(self, shape: Shape, path: Any = None, name: str | None = None) -> Collider:
+        """Add a rigid obstacle, which bodies feel where `add_contact` says so.
 
-    def add_contact(self, *args: Any, **options: Any) -> Any:
-        """Contact is not part of this version."""
-        raise NotImplementedError("add_contact: contact is not part of this version")
+        Args:
+            shape: HalfSpace, Sphere, Box, Capsule or Cylinder, where it is at displacement 0.
+            path: time law of its displacement (3,), m, or a Rotation; None: it is fixed.
+            name: unique name; by default the shape's.
+
+        Raises:
+            ModelError: no shape, a path that is not finite, or a name used twice.
+        """
+        collider = make_collider(self.description, shape, path, name)
+        self.description.colliders.append(collider)
+        return collider
+
+    def add_contact(
+        self, surface: Body | SurfaceSet, collider: Collider | Any = None, *, mu: float = 0.0,
+        mu_static: float | None = None, restitution: float = 1.0, law: str = "default", treatment: str = "implicit",
+        stiffness: float | None = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
+        points: int | None = None, smoothing: Any = None, overlap: str = "refuse", overlap_time: float = 0.1,
+        name: str | None = None,
+    ) -> Contact:  # fmt: skip
+        """Let a body, or a surface of it, touch a collider.
+
+        Args:
+            surface: the outer faces that may touch; of a body all.
+            collider: as `add_collider` returned it.
+            mu, mu_static: coefficients of friction in slip, and in stick if it is larger.
+            restitution: speed after an impact over that before, 0 < restitution <= 1.
+            law: "default", "paper" (Paper I, Eqs. 72-83) or "smooth".
+            treatment: "implicit", or "explicit" with the paper's law.
+            stiffness: factor on the normal and the tangential stiffness; None: 1.
+            model: "patch", spread over the surface, or "sphere", one contact at the deepest point, by Hertz.
+            radius: m; "patch": of the disc whose area counts instead of the surface's; "sphere": of the body there.
+            offset: gap at which contact begins, m.
+            points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4.
+            smoothing: "paper": depth over which its damping is ramped in, m; "smooth": (eps in N, v_eps in m/s).
+            overlap: of bodies that overlap at the start: "refuse", or "offset": stored, it decays in `overlap_time`, s.
+            name: unique name; by default "BODY on COLLIDER".
+
+        Returns:
+            Contact: the handle for reports.
+
+        Raises:
+            ModelError: a value out of range, an unknown name, no faces, or a handle of another builder.
+            NotImplementedError: two bodies, or a body with itself.
+        """
+        self._own(surface, "add_contact", Body, SurfaceSet)
+        if collider is None or isinstance(collider, (Body, SurfaceSet)):
+            raise NotImplementedError("add_contact: contact between bodies is a later part; give a collider")
+        contact = make_contact(
+            self.description, surface, collider, name, mu=mu, mu_static=mu_static, restitution=restitution, law=law,
+            treatment=treatment, stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
+            smoothing=smoothing, overlap=overlap, overlap_time=overlap_time,
+        )  # fmt: skip
+        self.description.contacts.append(contact)
+        return contact
 
     # the end
 
@@ -421,10 +424,7 @@ class ModelBuilder:
         Warns:
             MeshWarning: a size, mass or density that a wrong unit is likely to have made.
         """
-        if np.any(self.gravity):
-            require_density(self.bodies, "gravity needs, and any motion")  # no "or gravity=(0, 0, 0)": motion is next
-        for force in self.description.body_forces:
-            require_density(force.bodies, "add_body_force")
+        check_densities(self.bodies, self.gravity, self.description.body_forces)
         with quiet_warp():
             model = Model(self, device=device, dtype=dtype, worlds=worlds)
         warn_implausible(model)

@@ -12,12 +12,15 @@ from ..base.errors import MeshWarning, ModelError
 from ..base.names import did_you_mean, listing
 from ..materials import Material
 from ..mesh import Mesh
+from ..model.assembly import require_density
 from ..model.bodies import Body
+from ..model.description import BodyForce
 from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
 
 __all__ = [
     "COMPONENTS",
     "assign_materials",
+    "check_densities",
     "component_mask",
     "nodal",
     "owner_of",
@@ -64,6 +67,14 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
         if len(unused) == len(thing.indices):
             raise ModelError(f"{what}: no element of body {body.name!r} uses node {int(unused[0])}")
     return body
+
+
+def check_densities(bodies: list[Body], gravity: np.ndarray, forces: list[BodyForce]) -> None:
+    """Raise ModelError where gravity or a body force acts on a material without density."""
+    if np.any(gravity):
+        require_density(bodies, "gravity needs, and any motion")  # no "or gravity=(0, 0, 0)": motion is next
+    for force in forces:
+        require_density(force.bodies, "add_body_force")
 
 
 def warn_implausible(model: Any) -> None:

@@ -23,6 +23,7 @@ __all__ = [
     "probe_at",
     "set_initial_state",
     "spin_moment",
+    "start_from",
 ]
 
 
@@ -80,6 +81,13 @@ def check_field(field: Any) -> None:
             f"add_body_force: {field.key} takes {len(field.input_types)} arguments; it must be "
             "(x: wp.vec3d, t: wp.float64) -> wp.vec3d, or the same in float32"
         )
+
+
+def start_from(body: Body, initial: Any) -> None:
+    """Initial positions of a body, as the methods of ModelBuilder that add one take them; None: the reference."""
+    if initial is not None:
+        start, reference = slot_field(body, initial, f"body {body.name!r}: initial"), slot_field(body, lambda X: X, "")
+        body.initial_displacement = start - reference
 
 
 def set_initial_state(body: Body, velocity: Any, angular_velocity: Any, displacement: Any) -> None:

@@ -15,8 +15,11 @@ __all__ = [
     "composite",
     "conical_tet",
     "conical_triangle",
+    "lobatto_square",
     "square_rule",
+    "triangle_3",
     "triangle_6",
+    "triangle_7",
 ]
 
 
@@ -139,6 +142,20 @@ def triangle_6() -> Rule:
     return Rule("triangle6", table[:, :2], table[:, 2], 4)
 
 
+@functools.cache
+def triangle_3() -> Rule:
+    """The three vertices, degree 1."""
+    return Rule("triangle3", np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]), np.full(3, 1.0 / 6.0), 1)
+
+
+@functools.cache
+def triangle_7() -> Rule:
+    """Vertices, mid-sides and centre, degree 3, positive weights (Stroud 1971); contact needs corners."""
+    corners, middles = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)], [(0.5, 0.0), (0.5, 0.5), (0.0, 0.5)]
+    points = np.array([*corners, *middles, (1.0 / 3.0, 1.0 / 3.0)])
+    return Rule("triangle7", points, np.repeat([1.0 / 40.0, 1.0 / 15.0, 9.0 / 40.0], [3, 3, 1]), 3)
+
+
 Ranges = tuple[tuple[float, float], ...]
 
 
@@ -165,6 +182,17 @@ def box_rule(counts: tuple[int, int, int], ranges: Ranges) -> Rule:
 def square_rule(n: int) -> Rule:
     """Product Gauss rule of n^2 points on the unit square."""
     return _product(f"square{n}", (n, n), ((0.0, 1.0), (0.0, 1.0)))
+
+
+@functools.cache
+def lobatto_square(n: int) -> Rule:
+    """Product Gauss-Lobatto rule of n^2 points on the unit square, n >= 2, with its corners; degree 2n - 3."""
+    last = np.polynomial.legendre.Legendre.basis(n - 1)
+    x = np.concatenate([[-1.0], np.sort(last.deriv().roots().real), [1.0]])
+    w = 2.0 / (n * (n - 1) * last(x) ** 2)
+    x, w = 0.5 * (1.0 + x), 0.5 * w
+    grid = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    return Rule(f"lobatto{n}", grid, np.outer(w, w).ravel(), 2 * n - 3, (n, n))
 
 
 def composite(rule: Rule, parts: int) -> Rule:

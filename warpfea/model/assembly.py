@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -351,7 +351,7 @@ class FacetTables:
         conn: (F, n) body slots; faces that have fewer repeat their first one with functions of zero.
         shape, d_a, d_b: (F, Q, n) functions and their derivatives along the two sides of a face, whose cross product
             points outward.
-        weights: (Q,) of the face rule.
+        weights: (F, Q) of the face rules; faces with fewer points repeat their last one with weight 0.
     """
 
     conn: np.ndarray
@@ -361,28 +361,38 @@ class FacetTables:
     weights: np.ndarray
 
 
-def facet_tables(surface: SurfaceSet, parts: int = 1) -> FacetTables:
-    """Functions of the faces of a surface at the points of the face rule, repeated on parts x parts of a face."""
+def facet_tables(surface: SurfaceSet, parts: int = 1, rules: Mapping[int, Rule] | None = None) -> FacetTables:
+    """Functions of the faces of a surface at points of each face.
+
+    Args:
+        surface: the faces.
+        parts: the rule is repeated on parts x parts of a face.
+        rules: rule by the number of corners of a face, 3 or 4; by default the family's face rule for all.
+    """
     body, faces = surface.body, surface.faces
-    rule = composite(body.family.face_rule, parts)
-    Q, S = len(rule.weights), body.family.slots
+    kinds = [int(face) for face in np.unique(faces[:, 1])]
+    rule = {k: composite(rules[len(body.family.faces[k])] if rules else body.family.face_rule, parts) for k in kinds}
+    Q, S = max((len(r.weights) for r in rule.values()), default=0), body.family.slots
     values = np.zeros((3, len(faces), Q, S))
+    weights = np.zeros((len(faces), Q))
     used = np.zeros((len(faces), S), dtype=bool)
-    for face in np.unique(faces[:, 1]):
+    for face in kinds:
         rows = np.flatnonzero(faces[:, 1] == face)
-        xi, dxi = body.family.face_points(int(face), rule.points)
+        pad = Q - len(rule[face].weights)
+        xi, dxi = body.family.face_points(face, np.pad(rule[face].points, ((0, pad), (0, 0)), mode="edge"))
         s, ds = element_functions(body, faces[rows, 0], xi)
         values[0, rows] = s
         values[1:, rows] = np.einsum("eqsk,qkd->deqs", ds, dxi)
+        weights[rows] = np.pad(rule[face].weights, (0, pad))
         size = np.abs(values[:, rows]).max(axis=(0, 1, 2))
         used[rows] = size > 1e-12 * size.max()
-    width = int(used.sum(axis=1).max())
+    width = int(used.sum(axis=1).max(initial=0))
     order = np.argsort(~used, axis=1, kind="stable")[:, :width]
     real = np.take_along_axis(used, order, axis=1)
     conn = np.take_along_axis(body.connectivity[faces[:, 0]], order, axis=1)
     conn = np.where(real, conn, conn[:, :1])
     table = np.take_along_axis(values, order[None, :, None, :], axis=3) * real[:, None, :]
-    return FacetTables(conn, table[0], table[1], table[2], rule.weights)
+    return FacetTables(conn, table[0], table[1], table[2], weights)
 
 
 def facet_places(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..laws import TimeLaw
 from .bodies import Body
+from .contacts import Collider, Contact
 from .handles import NodeSet, SurfaceSet
 from .joints import Joint
 
@@ -120,6 +121,16 @@ class Description:
     body_forces: list[BodyForce] = field(default_factory=list)
     probes: list[Probe] = field(default_factory=list)
     joints: list[Joint] = field(default_factory=list)
+    colliders: list[Collider] = field(default_factory=list)
+    contacts: list[Contact] = field(default_factory=list)
+
+    def summary(self) -> str:
+        """What there is, in one line; "" of an empty description."""
+        loads = len(self.dead_loads) + len(self.pressures) + len(self.moments) + len(self.body_forces)
+        counts = {"support": len(self.supports), "load": loads, "joint": len(self.joints)}
+        counts |= {"collider": len(self.colliders), "contact": len(self.contacts), "probe": len(self.probes)}
+        parts = [repr(body) for body in self.bodies] if len(self.bodies) <= 3 else [f"{len(self.bodies)} bodies"]
+        return ", ".join(parts + [f"{n} {what}{'s' * (n > 1)}" for what, n in counts.items() if n])
 
 
 def support_slots(nodes: NodeSet, which: str) -> np.ndarray:

@@ -80,7 +80,7 @@ class Followers(Term):
         data.is_position = m.array("loads", position.T.astype(float), m.types.T)
         for name, table in (("shape", t.shape), ("d_a", t.d_a), ("d_b", t.d_b)):
             setattr(data, name, m.array("loads", np.moveaxis(table, 0, 2), m.types.T))
-        data.weight = m.array("loads", t.weights, m.types.T)
+        data.weight = m.array("loads", t.weights[0], m.types.T)
         k = pressure_kernels(m.dtype)
         return FollowerPart(data, k.pressure, k.pressure_product, len(t.conn))
 

@@ -1,0 +1,147 @@
+"""Colliders and contacts as a builder records them; the methods of ModelBuilder say what they mean."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..base.checks import is_number
+from ..base.errors import ModelError
+from ..base.names import did_you_mean
+from ..laws import time_law
+from ..model.bodies import Body
+from ..model.contact_points import check_points
+from ..model.contacts import Collider, ColliderRotation, Contact, Shape
+from ..model.description import Description, Rotation
+from ..model.handles import SurfaceSet
+from .bodies import unused_name
+from .checks import vector
+
+__all__ = ["CONTACT_LAWS", "CONTACT_MODELS", "OVERLAPS", "TREATMENTS", "contact_surface", "make_collider",
+           "make_contact"]  # fmt: skip
+
+CONTACT_LAWS = ("default", "paper", "smooth")
+TREATMENTS = ("implicit", "explicit")
+CONTACT_MODELS = ("patch", "sphere")
+OVERLAPS = ("refuse", "offset")
+
+
+def make_collider(d: Description, shape: Any, path: Any, name: str | None) -> Collider:
+    """See ModelBuilder.add_collider."""
+    if not isinstance(shape, Shape):
+        raise ModelError(f"add_collider: expected a shape (HalfSpace, Sphere, Box, Capsule or Cylinder), got {shape!r}")
+    default = {"HalfSpace": "half_space"}.get(type(shape).__name__, type(shape).__name__.lower())
+    name = unused_name(name, default, {c.name for c in d.colliders}, "collider")
+    out = Collider(shape, name, index=len(d.colliders))
+    what = f"collider {name!r}: path"
+    if isinstance(path, Rotation):
+        axis = vector(path.axis, f"{what}: axis")
+        if not np.linalg.norm(axis) > 0.0:
+            raise ModelError(f"{what}: axis is zero")
+        angle = time_law(path.angle, f"{what}: angle", scalar=True)
+        out.rotation = ColliderRotation(vector(path.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis), angle)
+    elif path is not None:
+        out.law = time_law(path, what)
+    return out
+
+
+def contact_surface(thing: Body | SurfaceSet) -> SurfaceSet:
+    """A surface, or all outer faces of a body.
+
+    Raises:
+        ModelError: no faces, faces inside of the body, or the same face twice.
+    """
+    body = thing if isinstance(thing, Body) else thing.body
+    surface = SurfaceSet(body, body.boundary) if isinstance(thing, Body) else thing
+    what = f"add_contact: surface {surface.name!r} of body {body.name!r}" if surface.name else (
+        f"add_contact: the surface of body {body.name!r}")  # fmt: skip
+    if not len(surface):
+        raise ModelError(f"{what} has no faces")
+    count = len(body.family.faces)
+    number, outer = surface.faces @ (count, 1), body.boundary @ (count, 1)
+    for k in np.flatnonzero(~np.isin(number, outer))[:1]:
+        raise ModelError(f"{what}: face {surface.faces[k].tolist()} (element, local face) is no outer face")
+    if len(np.unique(number)) < len(number):
+        raise ModelError(f"{what} has a face twice")
+    return surface
+
+
+def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: str | None, **options: Any) -> Contact:
+    """See ModelBuilder.add_contact.
+
+    Args:
+        options: those of ModelBuilder.add_contact, all of them.
+    """
+    if isinstance(collider, Shape):
+        shape = type(collider).__name__
+        raise ModelError(f"add_contact: {shape} is a shape; give the collider that add_collider({shape}(...)) returns")
+    if not isinstance(collider, Collider):
+        raise ModelError(f"add_contact: expected a collider, as add_collider returns, got {collider!r}")
+    if collider not in d.colliders:
+        raise ModelError(f"add_contact: collider {collider.name!r} belongs to another builder")
+    surface = contact_surface(thing)
+    default = f"{surface.body.name} on {collider.name}"
+    name = unused_name(name, default, {c.name for c in d.contacts}, "contact")
+    o = _checked(f"contact {name!r}", surface, dict(options))
+    return Contact(surface, collider, name, index=len(d.contacts), **o)
+
+
+def _checked(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any]:
+    """The options of a contact with None replaced where it stands for a value. ModelError names what is wrong."""
+    for option, known in (("law", CONTACT_LAWS), ("treatment", TREATMENTS), ("model", CONTACT_MODELS),
+                          ("overlap", OVERLAPS)):  # fmt: skip
+        if o[option] not in known:
+            hint = did_you_mean(o[option], known)
+            raise ModelError(f"{what}: {option} = {o[option]!r} is none of {', '.join(map(repr, known))}{hint}")
+    if o["treatment"] == "explicit" and o["law"] != "paper":
+        raise ModelError(f"{what}: treatment = 'explicit' is for law = 'paper' only, not {o['law']!r}")
+    o["mu"] = _number(what, "mu", o["mu"], "a friction coefficient, 0 or above", low=0.0)
+    if o["mu_static"] is None:
+        o["mu_static"] = o["mu"]
+    wanted = f"None, or at least mu = {o['mu']:g}"
+    o["mu_static"] = _number(what, "mu_static", o["mu_static"], wanted, low=o["mu"])
+    o["restitution"] = _number(what, "restitution", o["restitution"], "above 0 and at most 1", high=1.0)
+    o["stiffness"] = 1.0 if o["stiffness"] is None else o["stiffness"]
+    o["stiffness"] = _number(what, "stiffness", o["stiffness"], "a positive factor, or None for 1")
+    if o["radius"] is not None:
+        o["radius"] = _number(what, "radius", o["radius"], "positive, m")
+    elif o["model"] == "sphere":
+        raise ModelError(
+            f"{what}: model = 'sphere' needs radius=, the radius of the body's surface where it touches, m: its force "
+            "4/3 E sqrt(R) d^1.5 depends on it, and a mesh does not tell it"
+        )
+    o["offset"] = _number(what, "offset", o["offset"], "a finite number, m", low=-np.inf)
+    o["overlap_time"] = _number(what, "overlap_time", o["overlap_time"], "positive, s")
+    try:
+        check_points(surface, o["points"])
+    except ModelError as error:
+        raise ModelError(f"{what}: {error}") from None
+    o["points"] = None if o["points"] is None else int(o["points"])
+    o["smoothing"] = _smoothing(what, o["law"], o["smoothing"])
+    return o
+
+
+def _number(
+    what: str, name: str, value: Any, wanted: str, *, low: float | None = None, high: float = np.inf
+) -> float:  # fmt: skip
+    """A finite number from `low` (None: above 0) to `high`."""
+    if not is_number(value) or value > high or (value <= 0.0 if low is None else value < low):
+        raise ModelError(f"{what}: {name} = {value!r} must be {wanted}")
+    return float(value)
+
+
+def _smoothing(what: str, law: str, value: Any) -> float | tuple[float, float] | None:
+    """A depth with the paper's law, (eps, v_eps) with the smooth law, else None."""
+    if value is None:
+        return None
+    if law == "default":
+        raise ModelError(
+            f"{what}: smoothing = {value!r}: law = 'default' is smooth as it is; 'paper' and 'smooth' take it"
+        )
+    if law == "paper":
+        return _number(what, "smoothing", value, "a positive depth, m, over which the paper's damping is ramped in")
+    pair = tuple(value) if isinstance(value, (tuple, list, np.ndarray)) else ()
+    if len(pair) != 2 or not all(is_number(v) and v > 0.0 for v in pair):
+        raise ModelError(f"{what}: smoothing = {value!r} must be two positive numbers (eps in N, v_eps in m/s)")
+    return float(pair[0]), float(pair[1])

@@ -1,0 +1,121 @@
+"""Points at which contact with obstacles is integrated on the faces of a body, and what its law needs of the body."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..base.checks import is_count
+from ..base.errors import ModelError
+from ..elements import Rule
+from ..elements.quadrature import lobatto_square, triangle_3, triangle_7
+from . import assembly
+from .discretisation import Discretisation
+from .handles import SurfaceSet
+
+__all__ = ["ContactPoints", "body_mass_total", "check_points", "contact_points", "effective_modulus"]
+
+RULES: Mapping[int, Mapping[int, Rule]] = {
+    3: {3: triangle_3(), 7: triangle_7()},
+    4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
+}
+"""Rules with the corners of a face, by the number of its corners and of their points."""
+DEFAULT = {3: 7, 4: 16}
+"""Points of a face by the number of its corners."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPoints:
+    """Points of the faces of a surface.
+
+    Attributes:
+        conn: (F, L) body slots; faces that use fewer repeat their first one with functions of zero.
+        shape: (F, P, L) functions: the place of a point is sum_i shape_i e_i, plus the body's origin.
+        area: (F, P) reference area of each point, m^2; their sum is the area of the surface. Faces with fewer points
+            than others repeat their last one with area 0.
+        X: (F, P, 3) reference places, m.
+        normal: (F, P, 3) outward unit normals in the reference; 0 where a face has no tangent plane.
+        faces: (F, 2) rows (element, local face).
+    """
+
+    conn: np.ndarray
+    shape: np.ndarray
+    area: np.ndarray
+    X: np.ndarray
+    normal: np.ndarray
+    faces: np.ndarray
+
+
+def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:
+    """The points of a surface, corners included.
+
+    Triangles have 7 points (degree 3, area weights 1/20, 2/15, 9/20 of vertices, mid-sides and centre), quadrilaterals
+    Lobatto's 4 x 4 (degree 5 along each side).
+
+    Args:
+        surface: faces of a body of any family; beams with their section, shells with their thickness.
+        points: another number of points per face: 3 (the vertices, degree 1: on a T10 face they miss the mid-side
+            nodes) or 7 of triangles; 4, 9, 16 or 25 of quadrilaterals.
+
+    Raises:
+        ModelError: another number, or one that does not fit all faces of the surface.
+    """
+    check_points(surface, points)
+    body = surface.body
+    rules = {corners: known[DEFAULT[corners] if points is None else points] for corners, known in RULES.items()
+             if points is None or points in known}  # fmt: skip
+    t = assembly.facet_tables(surface, rules=rules)
+    X, area = assembly.facet_places(body, t)
+    x = body.reference[t.conn]
+    cross = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
+    length = np.linalg.norm(cross, axis=2, keepdims=True)
+    normal = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0)
+    return ContactPoints(t.conn, t.shape, area, X, normal, surface.faces)
+
+
+def check_points(surface: SurfaceSet, points: Any) -> None:
+    """Raise ModelError unless `points` is None or a number of points for which all faces have a rule."""
+    if points is None:
+        return
+    family = surface.body.family
+    for corners in sorted({len(family.faces[face]) for face in np.unique(surface.faces[:, 1])}):
+        known = RULES[corners]
+        if not is_count(points) or points not in known:
+            faces = {3: "triangles", 4: "quadrilaterals"}[corners]
+            numbers = ", ".join(map(str, known))
+            raise ModelError(
+                f"points = {points!r}: the faces of body {surface.body.name!r} ({family.name}) are {faces}, which have "
+                f"rules of {numbers} points; None takes {DEFAULT[corners]}"
+            )
+
+
+def effective_modulus(body: Discretisation, surface: SurfaceSet | None = None) -> tuple[float, float]:
+    """Young's modulus, Pa, and Poisson's ratio at small strain, whatever the law.
+
+    Of several materials at the faces of the surface (None: in the body) that with the largest Young's modulus counts:
+    the stiffness of a contact is one number.
+    """
+    elements = slice(None) if surface is None else surface.faces[:, 0]
+    pairs = []
+    for k in np.unique(body.material_of[elements]):
+        lam, mu = body.materials[int(k)][1].lame
+        pairs.append((mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))))
+    return max(pairs)
+
+
+def body_mass_total(body: Discretisation) -> float:
+    """Mass of a body, kg; 0 where a material has no density, so that only statics are possible."""
+    if any(material.density is None for _, material in body.materials):
+        return 0.0
+    total = 0.0
+    flat = assembly.straight(body)
+    for affine in (True, False):
+        rule = assembly.mass_rule(body, affine)
+        for part in assembly.chunks(body, np.flatnonzero(flat == affine), len(rule.weights)):
+            s, _, _, det = assembly.geometry(body, part, rule.points)
+            density = assembly.density_at(body, part, s, body.connectivity[part])
+            total += float(np.sum((density * det) @ rule.weights))
+    return total

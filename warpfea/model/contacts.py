@@ -1,0 +1,121 @@
+"""Contact with obstacles as a builder describes it: colliders, which move rigid shapes, and contacts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..laws import TimeLaw
+from .discretisation import Discretisation
+from .handles import SurfaceSet
+from .shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE, Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+
+__all__ = [
+    "BOX",
+    "CAPSULE",
+    "CYLINDER",
+    "HALF_SPACE",
+    "SPHERE",
+    "Box",
+    "Capsule",
+    "Collider",
+    "ColliderRotation",
+    "Contact",
+    "Cylinder",
+    "HalfSpace",
+    "Shape",
+    "Sphere",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class ColliderRotation:
+    """A checked wf.Rotation: a turn by angle(t) about an axis through an anchor.
+
+    Attributes:
+        anchor: (3,) m.
+        axis: (3,) of length 1.
+        angle: scalar law, rad.
+    """
+
+    anchor: np.ndarray
+    axis: np.ndarray
+    angle: TimeLaw
+
+
+@dataclass(eq=False)
+class Collider:
+    """A rigid obstacle; made by ModelBuilder.add_collider.
+
+    Attributes:
+        shape: the shape where it is at displacement 0.
+        name: unique among the colliders of its builder.
+        law: vector law of the displacement, m, or None.
+        rotation: of the shape, or None; not both.
+        index: number in its builder.
+    """
+
+    shape: Shape
+    name: str
+    law: TimeLaw | None = None
+    rotation: ColliderRotation | None = None
+    index: int = -1
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has a path; a constant displacement counts as one."""
+        return self.law is not None or self.rotation is not None
+
+    def __repr__(self) -> str:
+        return f"Collider({self.name!r}, {type(self.shape).__name__}{', moves' if self.moves else ''})"
+
+
+@dataclass(eq=False)
+class Contact:
+    """Contact of a surface with a collider; made by ModelBuilder.add_contact, which says what each value means.
+
+    Attributes:
+        surface: faces of the body.
+        collider: the obstacle.
+        mu, mu_static: coefficients of friction in slip and in stick, 0 <= mu <= mu_static.
+        restitution: in (0, 1].
+        law: "default", "paper" or "smooth".
+        treatment: "implicit", or "explicit" with the paper's law.
+        stiffness: factor on the normal and the tangential stiffness.
+        model: "patch" or "sphere".
+        radius: m, of the contact region ("patch") or of the body ("sphere"), or None.
+        offset: gap at which contact begins, m.
+        points: points of each face, or None for the default rules.
+        smoothing: None; with the paper's law a depth, m; with the smooth law (eps in N, v_eps in m/s).
+        overlap: "refuse" or "offset".
+        overlap_time: time in which a stored overlap decays, s.
+        name: unique among the contacts of its builder.
+        index: number in its builder.
+    """
+
+    surface: SurfaceSet
+    collider: Collider
+    name: str
+    mu: float = 0.0
+    mu_static: float = 0.0
+    restitution: float = 1.0
+    law: str = "default"
+    treatment: str = "implicit"
+    stiffness: float = 1.0
+    model: str = "patch"
+    radius: float | None = None
+    offset: float = 0.0
+    points: int | None = None
+    smoothing: float | tuple[float, float] | None = None
+    overlap: str = "refuse"
+    overlap_time: float = 0.1
+    index: int = -1
+
+    @property
+    def body(self) -> Discretisation:
+        """The body of the surface."""
+        return self.surface.body
+
+    def __repr__(self) -> str:
+        return f"Contact({self.name!r}, body {self.body.name!r} with collider {self.collider.name!r})"

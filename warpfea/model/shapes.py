@@ -1,0 +1,375 @@
+"""Rigid shapes that bodies touch: where they are, how large, and how they are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..base.checks import is_count, is_number
+from ..base.errors import ModelError
+
+__all__ = [
+    "BOX",
+    "CAPSULE",
+    "CYLINDER",
+    "HALF_SPACE",
+    "SPHERE",
+    "Box",
+    "Capsule",
+    "Cylinder",
+    "HalfSpace",
+    "Shape",
+    "Sphere",
+]
+
+HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER = range(5)
+"""Kinds of shapes, as kernels know them."""
+ORTHONORMAL = 1e-6
+"""How far from 0 and 1 the products of axes may be; they are made orthonormal to rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A rigid solid in the place where it is at displacement 0; base of the shapes.
+
+    Attributes:
+        kind: HALF_SPACE, SPHERE, BOX, CAPSULE or CYLINDER.
+    """
+
+    kind: ClassVar[int]
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centre (3,), m, and the local axes in the world, the columns of (3, 3), right-handed."""
+        raise NotImplementedError
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """(3,) m: half-space 0, 0, 0; sphere radius, 0, 0; box half of each edge; capsule and cylinder radius, half of
+        the axis, 0."""
+        raise NotImplementedError
+
+    @property
+    def radius_of_curvature(self) -> float:
+        """m: the radius of spheres, capsules and cylinders; infinite for half-spaces and boxes."""
+        raise NotImplementedError
+
+    def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
+        """The surface for drawing.
+
+        Args:
+            resolution: segments of a full circle, at least 3; boxes and half-spaces need none.
+
+        Returns:
+            points (n, 3), m, and triangles (m, 3), outward by the right hand, each edge shared by two.
+
+        Raises:
+            ModelError: a resolution that is no whole number or below 3.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpace(Shape):
+    """The half-space n.x <= offset; bodies are on the side that the normal points to.
+
+    Args:
+        normal: (3,), any length but zero; kept with length 1.
+        offset: m from the origin to the plane, along the normal of length 1.
+
+    Raises:
+        ModelError: a zero normal, or a value that is not finite.
+    """
+
+    normal: Any
+    offset: float = 0.0
+    kind: ClassVar[int] = HALF_SPACE
+
+    def __post_init__(self) -> None:
+        _set(self, normal=_direction(self, "normal"), offset=_number(self, "offset"))
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """A point of the plane, the one closest to the origin, and axes whose third is the normal."""
+        return self.offset * self.normal, _axes_along(self.normal)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        return np.zeros(3)
+
+    @property
+    def radius_of_curvature(self) -> float:
+        return np.inf
+
+    def mesh(
+        self, resolution: int = 24, *, size: float = 2.0, around: Any = (0.0, 0.0, 0.0)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A square of the plane, with sides `size`, m, about the point of the plane closest to `around` (3,), m."""
+        _, axes = self.frame()
+        place = np.asarray(around, dtype=float)
+        middle = place + (self.offset - place @ self.normal) * self.normal
+        corners = 0.5 * size * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+        return middle + corners @ axes[:, :2].T, np.array([(0, 1, 2), (0, 2, 3)])
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere(Shape):
+    """A ball.
+
+    Args:
+        center: (3,) m.
+        radius: m.
+
+    Raises:
+        ModelError: a radius that is not positive, or a value that is not finite.
+    """
+
+    center: Any
+    radius: float
+    kind: ClassVar[int] = SPHERE
+
+    def __post_init__(self) -> None:
+        _set(self, center=_vector(self, "center"), radius=_positive(self, "radius"))
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """The centre, and the axes of the world."""
+        return self.center.copy(), np.eye(3)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        return np.array([self.radius, 0.0, 0.0])
+
+    @property
+    def radius_of_curvature(self) -> float:
+        return self.radius
+
+    def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
+        """See Shape."""
+        n = _segments(self, resolution)
+        return _revolved(self, _arc(-np.pi / 2, np.pi / 2, max(2, n // 2)) * self.radius, n)
+
+
+@dataclass(frozen=True, eq=False)
+class Box(Shape):
+    """A box.
+
+    Args:
+        center: (3,) m.
+        size: (3,) lengths of its edges, m.
+        axes: (3, 3) rows: the directions of the edges, orthonormal and right-handed; by default those of the world.
+
+    Raises:
+        ModelError: a size that is not positive, axes that are not orthonormal or left-handed, or a value that is not
+            finite.
+    """
+
+    center: Any
+    size: Any
+    axes: Any = None
+    kind: ClassVar[int] = BOX
+
+    def __post_init__(self) -> None:
+        _set(self, center=_vector(self, "center"), size=_vector(self, "size"))
+        if not np.all(self.size > 0.0):
+            raise ModelError(f"Box: size = {self.size.tolist()} must be three positive lengths of edges, m")
+        _set(self, axes=_rows(self, "axes"))
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """The centre, and the directions of the edges as columns."""
+        return self.center.copy(), self.axes.T.copy()
+
+    @property
+    def sizes(self) -> np.ndarray:
+        return 0.5 * self.size
+
+    @property
+    def radius_of_curvature(self) -> float:
+        return np.inf
+
+    def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
+        """See Shape."""
+        signs = np.array([(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=float)
+        quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+        triangles = np.array([(q[0], q[i], q[i + 1]) for q in quads for i in (1, 2)])
+        return self.center + (signs * self.sizes) @ self.axes, triangles
+
+
+@dataclass(frozen=True, eq=False)
+class _Round(Shape):
+    """What capsules and cylinders share: an axis from start to end, and a radius."""
+
+    start: Any
+    end: Any
+    radius: float
+
+    def __post_init__(self) -> None:
+        _set(self, start=_vector(self, "start"), end=_vector(self, "end"), radius=_positive(self, "radius"))
+        if not np.linalg.norm(self.end - self.start) > 0.0:
+            raise ModelError(
+                f"{_name(self)}: end = {self.end.tolist()} is the start; the two ends of the axis must be apart"
+            )
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """The middle of the axis, and axes whose third points from start to end."""
+        along = self.end - self.start
+        return 0.5 * (self.start + self.end), _axes_along(along / np.linalg.norm(along))
+
+    @property
+    def sizes(self) -> np.ndarray:
+        return np.array([self.radius, 0.5 * float(np.linalg.norm(self.end - self.start)), 0.0])
+
+    @property
+    def radius_of_curvature(self) -> float:
+        return self.radius
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule(_Round):
+    """A cylinder with half a ball at each end: all within `radius` of the line from start to end.
+
+    Args:
+        start, end: (3,) m, the centres of the two balls.
+        radius: m.
+
+    Raises:
+        ModelError: start and end are one point, a radius that is not positive, or a value that is not finite.
+    """
+
+    kind: ClassVar[int] = CAPSULE
+
+    def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
+        """See Shape."""
+        n = _segments(self, resolution)
+        radius, half, _ = self.sizes
+        quarter = max(1, n // 4)
+        low, high = (radius * _arc(*span, quarter) for span in ((-np.pi / 2, 0.0), (0.0, np.pi / 2)))
+        return _revolved(self, np.concatenate([low - (0.0, half), high + (0.0, half)]), n)
+
+
+@dataclass(frozen=True, eq=False)
+class Cylinder(_Round):
+    """A cylinder with flat ends.
+
+    Args:
+        start, end: (3,) m, the centres of the two ends.
+        radius: m.
+
+    Raises:
+        ModelError: start and end are one point, a radius that is not positive, or a value that is not finite.
+    """
+
+    kind: ClassVar[int] = CYLINDER
+
+    def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
+        """See Shape."""
+        radius, half, _ = self.sizes
+        profile = np.array([(0.0, -half), (radius, -half), (radius, half), (0.0, half)])
+        return _revolved(self, profile, _segments(self, resolution))
+
+
+# checks; each returns the value as it is kept
+
+
+def _name(shape: Shape) -> str:
+    return type(shape).__name__
+
+
+def _set(shape: Shape, **values: Any) -> None:
+    """Set checked values of a frozen shape; arrays can't be written to."""
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+        object.__setattr__(shape, name, value)
+
+
+def _array(shape: Shape, name: str, size: tuple[int, ...], wanted: str) -> np.ndarray:
+    value = getattr(shape, name)
+    try:
+        out = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{_name(shape)}: {name} = {value!r} must be {wanted}") from error
+    if out.shape != size or not np.all(np.isfinite(out)):
+        raise ModelError(f"{_name(shape)}: {name} = {value!r} must be {wanted}")
+    return out
+
+
+def _vector(shape: Shape, name: str) -> np.ndarray:
+    return _array(shape, name, (3,), "three finite numbers, m")
+
+
+def _direction(shape: Shape, name: str) -> np.ndarray:
+    out = _array(shape, name, (3,), "three finite numbers that are not all zero")
+    length = np.linalg.norm(out)
+    if not length > 0.0:
+        raise ModelError(f"{_name(shape)}: {name} = {out.tolist()} is zero; it must point out of the solid")
+    return out / length
+
+
+def _rows(shape: Shape, name: str) -> np.ndarray:
+    if getattr(shape, name) is None:
+        return np.eye(3)
+    wanted = "(3, 3) rows that are orthonormal and right-handed, the directions of the edges"
+    out = _array(shape, name, (3, 3), wanted)
+    if np.abs(out @ out.T - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(out) < 0.0:
+        raise ModelError(f"{_name(shape)}: {name} = {out.tolist()} must be {wanted}")
+    u, _, v = np.linalg.svd(out)
+    return u @ v
+
+
+def _number(shape: Shape, name: str) -> float:
+    value = getattr(shape, name)
+    if not is_number(value):
+        raise ModelError(f"{_name(shape)}: {name} = {value!r} must be a finite number, m")
+    return float(value)
+
+
+def _positive(shape: Shape, name: str) -> float:
+    value = getattr(shape, name)
+    if not is_number(value) or value <= 0.0:
+        raise ModelError(f"{_name(shape)}: {name} = {value!r} must be a positive finite number, m")
+    return float(value)
+
+
+def _segments(shape: Shape, resolution: Any) -> int:
+    if not is_count(resolution) or resolution < 3:
+        raise ModelError(f"{_name(shape)}: resolution = {resolution!r} must be a whole number of at least 3")
+    return int(resolution)
+
+
+# geometry
+
+
+def _axes_along(n: np.ndarray) -> np.ndarray:
+    """Right-handed orthonormal axes (columns) whose third is n (3,)."""
+    least = np.eye(3)[int(np.argmin(np.abs(n)))]
+    first = np.cross(least, n)
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(n, first), n])
+
+
+def _arc(start: float, end: float, parts: int) -> np.ndarray:
+    """(parts + 1, 2) distance from the axis, and height, on a circle of radius 1, from low to high."""
+    angle = np.linspace(start, end, parts + 1)
+    distance = np.cos(angle)
+    distance[np.abs(distance) < 1e-15] = 0.0
+    return np.column_stack([distance, np.sin(angle)])
+
+
+def _revolved(shape: Shape, profile: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """A profile (k, 2) of distances from the local z axis and heights, turned about it; its ends lie on the axis."""
+    center, axes = shape.frame()
+    turn = 2.0 * np.pi * np.arange(n) / n
+    circle = np.column_stack([np.cos(turn), np.sin(turn)])
+    rings = [np.column_stack([r * circle, np.full(n, z)]) for r, z in profile[1:-1]]
+    poles = [np.array([[0.0, 0.0, z]]) for z in profile[[0, -1], 1]]
+    points = np.concatenate([*rings, *poles])
+    a = np.arange(n)
+    b = (a + 1) % n
+    low, high = len(points) - 2, len(points) - 1
+    top = (len(rings) - 1) * n
+    triangles = [np.column_stack([np.full(n, low), b, a]), np.column_stack([np.full(n, high), top + a, top + b])]
+    for k in range(len(rings) - 1):
+        first, second = k * n, (k + 1) * n
+        triangles.append(np.column_stack([first + a, first + b, second + b]))
+        triangles.append(np.column_stack([first + a, second + b, second + a]))
+    return center + points @ axes.T, np.concatenate(triangles)
