@@ -286,10 +286,11 @@ def _array(shape: Shape, name: str, size: tuple[int, ...], wanted: str) -> np.nd
     value = getattr(shape, name)
     try:
         out = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"{_name(shape)}: {name} = {value!r} must be {wanted}") from error
+    except (TypeError, ValueError):
+        out = np.full(1, np.nan)
     if out.shape != size or not np.all(np.isfinite(out)):
-        raise ModelError(f"{_name(shape)}: {name} = {value!r} must be {wanted}")
+        shown = value.tolist() if isinstance(value, np.ndarray) else value
+        raise ModelError(f"{_name(shape)}: {name} = {shown!r} must be {wanted}")
     return out
 
 
