@@ -18,6 +18,7 @@ from ..model.state import MEMORY
 from .body_forces import BodyForces
 from .checks import check_columns, check_made, check_names, check_rows, check_stored, check_tables, derived_traits
 from .constraints import Constraints
+from .contact import Contact
 from .damping import Damping
 from .dead_loads import DeadLoads
 from .elements import Elements
@@ -32,17 +33,15 @@ if TYPE_CHECKING:
 
 __all__ = ["KINDS", "TermSet", "all_parts"]
 
-KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Constraints)
+KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Constraints)
 """The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
-LATER = ("contact", "friction", "per-world parameters")
+LATER = ("per-world parameters",)
 """Features of later versions, which `info` lists as left out."""
 STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end")  # fmt: skip
 """Arrays of the state that are no term's."""
 FIELDS = ("von_mises", "displacement")
 """Fields of every model, see simulation.results."""
-ZERO = ("contact", "contact_loss", "friction", "collider_work")
-"""Columns of energies() of later versions."""
 
 
 def all_parts() -> dict[str, str]:
@@ -262,7 +261,7 @@ class TermSet:
         """Columns of the ledger (worlds, columns) by name; of kinds of terms that are not there zeros."""
         out = {name: ledger[:, k].copy() for k, name in enumerate(self.ledger)}
         known = [column.name for kind in KINDS for column in kind.columns if column.name]
-        for name in (*known, *ZERO):
+        for name in known:
             out.setdefault(name, np.zeros(len(ledger)))
         out["work"] = np.sum([values for name, values in out.items() if name.startswith("work_")], axis=0)
         return out

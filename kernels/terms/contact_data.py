@@ -1,0 +1,120 @@
+"""What kernels of contact read and write: contacts and colliders, facets with their points, the present step."""
+
+import functools
+
+import warp as wp
+
+from ..common.types import precision
+
+__all__ = ["RECORD", "attempt_struct", "contact_struct", "facet_struct", "history_struct"]
+
+RECORD = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "normal_force", "slip", "area",
+          "stick", "stored", "loss", "friction", "collider_work", "penetration")  # fmt: skip
+"""What is summed per contact over its points; of the last the largest. Slip and stick are weighted by area."""
+
+
+@functools.cache
+def contact_struct():
+    """Contacts [contact] and colliders [collider]."""
+
+    @wp.struct
+    class Contacts:
+        collider: wp.array(dtype=wp.int32)
+        law: wp.array(dtype=wp.int32)
+        lumped: wp.array(dtype=wp.int32)  # one contact at the deepest point
+        dead: wp.array(dtype=wp.int32)  # the force of the last state
+        first: wp.array(dtype=wp.int32)  # [contact + 1] its first point
+        normal: wp.array(dtype=wp.float64)  # k_n; of lumped contacts over sqrt(delta)
+        tangent: wp.array(dtype=wp.float64)  # k_t, likewise
+        normal_damping: wp.array(dtype=wp.float64)  # gamma_n over -beta; of lumped contacts over delta^(1/4)
+        mass: wp.array(dtype=wp.float64)  # m_eff, kg
+        ramp: wp.array(dtype=wp.float64)  # m
+        force_eps: wp.array(dtype=wp.float64)  # N
+        speed_eps: wp.array(dtype=wp.float64)  # m/s
+        offset: wp.array(dtype=wp.float64)  # m
+        decay: wp.array(dtype=wp.float64)  # s, over which a stored overlap vanishes
+        mu: wp.array2d(dtype=wp.float64)  # [world, contact]
+        mu_static: wp.array2d(dtype=wp.float64)
+        damping: wp.array2d(dtype=wp.float64)  # d of the default law
+        beta: wp.array2d(dtype=wp.float64)  # -beta of Eq. (75)
+        scale: wp.array2d(dtype=wp.float64)  # on k_n and k_t
+        grow: wp.array2d(dtype=wp.float64)  # [world, collider] m, by which its surface lies further out
+        kind: wp.array(dtype=wp.int32)  # [collider]
+        size: wp.array(dtype=wp.vec3d)
+        center: wp.array(dtype=wp.vec3d)
+        axes: wp.array(dtype=wp.mat33d)  # columns
+        path: wp.array(dtype=wp.int32)  # time law of its displacement, -1: none
+        spin: wp.array(dtype=wp.int32)  # of its angle
+        anchor: wp.array(dtype=wp.vec3d)
+        axis: wp.array(dtype=wp.vec3d)
+
+    return Contacts
+
+
+@functools.cache
+def facet_struct(dtype: str):
+    """Facets with as many slots and points each."""
+    T = precision(dtype).T
+
+    @wp.struct
+    class Facets:
+        conn: wp.array2d(dtype=wp.int32)  # [local, facet] slot
+        shape: wp.array3d(dtype=T)  # [point, local, facet]
+        X: wp.array2d(dtype=wp.vec3d)  # [point, facet] reference place
+        share: wp.array2d(dtype=wp.float64)  # [point, facet] area over that of the region; 0: no contact
+        area: wp.array2d(dtype=wp.float64)  # m^2
+        contact: wp.array(dtype=wp.int32)  # [facet]
+        pool: wp.int32  # first entry in the pool
+        row: wp.int32  # first row of the potential
+        point: wp.int32  # first point: [facet, point] are numbered in this order
+        count: wp.int32
+        points: wp.int32  # of a facet
+
+    return Facets
+
+
+@functools.cache
+def history_struct():
+    """What the state keeps: [world, point], of a lumped contact at its first point; [world, collider] of colliders."""
+
+    @wp.struct
+    class History:
+        spring: wp.array2d(dtype=wp.vec3d)  # stretch of the friction spring, in the collider's frame (paper: world), m
+        speed: wp.array2d(dtype=wp.float64)  # largest approach speed since birth, m/s; 0: not in contact
+        mark: wp.array2d(dtype=wp.int32)  # side of the shape + 1, and 16 where it slips
+        overlap: wp.array2d(dtype=wp.float64)  # stored at the start, m
+        stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's share
+        born: wp.array(dtype=wp.float64)  # [world] time that overlaps were stored at
+        place: wp.array2d(dtype=wp.vec3d)  # of colliders
+        turn: wp.array2d(dtype=wp.mat33d)
+
+    return History
+
+
+@functools.cache
+def attempt_struct(dtype: str):
+    """What an attempt at a step makes."""
+    sym = precision(dtype).sym
+
+    @wp.struct
+    class Attempt:
+        place: wp.array2d(dtype=wp.vec3d)  # [world, collider] at the end of the step
+        turn: wp.array2d(dtype=wp.mat33d)
+        start: wp.array2d(dtype=wp.vec3d)  # [world, point] where it was as the step began, in the collider's frame
+        depth: wp.array2d(dtype=wp.float64)  # then
+        speed: wp.array2d(dtype=wp.float64)  # that the damping takes
+        held: wp.array2d(dtype=wp.vec3d)  # cap, k_t, shrinkage of the spring that a line search holds
+        next: wp.array2d(dtype=wp.vec3d)  # those of the iterate
+        stiffness: wp.array2d(dtype=sym)  # [world, point] of the point's force
+        touched: wp.array2d(dtype=wp.int32)  # [world, facet row]
+        dead: wp.array2d(dtype=wp.vec3d)  # [world, point] explicit force
+        dead_spring: wp.array2d(dtype=wp.vec3d)
+        level: wp.array2d(dtype=wp.float64)  # [world, point] depth; with lumped contacts
+        pick: wp.array2d(dtype=wp.int32)  # [world, contact] deepest point
+        through: wp.array(dtype=wp.int32)  # [world] a point that went through a shape, + 1
+        deepest: wp.array2d(dtype=wp.float64)  # [world, contact] in this attempt's last evaluation
+        rows: wp.array3d(dtype=wp.float64)  # [RECORD, world, facet row]
+        total: wp.array3d(dtype=wp.float64)  # [world, contact, RECORD] of the step so far
+        elapsed: wp.array(dtype=wp.float64)  # [world] s of the step so far
+
+    return Attempt

@@ -1,0 +1,142 @@
+"""Contact laws of one point as derivatives of scalars: normal force of the depth, friction of the anchored slip.
+
+delta is the depth, m; delta_n that at the start of the step; all in float64. Of a lumped contact ("sphere") the elastic
+force is k delta^1.5, else k delta.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+__all__ = ["DEFAULT", "PAPER", "SMOOTH", "law_functions"]
+
+DEFAULT, PAPER, SMOOTH = range(3)
+
+
+@functools.cache
+def law_functions() -> _types.SimpleNamespace:
+    """Device functions `normal_law`, `elastic`, `friction` and `smooth_friction`."""
+    f64 = wp.float64
+    vec3d = wp.vec3d
+
+    @wp.func
+    def elastic(lumped: int, k: f64, delta: f64) -> wp.vec2d:
+        """Elastic force, N, and the energy stored, J."""
+        if delta <= f64(0.0):
+            return wp.vec2d()
+        if lumped != 0:
+            force = k * delta * wp.sqrt(delta)
+            return wp.vec2d(force, f64(0.4) * force * delta)
+        return wp.vec2d(k * delta, f64(0.5) * k * delta * delta)
+
+    @wp.func
+    def hunt_crossley(lumped: int, k: f64, rate: f64, delta: f64, delta_n: f64) -> vec3d:
+        """F = F_el (1 + rate (delta - delta_n)), not below 0 (Hunt and Crossley 1975), its derivative, its integral.
+
+        rate = chi / h, 1/m. F grows with delta wherever it is not 0, so its integral is convex.
+        """
+        if delta <= f64(0.0):
+            return vec3d()
+        factor = f64(1.0) + rate * (delta - delta_n)
+        if factor <= f64(0.0):
+            return vec3d()
+        m = wp.where(lumped != 0, f64(1.5), f64(1.0))
+        c0 = f64(1.0) - rate * delta_n
+        power = elastic(lumped, k, delta)[0]
+        force = power * factor
+        slope = m * force / delta + power * rate
+        psi = power * delta * (c0 / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
+        if c0 < f64(0.0):  # the force begins at delta_a > 0
+            begin = -c0 / rate
+            low = elastic(lumped, k, begin)[0] * begin
+            psi -= low * (c0 / (m + f64(1.0)) + rate * begin / (m + f64(2.0)))
+        return vec3d(force, slope, psi)
+
+    @wp.func
+    def damped(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
+        """k_n delta - gamma_n v_n of Eq. (77), not cut, its derivative where both parts count, and its integral.
+
+        g = gamma_n / h (of spheres gamma_n is g h delta^(1/4)); the damping grows linearly over the depth `ramp`.
+        """
+        spring = elastic(lumped, k, delta)
+        if lumped != 0:
+            root = wp.sqrt(wp.sqrt(delta))
+            force = spring[0] + g * root * (delta - delta_n)
+            slope = f64(1.5) * spring[0] / wp.max(delta, f64(1.0e-300)) + g * root
+            psi = spring[1] + g * root * delta * (delta / f64(2.25) - delta_n / f64(1.25))
+            return vec3d(force, slope, psi)
+        if delta < ramp:
+            part = delta / ramp
+            force = spring[0] + g * part * (delta - delta_n)
+            psi = spring[1] + g * part * delta * (delta / f64(3.0) - f64(0.5) * delta_n)
+            return vec3d(force, k + g * part, psi)
+        psi = spring[1] + g * (f64(0.5) * delta * delta - delta_n * delta)
+        # what the ramp leaves out below its depth
+        psi += g * ramp * (f64(0.5) * delta_n - ramp / f64(6.0))
+        return vec3d(spring[0] + g * (delta - delta_n), k + g, psi)
+
+    @wp.func
+    def paper_law(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
+        """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative and integral."""
+        if delta <= f64(0.0):
+            return vec3d()
+        out = damped(lumped, k, g, ramp, delta, delta_n)
+        if out[0] <= f64(0.0):
+            return vec3d()
+        if delta_n > f64(0.0) and g > f64(0.0):
+            low = f64(0.0)  # where the force begins: it is negative below, and positive at delta_n
+            high = wp.min(delta, delta_n)
+            for _ in range(60):
+                middle = f64(0.5) * (low + high)
+                if damped(lumped, k, g, ramp, middle, delta_n)[0] > f64(0.0):
+                    high = middle
+                else:
+                    low = middle
+            out[2] = out[2] - damped(lumped, k, g, ramp, low, delta_n)[2]
+        return out
+
+    @wp.func
+    def smooth_law(k: f64, g: f64, eps: f64, delta: f64, delta_n: f64) -> vec3d:
+        """(y + sqrt(y^2 + eps^2)) / 2 in place of max(0, y) (Paper I, 6.2), y = k delta - gamma v, at any gap."""
+        y = k * delta + g * (delta - delta_n)
+        root = wp.sqrt(y * y + eps * eps)
+        total = y + root
+        if y < f64(0.0):
+            total = eps * eps / (root - y)
+        bend = k + g
+        logarithm = wp.log((wp.abs(y) + root) / eps) * wp.sign(y)
+        psi = f64(0.25) * (y * total + eps * eps * logarithm) / bend
+        return vec3d(f64(0.5) * total, f64(0.5) * total / root * bend, psi)
+
+    @wp.func
+    def normal_law(
+        law: int, lumped: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
+    ) -> vec3d:  # fmt: skip
+        """Normal force, N, its derivative by the depth, N/m, and its integral, J; g = chi/h or gamma_n/h."""
+        if law == DEFAULT:
+            return hunt_crossley(lumped, k, g, delta, delta_n)
+        if law == PAPER:
+            return paper_law(lumped, k, g, ramp, delta, delta_n)
+        return smooth_law(k, g, eps, delta, delta_n)
+
+    @wp.func
+    def friction(trial: vec3d, stiffness: f64, cap: f64) -> wp.vec2d:
+        """Huber's potential, J, of a trial force = stiffness x slip that is cut at `cap`, and the part of it that acts."""
+        size = wp.length(trial)
+        if size <= cap:
+            return wp.vec2d(f64(0.5) * size * size / stiffness, f64(1.0))
+        return wp.vec2d((cap * size - f64(0.5) * cap * cap) / stiffness, cap / size)
+
+    @wp.func
+    def smooth_friction(slip: vec3d, inv_h: f64, v_eps: f64, cap: f64) -> wp.vec2d:
+        """cap v / sqrt(v^2 + v_eps^2) (Paper I, 6.2), v = slip/h: its potential, J, and force over slip, N/m."""
+        v = inv_h * slip
+        root = wp.sqrt(wp.dot(v, v) + v_eps * v_eps)
+        if inv_h == f64(0.0):
+            return wp.vec2d()
+        return wp.vec2d(cap * wp.dot(v, v) / (root + v_eps) / inv_h, cap * inv_h / root)
+
+    return _types.SimpleNamespace(
+        elastic=elastic, normal_law=normal_law, friction=friction, smooth_friction=smooth_friction
+    )

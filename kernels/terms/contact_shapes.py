@@ -1,0 +1,223 @@
+"""Rigid analytic shapes: signed distance and outward normal, and whether a motion passes through them.
+
+All in float64 and in the shape's own frame: half-space z <= 0, sphere about the origin, box along the axes, capsule and
+cylinder along z. `size` holds what `warpfea.model.contacts` says: radius; half edges; radius and half length.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+__all__ = ["BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "SPHERE", "shape_functions"]
+
+HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER = range(5)
+LATERAL = 6
+"""Sides: 0 to 5 are the faces -x, +x, -y, +y, -z, +z (ends of a cylinder: 4, 5), 6 the round side of a cylinder."""
+THROUGH = 0.5
+"""A motion that enters deeper than this part of a shape's radius or thickness and comes out again passes through it."""
+
+
+@functools.cache
+def shape_functions() -> _types.SimpleNamespace:
+    """Device functions `distance` and `sweep`."""
+    f64 = wp.float64
+    vec3d = wp.vec3d
+
+    @wp.func
+    def unit(v: vec3d) -> vec3d:
+        """v over its length; z where it has none."""
+        size = wp.length(v)
+        if size > f64(0.0):
+            return v / size
+        return vec3d(f64(0.0), f64(0.0), f64(1.0))
+
+    @wp.func
+    def face_normal(side: int) -> vec3d:
+        """Outward normal of a flat side."""
+        n = vec3d()
+        n[side / 2] = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
+        return n
+
+    @wp.func
+    def half_size(kind: int, size: vec3d, axis: int) -> f64:
+        """Half the thickness along an axis, of a box or a cylinder."""
+        if kind == CYLINDER:
+            return wp.where(axis == 2, size[1], size[0])
+        return size[axis]
+
+    @wp.func
+    def depth_below(kind: int, size: vec3d, y: vec3d, side: int) -> f64:
+        """Signed depth of a place under a side of a box or a cylinder."""
+        if side == LATERAL:
+            return size[0] - wp.sqrt(y[0] * y[0] + y[1] * y[1])
+        axis = side / 2
+        sign = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
+        return half_size(kind, size, axis) - sign * y[axis]
+
+    @wp.func
+    def axis_place(size: vec3d, y: vec3d) -> vec3d:
+        """The place on a capsule's axis that is nearest to y."""
+        return vec3d(f64(0.0), f64(0.0), wp.clamp(y[2], -size[1], size[1]))
+
+    @wp.func
+    def nearest_side(kind: int, size: vec3d, y: vec3d) -> int:
+        """The side that a place inside a box or a cylinder is closest to."""
+        best = wp.int32(5)
+        least = depth_below(kind, size, y, 5)
+        first = wp.where(kind == CYLINDER, 4, 0)
+        for side in range(first, 5):
+            d = depth_below(kind, size, y, side)
+            if d < least:
+                least = d
+                best = side
+        if kind == CYLINDER:
+            if depth_below(kind, size, y, LATERAL) < least:
+                best = wp.int32(LATERAL)
+        return best
+
+    @wp.func
+    def distance(kind: int, size: vec3d, y: vec3d, side: int) -> wp.vec4d:
+        """Outward unit normal and signed distance; inside a shape with sides from `side`, or from the nearest if -1."""
+        n = vec3d(f64(0.0), f64(0.0), f64(1.0))
+        gap = y[2]
+        if kind == SPHERE:
+            n = unit(y)
+            gap = wp.length(y) - size[0]
+        elif kind == CAPSULE:
+            arm = y - axis_place(size, y)
+            n = unit(arm)
+            gap = wp.length(arm) - size[0]
+        elif kind == BOX or kind == CYLINDER:
+            rho = wp.sqrt(y[0] * y[0] + y[1] * y[1])
+            out = vec3d()
+            for k in range(3):
+                out[k] = wp.max(wp.abs(y[k]) - half_size(kind, size, k), f64(0.0)) * wp.sign(y[k])
+            if kind == CYLINDER:
+                over = wp.max(rho - size[0], f64(0.0)) / wp.max(rho, f64(1.0e-300))
+                out[0] = over * y[0]
+                out[1] = over * y[1]
+            gap = wp.length(out)
+            if gap > f64(0.0):
+                n = out / gap
+            else:
+                face = side
+                if face < 0:
+                    face = nearest_side(kind, size, y)
+                gap = -depth_below(kind, size, y, face)
+                if face == LATERAL:
+                    n = unit(vec3d(y[0], y[1], f64(0.0)))
+                else:
+                    n = face_normal(face)
+        return wp.vec4d(n[0], n[1], n[2], gap)
+
+    @wp.func
+    def enters(kind: int, size: vec3d, a: vec3d, d: vec3d) -> vec3d:
+        """Where a + t d is within a box or a cylinder: t of entry and of leaving, and 16 x side of entry + side of
+        leaving; without entry the first is the larger."""
+        t_in = f64(-1.0e300)
+        t_out = f64(1.0e300)
+        side_in = wp.int32(0)
+        side_out = wp.int32(0)
+        first = wp.where(kind == CYLINDER, 2, 0)
+        for axis in range(first, 3):
+            h = half_size(kind, size, axis)
+            low = 2 * axis
+            if d[axis] == f64(0.0):
+                if wp.abs(a[axis]) > h:
+                    t_in = f64(1.0e300)
+            else:
+                t0 = (-h - a[axis]) / d[axis]
+                t1 = (h - a[axis]) / d[axis]
+                near = low
+                far = low + 1
+                if t0 > t1:
+                    swap = t0
+                    t0 = t1
+                    t1 = swap
+                    near = low + 1
+                    far = low
+                if t0 > t_in:
+                    t_in = t0
+                    side_in = near
+                if t1 < t_out:
+                    t_out = t1
+                    side_out = far
+        if kind == CYLINDER:
+            aa = d[0] * d[0] + d[1] * d[1]
+            bb = a[0] * d[0] + a[1] * d[1]
+            cc = a[0] * a[0] + a[1] * a[1] - size[0] * size[0]
+            root = bb * bb - aa * cc
+            if aa == f64(0.0) or root < f64(0.0):
+                if cc > f64(0.0):
+                    t_in = f64(1.0e300)
+            else:
+                t0 = (-bb - wp.sqrt(root)) / aa
+                t1 = (-bb + wp.sqrt(root)) / aa
+                if t0 > t_in:
+                    t_in = t0
+                    side_in = wp.int32(LATERAL)
+                if t1 < t_out:
+                    t_out = t1
+                    side_out = wp.int32(LATERAL)
+        return vec3d(t_in, t_out, f64(16 * side_in + side_out))
+
+    @wp.func
+    def closest_on_chord(kind: int, size: vec3d, a: vec3d, d: vec3d) -> f64:
+        """Smallest distance of a + t d, 0 <= t <= 1, from a sphere's centre or a capsule's axis."""
+        aa = wp.dot(d, d)
+        if aa == f64(0.0):
+            return distance(kind, size, a, -1)[3] + size[0]
+        half = wp.where(kind == CAPSULE, size[1], f64(0.0))
+        t = wp.clamp(-wp.dot(a, d) / aa, f64(0.0), f64(1.0))
+        for _ in range(8):  # alternately the nearest place on either segment: convex, and exact for a sphere
+            z = wp.clamp(a[2] + t * d[2], -half, half)
+            t = wp.clamp((z * d[2] - wp.dot(a, d)) / aa, f64(0.0), f64(1.0))
+        p = a + t * d
+        return wp.length(p - vec3d(f64(0.0), f64(0.0), wp.clamp(p[2], -half, half)))
+
+    @wp.func
+    def sweep(kind: int, size: vec3d, start: vec3d, end: vec3d, side: int) -> int:
+        """Side through which a motion from `start` to `end` is inside at its end, -1: any; -2: it went through.
+
+        `side`: that at the start, -1 where it was outside.
+        """
+        if kind == HALF_SPACE:
+            return -1
+        d = end - start
+        if kind == SPHERE or kind == CAPSULE:
+            near = closest_on_chord(kind, size, start, d)
+            if near < f64(THROUGH) * size[0]:
+                before = distance(kind, size, start, -1)
+                after = distance(kind, size, end, -1)
+                turned = before[0] * after[0] + before[1] * after[1] + before[2] * after[2]
+                if turned < f64(0.0) or (after[3] > f64(0.0) and before[3] > f64(0.0)):
+                    return -2
+            return -1
+        cross = enters(kind, size, start, d)
+        code = int(cross[2])
+        entry = code / 16
+        leave = code % 16
+        inside = cross[0] <= f64(0.0) and cross[1] >= f64(0.0)  # at the start
+        if inside:
+            entry = side
+            if side < 0:
+                entry = nearest_side(kind, size, start)
+        elif cross[0] >= cross[1] or cross[0] > f64(1.0) or cross[1] < f64(0.0):
+            return -1
+        if cross[1] >= f64(1.0):
+            return entry
+        if leave == entry:
+            if leave == LATERAL:
+                near = closest_on_chord(SPHERE, vec3d(size[0], f64(0.0), f64(0.0)), vec3d(start[0], start[1], f64(0.0)),
+                                        vec3d(d[0], d[1], f64(0.0)))  # fmt: skip
+                if near < f64(THROUGH) * size[0]:
+                    return -2
+            return -1
+        # it left by another side: off an edge, or through
+        limit = f64(2.0) * f64(THROUGH) * half_size(kind, size, wp.where(entry == LATERAL, 0, entry / 2))
+        if depth_below(kind, size, start + cross[1] * d, entry) > limit:
+            return -2
+        return -1
+
+    return _types.SimpleNamespace(distance=distance, sweep=sweep, unit=unit)

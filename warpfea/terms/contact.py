@@ -1,0 +1,351 @@
+"""Contact with rigid obstacles: a term whose potential is that of its points, see kernels/terms/contact.py."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..base.launch import Launcher
+from ..kernels.terms.contact import contact_kernels
+from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
+from ..kernels.terms.contact_data import RECORD, attempt_struct, history_struct
+from ..model.state import State
+from .contact_tables import ContactTables
+from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
+from .time_laws import TimeLaws
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from .workspace import Workspace
+
+__all__ = ["Contact"]
+
+TOUCHING = 1e-9
+"""Depth at the start, over the model's size, that counts as touch."""
+PARAMETERS = ("mu", "mu_static", "restitution", "stiffness")
+
+
+class Contact(Term):
+    """All contacts of a model with its colliders.
+
+    Attributes:
+        tables: contacts, colliders and facets on the device.
+    """
+
+    name = "contact"
+    columns = (
+        Column("contact", STORED),
+        Column("contact_loss", LOSS),
+        Column("friction", LOSS),
+        Column("collider_work", WORK),
+        Column("", NUMERICAL),
+    )
+    fields = {
+        "contact_pressure": FieldSpec("contact pressure", "Pa"),
+        "gap": FieldSpec("gap to the nearest obstacle in contact", "m"),
+    }
+    parts = {"contact": "contact with obstacles: forces, products, history"}
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.tables = ContactTables(model)
+        self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        self.report_columns = len(RECORD) * len(self.tables.contacts)
+
+    @classmethod
+    def of(cls, model: Model) -> Contact | None:
+        return cls(model) if model.description.contacts else None
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        contacts = model.description.contacts
+        return {"contact": bool(contacts), "friction": any(c.mu_static > 0.0 for c in contacts)}
+
+    def build(self, laws: TimeLaws) -> None:
+        self.tables.build(laws, self.offset)
+        self.connectivity = [group.conn for group in self.tables.groups]
+        self.rows = self.booked_rows = self.tables.rows
+
+    def hash(self, h: Any) -> None:
+        self.tables.hash(h)
+
+    # for one simulation
+
+    def allocate(self, work: Workspace, at: At) -> None:
+        t, B = self.tables, self.model.worlds
+        K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
+        lumped, explicit = (B, P) if t.lumped else (1, 1), (B, P) if t.explicit else (1, 1)
+        shapes: dict[str, tuple[int, ...]] = {
+            "place": (B, K), "turn": (B, K), "level": lumped, "dead": explicit, "dead_spring": explicit,
+            "pick": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R), "rows": (len(RECORD), B, R),
+            "total": (B, C, len(RECORD)),
+        }  # fmt: skip
+        attempt = attempt_struct(self.model.dtype)()
+        for name, var in attempt_struct(self.model.dtype).vars.items():
+            setattr(attempt, name, work.array(f"contact {name}", shapes.get(name, (B, P)), var.type.dtype))
+        scratch = {
+            "attempt": attempt,
+            "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
+            "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
+            "row_start": self.model.array("contact", t.row_start, wp.int32),
+        }
+        at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
+
+    def register(self, at: At) -> None:
+        P, K = self.tables.points, len(self.tables.colliders)
+        history = history_struct()()
+        one = {"place": K, "turn": K}
+        for name, var in history_struct().vars.items():
+            shape = () if name == "born" else (one.get(name, P),)
+            setattr(history, name, at.state.register(f"contact_{name}", var.type.dtype, shape))
+        at.scratch[self.name] = {"history": history}
+
+    def modules(self, at: At) -> Iterable[wp.Module]:
+        return [self.kernels.module]
+
+    def start(self, at: At, active: wp.array) -> None:
+        """Colliders at the state's time, and what overlaps there.
+
+        Raises:
+            ModelError: a point that was not in contact lies in an obstacle, and `overlap` is "refuse".
+        """
+        s, state = at.scratch[self.name], at.state
+        history = s["history"]
+        fresh = active.numpy() != 0
+        self._poses(at, active)
+        for mine, other in ((history.place, s["attempt"].place), (history.turn, s["attempt"].turn)):
+            values = mine.numpy()
+            values[fresh] = other.numpy()[fresh]
+            mine.assign(values)
+        overlap, born = history.overlap.numpy(), history.born.numpy()
+        live = history.speed.numpy() > 0.0
+        new = fresh & ~live.any(axis=1)
+        overlap[new] = 0.0
+        born[new] = state.time.numpy()[new]
+        history.overlap.assign(overlap)
+        history.born.assign(born)
+        gap, _ = self.at_points(state, history)
+        for k, contact in enumerate(self.tables.contacts):
+            first, last = self.tables.first[k], self.tables.first[k + 1]
+            depth = np.where(live[:, first:last] | ~new[:, None], 0.0, -gap[:, first:last])
+            worst = float(depth.max())
+            if worst <= TOUCHING * self.model.size:
+                continue
+            if contact.overlap == "refuse":
+                world, point = np.unravel_index(int(depth.argmax()), depth.shape)
+                where = self._where(k, int(point))
+                raise ModelError(
+                    f"contact {contact.name!r}: body {contact.body.name!r} begins {worst:.3g} m inside collider "
+                    f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
+                    "overlap='offset', which stores the overlap and lets it decay"
+                )
+            overlap[:, first:last] = np.maximum(depth, 0.0)
+        history.overlap.assign(overlap)
+
+    def _where(self, k: int, point: int) -> str:
+        """Reference place of a point of a contact."""
+        X = self.tables.host[k].X.reshape(-1, 3)[point]
+        return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
+
+    def _poses(self, at: At, active: wp.array) -> None:
+        s = at.scratch[self.name]
+        args = [self.tables.data, at.work.law_value, active, s["attempt"]]
+        at.launch(self.kernels.poses, (self.model.worlds, len(self.tables.colliders)), args)
+
+    # in a step
+
+    @part("contact")
+    def begin(self, at: At, active: wp.array) -> None:
+        """Colliders at the end of the attempt, points at its beginning."""
+        s, m, w = at.scratch[self.name], self.model, at.work
+        static = int(not at.inertia)
+        self._poses(at, active)
+        for group in self.tables.groups:
+            dim = (m.worlds, group.count, group.data.points)
+            args = [self.tables.data, group.data, s["history"], w.step, static]
+            more = [at.state.displacement, at.state.velocity, active, s["attempt"]]
+            at.launch(self.kernels.begin_points, dim, [*args, *more])
+            if self.tables.explicit:
+                at.launch(self.kernels.explicit_forces, dim, [*args, *more[1:]])
+
+    def prepare(self, at: At, active: wp.array) -> None:
+        """Caps of the first iterate, and the stiffness that blocks are made from."""
+        self._forces(at, active, fresh=1)
+
+    def force(self, at: At, active: wp.array) -> None:
+        self._forces(at, active, fresh=0)
+
+    @part("contact")
+    def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
+        s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
+        static = int(not at.inertia)
+        if self.tables.lumped:
+            for group in self.tables.groups:
+                args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
+                at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
+            args = [self.tables.data, active, s["attempt"]]
+            at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+        rows = w.rows_of(self)
+        for group in self.tables.groups:
+            args = [self.tables.data, group.data, s["history"], w.step, static, w.u, active, fresh]
+            at.launch(k.forces, (m.worlds, group.count), [*args, s["attempt"], w.pool_force, rows])
+
+    @part("contact")
+    def adopt(self, at: At, flags: wp.array) -> None:
+        """Hold the caps of the iterate in the next search."""
+        at.launch(
+            self.kernels.adopt, (self.model.worlds, self.tables.points), [flags, at.scratch[self.name]["attempt"]]
+        )
+
+    @part("contact")
+    def product(self, at: At, p: wp.array, active: wp.array) -> None:
+        m, w = self.model, at.work
+        for group in self.tables.groups:
+            args = [group.data, active, p, at.scratch[self.name]["attempt"], w.pool_product]
+            at.launch(self.kernels.product, (m.worlds, group.count), args)
+
+    @part("contact")
+    def diagonal(self, at: At, active: wp.array) -> None:
+        m, w = self.model, at.work
+        for group in self.tables.groups:
+            args = [group.data, active, at.scratch[self.name]["attempt"], w.pool_block]
+            at.launch(self.kernels.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
+
+    def book(self, at: At, accepted: wp.array) -> wp.array:
+        self._finish(at, accepted)
+        at.scratch[self.name]["finished"] = True
+        return at.scratch[self.name]["booked"]
+
+    @part("contact")
+    def _finish(self, at: At, accepted: wp.array) -> None:
+        """History, books and records of an accepted substep."""
+        s, m, w, k = at.scratch[self.name], self.model, at.work, self.books
+        static = int(not at.inertia)
+        C = len(self.tables.contacts)
+        for group in self.tables.groups:
+            args = [self.tables.data, group.data, s["history"], w.step, static, w.u, accepted, s["attempt"]]
+            at.launch(k.finish, (m.worlds, group.count), [*args, s["booked"]])
+        args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
+        at.launch(k.partial_records, (m.worlds, C, LANES), args)
+        at.launch(k.total_records, (m.worlds, C), [w.step, static, accepted, s["parts"], s["attempt"]])
+
+    @part("contact")
+    def commit(self, at: At, accepted: wp.array) -> None:
+        s, m, w = at.scratch[self.name], self.model, at.work
+        if not s.get("finished"):
+            self._finish(at, accepted)
+        args = [w.step, w.newton, accepted, s["history"], s["attempt"]]
+        at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), args)
+
+    def report(self, at: At) -> None:
+        args = [at.scratch[self.name]["attempt"], self.report_offset, at.work.report]
+        at.launch(self.books.write_records, (self.model.worlds, len(self.tables.contacts)), args)
+
+    def measure(self, at: At) -> dict[str, np.ndarray]:
+        """Energy that the history says is stored, by points; a lumped contact's is at its first."""
+        stored = at.scratch[self.name]["history"].stored.numpy()
+        return {"contact": stored @ self.weights}
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(points,) part of the region that a point stands for."""
+        out = np.concatenate([share.ravel() for share in self.tables.shares])
+        for k, contact in enumerate(self.tables.contacts):
+            if contact.model == "sphere":
+                out[self.tables.first[k]] = 1.0
+        return out
+
+    # in a linear solve
+
+    def keep(self, at: At) -> list[tuple[str, wp.array]]:
+        return [("stiffness", at.scratch[self.name]["attempt"].stiffness)]
+
+    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
+        if "contact blocks" not in self.model.cache:
+            self.model.cache["contact blocks"] = [self._entries(group.conn, matrix.pattern) for group in
+                                                  self.tables.groups]  # fmt: skip
+
+    def _entries(self, conn: np.ndarray, pattern: Any) -> tuple[wp.array, wp.array, wp.array, int]:
+        """Entries of the pattern that facets add to: which, where their items begin, and (facet, slot, slot)."""
+        a, b = (x.ravel() for x in np.indices((conn.shape[1],) * 2))
+        facet = np.repeat(np.arange(len(conn)), len(a))
+        a, b = np.tile(a, len(conn)), np.tile(b, len(conn))
+        index = pattern.find(conn[facet, a], conn[facet, b])
+        chosen = np.flatnonzero(index >= 0)
+        chosen = chosen[np.argsort(index[chosen], kind="stable")]
+        entry, count = np.unique(index[chosen], return_counts=True)
+        source = np.stack([facet[chosen], a[chosen], b[chosen]], axis=1)
+        m = self.model
+        start = np.concatenate([[0], np.cumsum(count)])
+        arrays = (m.array("contact", x, t) for x, t in ((entry, wp.int32), (start, wp.int32), (source, wp.vec3i)))
+        return (*arrays, len(entry))  # type: ignore[return-value]
+
+    def blocks(
+        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        *, projected: bool,
+    ) -> None:  # fmt: skip
+        """The points' stiffness, which is positive."""
+        m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact
+        for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
+            args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0], dq_dv, active, out]
+            at.launch(kernel, (m.worlds, count), args)
+
+    def block_modules(self) -> set[wp.Module]:
+        return {contact_block_kernels(self.model.dtype).module}
+
+    # at a state
+
+    def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""
+        m, t, B = self.model, self.tables, state.worlds
+        launch, laws = Launcher(m.device), m.terms.laws
+        every = wp.ones(B, dtype=wp.int32, device=m.device)
+        value = wp.zeros((B, max(laws.count, 1)), dtype=wp.vec3d, device=m.device)
+        laws.evaluate(launch, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+        P = t.points
+        if history is None:
+            history = history_struct()()
+            for name, var in history_struct().vars.items():
+                known = state.specs.get(f"contact_{name}")
+                shape = (B,) if name == "born" else (B, len(t.colliders)) if name in ("place", "turn") else (B, P)
+                array = (
+                    getattr(state, f"contact_{name}")
+                    if known
+                    else wp.zeros(shape, dtype=var.type.dtype, device=m.device)
+                )
+                setattr(history, name, array)
+        attempt = attempt_struct(m.dtype)()
+        for name, shape in (
+            ("place", (B, len(t.colliders))),
+            ("turn", (B, len(t.colliders))),
+            ("pick", (B, len(t.contacts))),
+        ):
+            setattr(
+                attempt, name, wp.zeros(shape, dtype=attempt_struct(m.dtype).vars[name].type.dtype, device=m.device)
+            )
+        for name in ("start", "depth", "speed", "held", "level"):
+            setattr(
+                attempt, name, wp.zeros((B, P), dtype=attempt_struct(m.dtype).vars[name].type.dtype, device=m.device)
+            )
+        attempt.speed.fill_(1.0)
+        launch(self.kernels.poses, (B, len(t.colliders)), [t.data, value, every, attempt])
+        gap, force = (
+            wp.zeros((B, P), dtype=wp.float64, device=m.device),
+            wp.zeros((B, P), dtype=wp.vec3d, device=m.device),
+        )
+        for group in t.groups:
+            dim = (B, group.count, group.data.points)
+            launch(self.kernels.settle, dim, [t.data, group.data, state.displacement, attempt])
+            launch(
+                self.kernels.levels, dim, [t.data, group.data, history, state.time, state.displacement, every, attempt]
+            )
+        launch(self.kernels.pick_deepest, (B, len(t.contacts)), [t.data, every, attempt])
+        for group in t.groups:
+            dim = (B, group.count, group.data.points)
+            args = [t.data, group.data, history, state.displacement, state.time, attempt, gap, force]
+            launch(self.books.at_points, dim, args)
+        return gap.numpy(), force.numpy()
