@@ -43,7 +43,7 @@ class Source(Protocol):
 
 
 class Model:
-    """Made by ModelBuilder.finalize; constant but for `set_gravity`.
+    """Made by ModelBuilder.finalize; constant but for `set_gravity` and `set_parameter`.
 
     Attributes:
         bodies: the bodies, in the order they were added.
@@ -373,12 +373,29 @@ class Model:
         self.terms.dead.set_gravity(gravity)
 
     def contact_force(self, state: State) -> np.ndarray:
-        """Contact is not part of this version."""
-        raise NotImplementedError("contact_force: contact is not part of this version")
+        """Elastic part of the forces of contact at a state, without damping, [world, slot, 3], N; on the bodies.
+
+        The state of a simulation knows the springs of friction and where colliders are; with another they are where
+        their paths are at its time, and there is no friction.
+        """
+        if self.terms.contact is None:
+            return np.zeros((self.worlds, self.slots, 3))
+        return self.terms.contact.nodal_force(state)
 
     def set_parameter(self, name: str, values: Any) -> None:
-        """Per-world material parameters are not part of this version."""
-        raise NotImplementedError("set_parameter: per-world material parameters are not part of this version")
+        """Set a parameter in all worlds; simulations take the new values from their next step on.
+
+        Args:
+            name: "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
+                ModelBuilder.add_contact; where mu_static equals mu, it follows mu. "K.offset" with the name K of a
+                collider: of a HalfSpace the offset of its plane, m; of other shapes by how much the surface lies
+                further out, m. A surface that comes to lie in a body pushes it out.
+            values: a number, or (worlds,).
+
+        Raises:
+            ModelError: an unknown name, a wrong shape, or a value out of range.
+        """
+        self.terms.set_parameter(name, values)
 
     def fingerprint(self) -> str:
         """Hash of all that a checkpoint must agree with: topology, geometry, laws, precision, supports, worlds."""

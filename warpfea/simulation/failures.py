@@ -62,7 +62,12 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
     reason, hint = _why(sim, code, world)
-    return ConvergenceError(
+    kind: type[ConvergenceError] = ConvergenceError
+    for term in sim.model.terms:
+        if (found := term.explain(sim.stepper.at, world)) is not None:
+            kind, text = found
+            reason = f"{text}; {reason}"
+    return kind(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
         f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}",

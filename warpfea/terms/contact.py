@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, PenetrationError
 from ..base.launch import Launcher
 from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, history_struct
 from ..model.state import State
+from .contact_parameters import contact_parameters
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
 from .time_laws import TimeLaws
@@ -26,7 +27,6 @@ __all__ = ["Contact"]
 
 TOUCHING = 1e-9
 """Depth at the start, over the model's size, that counts as touch."""
-PARAMETERS = ("mu", "mu_static", "restitution", "stiffness")
 
 
 class Contact(Term):
@@ -297,7 +297,33 @@ class Contact(Term):
     def block_modules(self) -> set[wp.Module]:
         return {contact_block_kernels(self.model.dtype).module}
 
+    def explain(self, at: At, world: int) -> tuple[type[PenetrationError], str] | None:
+        number = int(at.scratch[self.name]["attempt"].through.numpy()[world]) - 1
+        if number < 0:
+            return None
+        t = self.tables
+        k = int(np.searchsorted(t.first, number, side="right")) - 1
+        contact = t.contacts[k]
+        return PenetrationError, (
+            f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
+            f"{self._where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
+            "smaller dt, a larger stiffness= of the contact, or a thicker shape"
+        )
+
+    def parameters(self) -> dict[str, Callable[[Any], None]]:
+        return contact_parameters(self.tables)
+
     # at a state
+
+    def nodal_force(self, state: State) -> np.ndarray:
+        """Elastic forces of all contacts on slots, (worlds, slots, 3), N, at a state."""
+        _, force = self.at_points(state)
+        t, out = self.tables, np.zeros((state.worlds, self.model.slots, 3))
+        for k, (contact, p) in enumerate(zip(t.contacts, t.host)):
+            at_point = force[:, t.first[k] : t.first[k + 1]].reshape(-1, *p.area.shape, 3)
+            at_slot = np.einsum("bfpk,fpl->bflk", at_point, p.shape)
+            np.add.at(out, (slice(None), p.conn + contact.body.slot_offset), at_slot)
+        return out
 
     def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""
@@ -323,7 +349,10 @@ class Contact(Term):
             dtype = attempt_struct(m.dtype).vars[name].type.dtype
             setattr(attempt, name, zeros(shapes.get(name, (B, P)), dtype))
         attempt.speed.fill_(1.0)
-        launch(self.kernels.poses, (B, K), [t.data, value, every, attempt])
+        if "contact_place" in state.specs:  # statics puts its time back to 0
+            attempt.place, attempt.turn = history.place, history.turn
+        else:
+            launch(self.kernels.poses, (B, K), [t.data, value, every, attempt])
         gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
         for group in t.groups:
             dim = (B, group.count, group.data.points)
