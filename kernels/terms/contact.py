@@ -227,7 +227,13 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Where the points are as an attempt begins, and the approach speed that damping is made for."""
         world, item, q = wp.tid()
-        if active[world] == 0 or facets.share[q, item] == f64(0.0):
+        if active[world] == 0:
+            return
+        if q == 0 and item == 0 and facets.row == 0:
+            at.through[world] = 0
+            if step.part[world] == 0:
+                at.elapsed[world] = f64(0.0)
+        if facets.share[q, item] == f64(0.0):
             return
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
@@ -249,10 +255,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             approach = wp.dot(turn * vec3d(d[0], d[1], d[2]), moved - along(facets, v_n, world, q, item))
             speed = wp.max(speed, approach)
         at.speed[world, point] = speed
-        if q == 0 and item == 0 and facets.row == 0:
-            at.through[world] = 0
-            if step.part[world] == 0:
-                at.elapsed[world] = f64(0.0)
 
     @wp.kernel(module=module)
     def settle(con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), at: Attempt):

@@ -66,7 +66,7 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     for term in sim.model.terms:
         if (found := term.explain(sim.stepper.at, world)) is not None:
             kind, text = found
-            reason = f"{text}; {reason}"
+            reason, hint = f"{text}; {reason}", ""
     return kind(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
