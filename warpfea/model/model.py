@@ -257,7 +257,7 @@ class Model:
         return dict(self._memory)
 
     def info(self) -> dict[str, Any]:
-        """Features in and left out, counts, bytes of the constants, kernels' modules of the elements."""
+        """Features in and left out, counts, contacts, bytes of the constants, kernels' modules of the elements."""
         features = self.features
         return {
             "bodies": [
@@ -282,6 +282,7 @@ class Model:
                 {"name": j.name, "kind": j.kind, "rows": len(j.rows), "between": j.between}
                 for j in (self.constraints.joints if self.constraints else ())
             ],
+            "contacts": self.terms.contact.facts() if self.terms.contact else [],
             "features": [k for k, on in features.items() if on],
             "left_out": [k for k, on in features.items() if not on] + list(self.terms.later),
             "blocks": [

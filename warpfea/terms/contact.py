@@ -313,6 +313,17 @@ class Contact(Term):
     def parameters(self) -> dict[str, Callable[[Any], None]]:
         return contact_parameters(self.tables)
 
+    def facts(self) -> list[dict[str, Any]]:
+        """Of each contact, in the order they were added, what `Model.info` tells: with the points that count, and those
+        left out, which clamped slots hold."""
+        t, out = self.tables, []
+        for contact in self.model.description.contacts:
+            k = t.number[contact.index]
+            facts = {"name": contact.name, "body": contact.body.name, "collider": contact.collider.name}
+            numbers = {"points": int((t.shares[k] > 0.0).sum()), "left_out": t.left_out[k]}
+            out.append(facts | {"law": contact.law, "model": contact.model} | numbers)
+        return out
+
     # at a state
 
     def nodal_force(self, state: State) -> np.ndarray:
