@@ -49,12 +49,12 @@ def simulated(steps, *args, dt=DT, integrator="backward_euler", solver=None, **o
     return sim
 
 
-def falling(shape, *, E, speed, solver=None, stiffness=None, gap=0.05, worlds=1, **options):
+def falling(shape, *, E, speed, solver=None, worlds=1, **options):
     """A cube of 0.1 m that flies at an obstacle below it: simulation with steps of 10 ms, and the cube."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     material = wf.SVK(E=E, nu=0.3, density=1000)
     cube = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(2, 2, 2)), material=material, name="cube")
-    b.add_contact(cube, b.add_collider(shape, name="plate"), stiffness=stiffness, restitution=0.5, name="pad")
+    b.add_contact(cube, b.add_collider(shape, name="plate"), restitution=0.5, name="pad")
     model = b.finalize(device="cpu", worlds=worlds)
     state = model.state()
     velocity = state.velocity.numpy()
@@ -85,7 +85,7 @@ def test_a_record_has_every_step_and_world():
         assert (values[0] == values[1]).all()
     assert record.normal_force.max() > 10.0
     assert 1e-4 < record.penetration.max() < 0.01
-    assert 0.0 < record.area.max() <= 0.01 * (1 + 1e-12)
+    assert 0.005 < record.area.max() < 0.016  # of the foot, and of the points of the sides on its edges
     assert ((record.stick >= 0.0) & (record.stick <= 1.0)).all()
     assert sim.contact_record(sim.model.description.contacts[0]).force == pytest.approx(record.force)
     last = np.concatenate([record.force[:, -1], record.moment[:, -1]], axis=1)
@@ -100,34 +100,26 @@ def test_friction_of_a_slide_is_mu_times_the_normal_force():
     b.set_initial(cube, velocity=(1.0, 0, 0))
     b.add_contact(cube, b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor"), mu=0.3, restitution=0.1, name="pad")
     sim = wf.Simulation(b.finalize(device="cpu"), dt=DT)
-    sim.step(100)
+    foot, place = cube.mesh.points[:, 2] < 1e-9, []
+    for _ in range(100):
+        sim.step()
+        place.append(sim.positions(cube)[0, foot, 0].mean())
     record = sim.contact_record("pad")
     assert record.force[0, :, 2] == pytest.approx(record.normal_force[0], rel=1e-6)
     slips = (record.stick[0] == 0.0) & (record.normal_force[0] > 1.0)
     assert slips.sum() > 50
     assert -record.force[0, slips, 0] == pytest.approx(0.3 * record.normal_force[0, slips], rel=1e-4)
-    # the line of the resultant: it passes through the cube's foot
+    assert record.slip[0, -50:].sum() == pytest.approx(place[-1] - place[-51], rel=1e-2)
+    # the line of the resultant passes through the cube's foot
     x = -record.moment[0, -1, 1] / record.force[0, -1, 2]
     low, high = sim.positions(cube)[0, :, 0].min(), sim.positions(cube)[0, :, 0].max()
     assert low < x < high
 
 
-def test_slip_is_recorded_as_the_way_that_was_slid():
-    sim = simulated(1, dt=DT)
-    b, cube, model = thrown(restitution=0.1)
-    sim = wf.Simulation(model, dt=DT)
-    before, total = sim.positions(cube)[0].mean(axis=0), 0.0
-    sim.step(60)
-    record = sim.contact_record("pad")
-    total = record.slip[0].sum()
-    moved = np.linalg.norm((sim.positions(cube)[0].mean(axis=0) - before)[:2])
-    assert 0.5 * moved < total < 1.5 * moved
-
-
 def test_unknown_contacts_are_named():
     sim = wf.Simulation(thrown()[2], dt=DT)
-    with pytest.raises(wf.ModelError, match=r"'pod'; it has: 'pad'; did you mean 'pad'\?"):
-        sim.contact_record("pod")
+    with pytest.raises(wf.ModelError, match=r"'padd'; it has: 'pad'; did you mean 'pad'\?"):
+        sim.contact_record("padd")
     with pytest.raises(wf.ModelError, match="handle from add_contact"):
         sim.contact_force(thrown()[2].description.contacts[0])
     assert np.isnan(sim.contact_force("pad")).all()
@@ -185,7 +177,8 @@ def driven(**options):
     mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4")
     cube = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000), element="T4", name="cube")
     b.drive(cube.nodes(lambda X: X[:, 0] > -1), displacement=([0, 1], [(0, 0, 0), (0, 0, -0.01)]))
-    b.add_contact(cube, b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor"), name="pad", **options)
+    foot = cube.surface("z-")
+    b.add_contact(foot, b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor"), name="pad", **options)
     return wf.Simulation(b.finalize(device="cpu"), dt=0.1)
 
 
@@ -199,8 +192,10 @@ def test_all_nodes_may_be_driven():
         assert sim.model.contact_force(sim.state)[0].sum(axis=0)[2] == pytest.approx(expected, rel=1e-10)
     sim = driven()
     sim.step(3)
-    expected = 4 / 3 * modulus * np.sqrt(0.06 / np.pi) * 3e-3 / 6  # one face of six
-    assert sim.model.contact_force(sim.state)[0].sum(axis=0)[2] == pytest.approx(expected, rel=1e-2)
+    expected = 4 / 3 * modulus * np.sqrt(0.01 / np.pi) * 3e-3
+    nodal = sim.model.contact_force(sim.state)[0]
+    assert nodal.sum(axis=0) == pytest.approx([0, 0, expected], rel=1e-10)
+    assert (nodal[:, 2] > 0.0).sum() == 4
 
 
 def test_without_contact_the_force_is_zero():
@@ -381,16 +376,15 @@ def resting(offset=0.0, **options):
 def test_touch_at_the_start_is_fine_and_overlap_is_not():
     sim, cube = resting()
     assert sim.step(3).converged.all()
-    with pytest.raises(
-        wf.ModelError, match=r"'pad': body 'cube' begins 0.002 m inside collider 'floor' \(world 0.*off"
-    ):
+    text = r"'pad': body 'cube' begins 0.002 m inside collider 'floor' \(world 0.*overlap='offset'"
+    with pytest.raises(wf.ModelError, match=text):
         resting(0.002)
 
 
 def test_a_stored_overlap_decays():
     """It gives no kick: the cube is lifted at the speed at which the overlap vanishes, and then lies on the floor."""
     sim, cube = resting(0.002, overlap="offset", overlap_time=0.05)
-    height, speed, force = [], [], []
+    height, speed = [], []
     for _ in range(100):
         sim.step()
         height.append(sim.positions(cube)[0, :, 2].min())
@@ -466,10 +460,9 @@ def test_halved_steps_keep_momentum_and_energy(max_newton):
 
 
 def everything(sim):
-    record = vars(sim.contact_record("pad"))
-    return {f"state.{k}": v.copy() for k, v in sim.state.numpy().items()} | {
-        f"record.{k}": v for k, v in record.items()
-    }
+    """Arrays of the state, and the record of the contact."""
+    out = {f"state.{name}": values.copy() for name, values in sim.state.numpy().items()}
+    return out | {f"record.{name}": values for name, values in vars(sim.contact_record("pad")).items()}
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -540,7 +533,7 @@ def slide(*, pads: int = 1) -> wf.ModelBuilder:
     b = wf.ModelBuilder()
     floor = b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor")
     for k in range(pads):
-        mesh = wf.mesh.box((.1, .1, .1), cells=(1, 1, 1)).transformed(transform=wf.mesh.translation((.2 * k, 0, 0)))
+        mesh = wf.mesh.box((.1, .1, .1), cells=(1, 1, 1), origin=(.2 * k, 0, 0))
         cube = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=.3, density=1000), name=f"cube{k}")
         b.set_initial(cube, velocity=(1, 0, -.1))
         b.add_contact(cube, floor, mu=.5, restitution=.5, name=f"pad{k}")
@@ -564,9 +557,10 @@ def test_commands_tell_of_contacts(tmp_path, monkeypatch, capfd):
     assert 0.0 < pad["area"] < 0.011
     assert len(pad["force"]) == 3
     assert not {"contact", "friction"} & set(summary["left_out"])
-    assert "contact pad0  normal force up to" in " ".join(
-        command(capfd, "run", "mine.py:slide", "--device", "cpu").split(" ")
-    )
+    words = command(capfd, "run", "mine.py:slide", "--device", "cpu").split()
+    assert "contact pad0 normal force up to" in " ".join(words)
+    many = " ".join(command(capfd, "run", "mine.py:slide", "--device", "cpu", "--set", "pads=13").split())
+    assert "contacts 13 in all, of which these have the largest forces" in many
     out = command(capfd, "info", "mine.py:slide", "--device", "cpu")
     assert "body cube0 on floor, law default, patch, 84 points" in out
     info = json.loads(command(capfd, "info", "mine.py:slide", "--device", "cpu", "--json", "-"))

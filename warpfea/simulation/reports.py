@@ -68,7 +68,7 @@ class ContactRecord:
             was halved, so that their impulse is that of the step.
         penetration: largest depth in the step, m.
         slip: length of slip in the step, m, and stick: share that sticks at its end; means over the area in contact.
-        area: reference area in contact at the end of the step, m^2.
+        area: reference area in contact at the end of the step, m^2; at an edge also points of the faces beside count.
         stored: elastic energy of the contact at the end of the step, J.
         loss, friction: energy lost in the step to restitution and to friction, J.
         collider_work: work of the moving collider on the body in the step, J.
