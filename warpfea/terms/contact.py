@@ -333,7 +333,9 @@ class Contact(Term):
         for k, (contact, p) in enumerate(zip(t.contacts, t.host)):
             at_point = force[:, t.first[k] : t.first[k + 1]].reshape(-1, *p.area.shape, 3)
             at_slot = np.einsum("bfpk,fpl->bflk", at_point, p.shape)
-            np.add.at(out, (slice(None), p.conn + contact.body.slot_offset), at_slot)
+            slots = p.conn + contact.body.slot_offset
+            for world in range(state.worlds):
+                np.add.at(out[world], slots, at_slot[world])
         return out
 
     def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
