@@ -303,9 +303,20 @@ class NewtonLoop:
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self._rarely(self._search_on)
+        if self.terms.traits.walls:
+            self._refresh()
         self.preconditioner.follow(active)
         self._each("follow", active)
         self._any(active, self.iterating)
+
+    @labelled("control")
+    def _refresh(self) -> None:
+        """Let terms take anew what they hold, where Newton's method has solved for it."""
+        w, flags = self.work, self.work.newton.stepped
+        self.launch(self.kernels.begin_refresh, self.model.worlds, [w.newton, flags])
+        self._each("refresh", flags)
+        self.residual.evaluate(flags, hold=True)
+        self.launch(self.kernels.end_refresh, self.model.worlds, [w.newton, flags])
 
     @labelled("control")
     def _search_on(self) -> None:
