@@ -409,7 +409,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                     if t.side == -2:
                         at.through[world] = point + 1
                         held_sum += f64(wp.inf)
-                    elif t.depth > f64(0.0) or con.law[c] == SMOOTH:
+                    elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
                         touched = wp.int32(1)
                         psi = t.law[2]
                         rub = friction_potential(con, world, c, t, held, inv_h)
