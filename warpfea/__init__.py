@@ -50,6 +50,7 @@ from .builder.builder import ModelBuilder  # noqa: E402
 from .builder.joints import GROUND  # noqa: E402
 from .builder.scene import scene  # noqa: E402
 from .elements.sections import Rectangle  # noqa: E402
+from .laws import Control  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
 from .model.bodies import Body  # noqa: E402
 from .model.description import Rotation  # noqa: E402
@@ -73,6 +74,7 @@ __all__ = [
     "Checkpoint",
     "CheckpointError",
     "ConstraintError",
+    "Control",
     "ConvergenceError",
     "ElementSet",
     "Error",
@@ -116,7 +118,6 @@ _LATER = {
     "Capsule": "contact",
     "Cylinder": "contact",
     "TriMesh": "contact",
-    "Control": "controls between steps",
     "GeneralizedAlpha": "generalised-alpha steps",
 }
 
