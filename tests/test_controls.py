@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warpfea as wf
+from warpfea.terms.term import Term
 
 H = 1.0 / 128.0  # exact in binary, so that the samples of a law are met exactly
 VALUES = np.array([0.25, 0.75, -0.5, 0.125])
@@ -419,6 +420,20 @@ def test_nothing_is_written_where_a_value_is_refused():
     with pytest.raises(wf.ModelError):
         value[:] = [(1, 1, 1), (np.nan, 1, 1)]
     assert not value.numpy().any()
+
+
+def test_a_term_may_not_take_the_array_of_a_control():
+    class Watch(Term):
+        name = "watch"
+
+        def register(self, at):
+            at.state.register("control_jaw", wp.float64, (3,))
+
+    b, body = bar()
+    add_load(b, body, wf.Control("jaw", 3))
+    b.add_term(Watch)
+    with pytest.raises(wf.ModelError, match="'watch': the state's array 'control_jaw' is that of the state itself"):
+        wf.Simulation(b.finalize(device="cpu"), dt=H)
 
 
 def test_equal_controls_may_meet_on_a_component():
