@@ -198,6 +198,17 @@ def test_a_dynamic_run_goes_on_with_the_controls_of_an_equilibrium():
     assert np.abs(sim.displacements(body) - rest).max() < 1e-7 * np.abs(rest).max()
 
 
+def test_a_state_without_the_controls_gets_their_initial_values():
+    start = simulation("load", (0.0, 0.0, 0.0)).state
+    b, body = bar()
+    add_load(b, body, wf.Control("c", 3, initial=(0, 0, -5.0)))
+    sim = wf.Simulation(b.finalize(device="cpu"), start, dt=H)
+    assert np.array_equal(sim.controls["c"], [(0, 0, -5)])
+    assert sim.state is start
+    sim.step()
+    assert sim.probe("tip").displacement[0, -1, 2] < 0.0
+
+
 def test_reset_goes_back_to_the_initial_value_in_the_chosen_worlds():
     sim = simulation("load", wf.Control("c", 3, initial=(1.0, 2.0, 3.0)), worlds=3)
     assert np.array_equal(sim.controls["c"], np.tile((1.0, 2.0, 3.0), (3, 1)))
