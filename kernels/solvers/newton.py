@@ -42,6 +42,8 @@ RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1
 """Tolerance of the first solve of a step that begins far from its end: what it is solved to is lost."""
+REFRESH = 0.1
+"""Relative residual from which on what terms hold (caps of friction) is taken anew at each iterate."""
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
 
@@ -55,12 +57,12 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     f64 = wp.float64
     Control = control_struct()
     PCG = pcg_struct()
-    stored, gated, limited = traits.stored, traits.gated, traits.limited
+    stored, gated, limited, walls = traits.stored, traits.gated, traits.limited, traits.walls
     judging = judging_functions(traits)
     objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
     measure, settle, fail = judging.measure, judging.settle, judging.fail
-    accept, give_up = judging.accept, judging.give_up
-    module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited')}")
+    accept, give_up, record = judging.accept, judging.give_up, judging.record
+    module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited', 'walls')}")
 
     @wp.kernel(module=module)
     def reset_min_J(ctl: Control, active: wp.array(dtype=wp.int32)):
@@ -96,6 +98,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             give_up(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
             give_up(ctl, world, FAIL_NAN)
+        elif wp.static(walls):
+            record(ctl, world)  # what is held is not that of this iterate: it can't be accepted
         else:
             settle(ctl, world)
 
@@ -270,7 +274,11 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.best_phi[world] = old_phi
             ctl.best_norm[world] = old_norm
         ctl.mixed[world] = 1
-        ctl.leaps[world] = ctl.leaps[world] + 1
+        counts = True
+        if wp.static(walls):  # the way back out of an obstacle goes down in Phi all along
+            counts = ctl.leaps[world] == 0 or not ctl.phi[world] < old_phi
+        if counts:
+            ctl.leaps[world] = ctl.leaps[world] + 1
         if ctl.norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
             ctl.leaps[world] = 0
             ctl.radius[world] = wp.min(f64(2.0) * ctl.radius[world], f64(TURN))
@@ -327,9 +335,35 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             eta = wp.max(eta, guard)
         if ctl.fixed_forcing == 0 and not stands:
             ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
-        settle(ctl, world)
+        if wp.static(not walls):
+            settle(ctl, world)
         if not stands and ctl.strict[world] == 0 and (leap or ctl.leaps[world] > 0):
             watch(ctl, world, old_phi, old_norm)
+
+    @wp.kernel(module=module)
+    def begin_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
+        """Flag the worlds where what terms hold is to be taken anew: Newton's method has solved for it so far."""
+        world = wp.tid()
+        flags[world] = 0
+        if ctl.active[world] != 0:
+            last = ctl.iterations[world] + 1 >= ctl.max_iterations
+            if ctl.relative[world] <= f64(REFRESH) or last:
+                flags[world] = 1
+
+    @wp.kernel(module=module)
+    def end_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
+        """Judge the iterate, in the flagged worlds with what terms hold now."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        if flags[world] != 0:
+            measure(ctl, world)
+            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+            ctl.phi_magnitude[world] = magnitude(ctl, world)
+            ctl.leaps[world] = 0
+            settle(ctl, world)
+        else:
+            record(ctl, world)
 
     @wp.func
     def shorten(ctl: Control, world: int, reused: bool):
@@ -424,7 +458,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         module=module,
         measure=measure,
         accept=accept,
-        record=judging.record,
+        record=record,
         reset_min_J=reset_min_J,
         begin=begin,
         plan_leap=plan_leap,
@@ -432,6 +466,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         judge_floor=judge_floor,
         free_step=free_step,
         begin_search=begin_search,
+        begin_refresh=begin_refresh,
+        end_refresh=end_refresh,
         judge_trial=judge_trial,
         judge_outer=judge_outer,
         any_set=any_set,

@@ -367,7 +367,8 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Forces of facets, stiffness of their points, and rows of the potential.
 
-        `fresh`: what line searches hold is taken from this iterate.
+        `fresh`: an attempt begins. Caps are held while Newton's method solves for them: with held caps the problem has
+        a potential, which with those of each iterate is lost where an iterate lies deep in an obstacle.
         """
         world, item = wp.tid()
         if active[world] == 0:
@@ -379,7 +380,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         inv_h = f64(0.0)
         if still == 0:
             inv_h = f64(1.0) / step.h[world]
-        held_sum, next_sum, size_sum = f64(0.0), f64(0.0), f64(0.0)
+        held_sum, size_sum = f64(0.0), f64(0.0)
         touched = wp.int32(0)
         for q in range(facets.points):
             point = facets.point + item * facets.points + q
@@ -394,36 +395,30 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                     force = -at.dead[world, point]
                     work = share * wp.dot(force, x - x_n)
                     held_sum += work
-                    next_sum += work
                     size_sum += wp.abs(work)
                     if wp.length_sq(force) > f64(0.0):
                         touched = wp.int32(1)
                 else:
                     held = at.held[world, point]
-                    t = touch(con, facets, his, at, world, c, q, item, point, u, step.new_time[world], inv_h, held[2])
+                    time = step.new_time[world]
+                    t = touch(con, facets, his, at, world, c, q, item, point, u, time, inv_h, held[2])
                     new = hold(con, his, at, world, c, point, t)
-                    if new[2] != held[2]:
-                        t = touch(
-                            con, facets, his, at, world, c, q, item, point, u, step.new_time[world], inv_h, new[2]
-                        )
-                    at.next[world, point] = new
-                    if fresh != 0:
+                    if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
                         held = new
-                        at.held[world, point] = new
+                        held[0] = wp.min(new[0], his.cap[world, record_of(con, c, point)])
+                        at.held[world, point] = held
+                    at.next[world, point] = new
                     if t.side == -2:
                         at.through[world] = point + 1
                         held_sum += f64(wp.inf)
-                        next_sum += f64(wp.inf)
-                    elif t.depth > f64(0.0) or con.law[c] == SMOOTH:
+                    elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
                         touched = wp.int32(1)
                         psi = t.law[2]
-                        a = psi + friction_potential(con, world, c, t, held, inv_h)
-                        b = psi + friction_potential(con, world, c, t, new, inv_h)
-                        held_sum += share * a
-                        next_sum += share * b
-                        size_sum += share * (wp.abs(psi) + wp.abs(a - psi))
-                        force = friction_force(con, world, c, t, new, inv_h) - t.law[0] * t.n
-                        K = point_stiffness(con, world, c, t, new, inv_h)
+                        rub = friction_potential(con, world, c, t, held, inv_h)
+                        held_sum += share * (psi + rub)
+                        size_sum += share * (wp.abs(psi) + wp.abs(rub))
+                        force = friction_force(con, world, c, t, held, inv_h) - t.law[0] * t.n
+                        K = point_stiffness(con, world, c, t, held, inv_h)
                         at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),
                             T(share * K[1, 2]), T(share * K[0, 2]), T(share * K[0, 1]))  # fmt: skip
                 for i in range(facets.conn.shape[0]):
@@ -431,12 +426,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                     pool[world, e] = pool[world, e] + facets.shape[q, i, item] * vec3(share * force)
         at.touched[world, row] = touched
         rows[0, world, row] = held_sum
-        rows[1, world, row] = next_sum
+        rows[1, world, row] = held_sum
         rows[2, world, row] = size_sum
 
     @wp.kernel(module=module)
-    def adopt(flags: wp.array(dtype=wp.int32), at: Attempt):
-        """The trial was accepted: hold its caps."""
+    def refresh(flags: wp.array(dtype=wp.int32), at: Attempt):
+        """Take the caps of the iterate."""
         world, point = wp.tid()
         if flags[world] != 0:
             at.held[world, point] = at.next[world, point]
@@ -488,5 +483,5 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         module=module, Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, touch=touch, hold=hold,
         pull=pull, friction_force=friction_force, acts=acts, poses=poses, begin_points=begin_points,
         settle=settle, explicit_forces=explicit_forces, levels=levels, pick_deepest=pick_deepest, forces=forces,
-        adopt=adopt, product=product, diagonal=diagonal,
+        refresh=refresh, product=product, diagonal=diagonal,
     )  # fmt: skip

@@ -72,9 +72,8 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             if share > f64(0.0):
                 rec = record_of(con, c, point)
                 live = his.speed[world, rec] > f64(0.0)
-                held = at.next[world, point]
+                held = at.held[world, point]
                 t = touch(con, facets, his, at, world, c, q, item, point, u, step.new_time[world], inv_h, held[2])
-                held = hold(con, his, at, world, c, point, t)
                 before = at.depth[world, point]
                 change = t.depth - before
                 spring = elastic(lumped, k_n, t.depth)
@@ -146,6 +145,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
                         kept = wp.transpose(at.turn[world, kc]) * kept
                     his.spring[world, rec] = kept
                     his.stored[world, rec] = stored
+                    his.cap[world, rec] = held[0]
                     his.speed[world, rec] = speed
                     side = wp.max(t.side, -1) + 1
                     if slips and held[0] > f64(0.0):
@@ -154,6 +154,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
                 else:
                     his.spring[world, rec] = vec3d()
                     his.stored[world, rec] = f64(0.0)
+                    his.cap[world, rec] = f64(0.0)
                     his.speed[world, rec] = f64(0.0)
                     his.mark[world, rec] = 0
 

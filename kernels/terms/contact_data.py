@@ -83,6 +83,7 @@ def history_struct():
         speed: wp.array2d(dtype=wp.float64)  # largest approach speed since birth, m/s; 0: not in contact
         mark: wp.array2d(dtype=wp.int32)  # side of the shape + 1, and 16 where it slips
         overlap: wp.array2d(dtype=wp.float64)  # stored at the start, m
+        cap: wp.array2d(dtype=wp.float64)  # mu F_n of the last step, N over the point's share
         stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's share
         born: wp.array(dtype=wp.float64)  # [world] time that overlaps were stored at
         place: wp.array2d(dtype=wp.vec3d)  # of colliders

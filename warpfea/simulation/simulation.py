@@ -20,6 +20,7 @@ from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
 from .checks import check_choice, check_constraint_tol, check_dt, check_model, check_state, check_steps
+from .controls import Controls
 from .failures import check_closed, step_error
 from .records import Records
 from .reports import ContactRecord, JointRecord, ProbeRecord, StepReport, describe, idle_report
@@ -52,6 +53,9 @@ class Simulation(Records):
             several only once all have failed.
         inversion: a step that turns an element inside out, J <= 0 at a quadrature point where J was positive, is
             refused ("refuse"), or passes where the law allows it ("report": StepReport.min_J tells).
+
+    Attributes:
+        controls: what the caller writes between steps, see Controls.
 
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
@@ -100,6 +104,7 @@ class Simulation(Records):
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
                 on_compile=on_compile or bar,
             )  # fmt: skip
+        self.controls = Controls(model, self.state)
         self.compile_s = clock.perf_counter() - began
         self.dt = dt
         check_closed(self)
@@ -332,11 +337,6 @@ class Simulation(Records):
         total = g[:, rows].sum(axis=1).astype(float)
         total[~self._stepped] = np.nan
         return total
-
-    @property
-    def controls(self) -> Any:
-        """Controls are not part of this version."""
-        raise NotImplementedError("controls: values that a caller writes between steps are not part of this version")
 
     def resume(self, path: Any) -> None:
         """Continue from a checkpoint, bit for bit. Raises CheckpointError if it is of another model."""

@@ -64,6 +64,7 @@ class Stepper:
         )
         vec3 = model.types.vec3
         state.sealed = False
+        model.terms.laws.register(state)
         if integrator.multistep:
             state.register("previous_displacement", vec3, (model.slots,))
             state.register("previous_velocity", vec3, (model.slots,))
@@ -310,7 +311,7 @@ class Stepper:
     def _laws(self, active: wp.array) -> None:
         """Values of the time laws at the end of the attempt."""
         w = self.work
-        self.terms.laws.evaluate(self.launch, w.step.new_time, w.step.ramp, active, w.law_value)
+        self.terms.laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
 
     def _book(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state

@@ -10,6 +10,7 @@ import warp as wp
 
 from ..base.errors import ModelError, PenetrationError
 from ..base.launch import Launcher
+from ..kernels.common.traits import Traits
 from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, history_struct
@@ -52,6 +53,7 @@ class Contact(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
+        self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
         self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
@@ -173,7 +175,7 @@ class Contact(Term):
                 at.launch(self.kernels.explicit_forces, dim, [*args, *more[1:]])
 
     def prepare(self, at: At, active: wp.array) -> None:
-        """Caps of the first iterate, and the stiffness that blocks are made from."""
+        """The first caps, and the stiffness that blocks are made from."""
         self._forces(at, active, fresh=1)
 
     def force(self, at: At, active: wp.array) -> None:
@@ -195,11 +197,9 @@ class Contact(Term):
             at.launch(k.forces, (m.worlds, group.count), [*args, s["attempt"], w.pool_force, rows])
 
     @part("contact")
-    def adopt(self, at: At, flags: wp.array) -> None:
-        """Hold the caps of the iterate in the next search."""
-        at.launch(
-            self.kernels.adopt, (self.model.worlds, self.tables.points), [flags, at.scratch[self.name]["attempt"]]
-        )
+    def refresh(self, at: At, flags: wp.array) -> None:
+        dim = (self.model.worlds, self.tables.points)
+        at.launch(self.kernels.refresh, dim, [flags, at.scratch[self.name]["attempt"]])
 
     @part("contact")
     def product(self, at: At, p: wp.array, active: wp.array) -> None:

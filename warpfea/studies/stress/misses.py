@@ -17,9 +17,6 @@ MISSES: dict[tuple[str, str, str], str] = {
     ("soft-thin-limbs", "float64", ""): "found, in 642 iterations in place of 80; it was refused before",
     ("soft-dolphin", "float32", ""): "refused by name: float32 can't hold it",
     ("soft-thin-limbs", "float32", ""): "refused by name: float32 can't hold it",
-    ("elastica/1000", "float64", "cuda"): "14 to 28 iterations per load step: a GPU has no exact factors of H",
-    ("elastica/10000", "float64", "cuda"): "50 to 73 iterations per load step, for the same reason",
-    ("elastica/100000", "float64", "cuda"): "28 to 39 iterations per load step, for the same reason",
     ("drive-jump/beam-4-jump", "float64", ""): _DRIVE,
     ("drive-jump/beam-4-jump", "float32", ""): _DRIVE,
     ("drive-jump/solid-4-jump", "float64", ""): _DRIVE,
@@ -38,8 +35,6 @@ MISSES: dict[tuple[str, str, str], str] = {
     ("thin-static/T10-500", "float32", ""): _THIN,
     ("thin-static/H3843-500", "float32", ""): _THIN,
     ("thin-dynamic/T10-500", "float32", ""): _THIN,
-    ("twist-below/0.5", "float32", "cuda"): "0.7 % off with an estimate below 0.2 %: torsion is little of the energy",
-    ("twist-below/0.9", "float32", "cuda"): "1.4 % off with an estimate below 0.2 %: torsion is little of the energy",
 }
 """Reasons by row, precision and kind of device ("": any)."""
 
