@@ -23,6 +23,7 @@ from ..kernels.solvers.control import (
 from ..kernels.solvers.judging import NEAR
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
+from .jumps import jumping_drives
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -62,10 +63,11 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
     reason, hint = _why(sim, code, world)
+    jumps = "" if code == FAIL_FLOOR else jumping_drives(sim, world)
     return ConvergenceError(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
-        f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}",
+        f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}{jumps}",
         time=time, world=world, residuals=history, element=element, state=sim.state,
     )  # fmt: skip
 
@@ -133,7 +135,7 @@ def _unsatisfied(sim: Any, world: int, time: float, halvings: int) -> Constraint
     return ConstraintError(
         f"{_step_from(sim, time)}: constraints could not be satisfied in world {world} after "
         f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or with "
-        f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}",
+        f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}{jumping_drives(sim, world)}",
         joints=names, violations=values, time=time, world=world, state=sim.state,
     )  # fmt: skip
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 __all__ = ["MISSES", "reason_for"]
 
 _NEO = "refused at a state that is unstable, or where no step is found; T4 finds it"
-_DRIVE = "refused, but by the element that fails and not by the drive that jumps"
 _THIN = "refused for the work spent or without a reason, where it is float32 that can't hold it"
 
 MISSES: dict[tuple[str, str, str], str] = {
@@ -20,10 +19,6 @@ MISSES: dict[tuple[str, str, str], str] = {
     ("elastica/1000", "float64", "cuda"): "14 to 28 iterations per load step: a GPU has no exact factors of H",
     ("elastica/10000", "float64", "cuda"): "50 to 73 iterations per load step, for the same reason",
     ("elastica/100000", "float64", "cuda"): "28 to 39 iterations per load step, for the same reason",
-    ("drive-jump/beam-4-jump", "float64", ""): _DRIVE,
-    ("drive-jump/beam-4-jump", "float32", ""): _DRIVE,
-    ("drive-jump/solid-4-jump", "float64", ""): _DRIVE,
-    ("drive-jump/solid-4-jump", "float32", ""): _DRIVE,
     ("neo-squeezed/T10", "float64", ""): _NEO,
     ("neo-squeezed/H3843", "float64", ""): _NEO,
     ("neo-stretched/H3843", "float64", ""): _NEO,
