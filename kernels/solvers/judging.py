@@ -28,7 +28,7 @@ NEAR = 1.0e3
 SETTLING = 10.0
 """A residual can only be at its floor when the last step was below this many accepted errors."""
 FAR = 3
-"""An attempt that begins far from its end may take so many times more iterations."""
+"""An attempt may take so many times more iterations where `patience` says so."""
 ALIKE = 64.0
 """A stall may be put down to rounding too where the last step was below this many roundings in the norm of energy: of
 laws that are steep at small J the stress rounds far more than the positions."""
@@ -165,6 +165,13 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         ctl.mixed[world] = 0
 
     @wp.func
+    def patience(ctl: Control, world: int) -> int:
+        """How many times `max_iterations` an attempt may take: more where it begins far from its end, or where a law
+        that keeps its own tangent left a state without positive curvature, which shorter steps meet again."""
+        far = wp.max(ctl.choose[world], ctl.bent[world] * (1 - ctl.linear_stress))
+        return 1 + FAR * far
+
+    @wp.func
     def give_up(ctl: Control, world: int, why: int):
         """End without convergence. In single precision a residual as large as the forces, of no more than `DROWNED`
         roundings, is put down to those, whatever it ends by: a shorter step has smaller forces in the same noise."""
@@ -188,7 +195,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
         step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
         most = f64(SETTLING) * ctl.floor_bound
-        limit = ctl.max_iterations * (1 + FAR * ctl.choose[world])
+        limit = ctl.max_iterations * patience(ctl, world)
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
         alike = f64(ALIKE) * ctl.eps
         near = ctl.floor_excess[world] <= f64(NEAR)
@@ -217,5 +224,5 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         objective=objective, magnitude=magnitude, largest_violation=largest_violation, measure=measure, record=record,
-        accept=accept, ask=ask, give_up=give_up, settle=settle, fail=fail,
+        accept=accept, ask=ask, patience=patience, give_up=give_up, settle=settle, fail=fail,
     )  # fmt: skip

@@ -20,7 +20,7 @@ from .control import (
     LANES,
     control_struct,
 )
-from .judging import FAR, TRIES, judging_functions
+from .judging import TRIES, judging_functions
 from .pcg import pcg_struct
 from .vectors import vector_kernels
 
@@ -38,6 +38,8 @@ TURN, SHRINK = 0.5, 0.4
 """Most that such a step turns or stretches an element, and what remains of it when the best iterate was restored."""
 ROUNDS = 3
 """Linear solves of an attempt, over its iterations: those that lead to no step are bounded too."""
+LOST = 10
+"""Such solves that may lead to no step before the tangent is followed as it is; with 0 soft solids take longer."""
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1
@@ -59,7 +61,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     judging = judging_functions(traits)
     objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
     measure, settle, fail = judging.measure, judging.settle, judging.fail
-    accept, give_up = judging.accept, judging.give_up
+    accept, give_up, patience = judging.accept, judging.give_up, judging.patience
     module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited')}")
 
     @wp.kernel(module=module)
@@ -154,6 +156,12 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.limit[world] = f64(1.0)
 
     @wp.func
+    def lost(ctl: Control, world: int) -> bool:
+        """Whether solves with other matrices than the tangent have led nowhere too often, of laws that have a tangent
+        of their own: past a bifurcation it alone knows the way down."""
+        return ctl.linear_stress == 0 and ctl.rounds[world] - ctl.iterations[world] > LOST
+
+    @wp.func
     def open_search(ctl: Control, world: int):
         """See whether the direction leads anywhere."""
         ctl.bent[world] = wp.max(ctl.bent[world], ctl.negative[world])
@@ -169,7 +177,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             if ctl.leaps[world] > 0:
                 ctl.restoring[world] = 1
             else:
-                ctl.mixed[world] = 2
+                ctl.mixed[world] = wp.where(lost(ctl, world), 0, 2)
                 ctl.tame[world] = 1
                 ctl.alpha[world] = f64(0.0)
         elif ctl.slope[world] >= f64(0.0):
@@ -256,7 +264,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             wp.atomic_max(ctl.any_hard, 0, 1)
         elif pcg.total[world] >= max_work:
             give_up(ctl, world, FAIL_WORK)
-        elif ctl.rounds[world] > ROUNDS * (1 + FAR * ctl.choose[world]) * ctl.max_iterations:
+        elif ctl.rounds[world] > ROUNDS * patience(ctl, world) * ctl.max_iterations:
             give_up(ctl, world, FAIL_ITERATIONS)
         else:
             open_search(ctl, world)
@@ -311,13 +319,13 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 ctl.restoring[world] = 0
                 ctl.radius[world] = f64(SHRINK) * ctl.radius[world]
                 ctl.leaps[world] = 0
-                ctl.mixed[world] = 2
+                ctl.mixed[world] = wp.where(lost(ctl, world), 0, 2)
                 ctl.tame[world] = 1
         else:
             ctl.iterations[world] = ctl.iterations[world] + 1
             if ctl.tame[world] != 0:
                 ctl.tame[world] = 0
-                ctl.mixed[world] = 1
+                ctl.mixed[world] = wp.where(lost(ctl, world), 0, 1)
         ctl.total_iterations[world] = ctl.total_iterations[world] + 1
         ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
         ctl.reduction[world] = ratio

@@ -187,7 +187,8 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     ):
         """x += alpha p, r -= alpha H p with alpha = r.z / p.H p.
 
-        A direction of no positive curvature ends the solve: it is taken in full if it is the first, else not at all.
+        A direction of no positive curvature ends the solve: it is taken in full if it is the first, else as far as the
+        same curvature, were it positive, would have it: it leads off a saddle, and off a bifurcation.
         """
         world, slot = wp.tid()
         if world == 0 and slot == 0:
@@ -203,6 +204,8 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             length = rz / pHp
         elif ctl.iterations[world] == 0:
             length = f64(1.0)
+        elif pHp < f64(0.0) and wp.isfinite(pHp):
+            length = -rz / pHp
         if slot == 0:
             ctl.energy[world] = ctl.energy[world] + length * rz
         alpha = T(length)
