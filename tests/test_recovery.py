@@ -6,6 +6,7 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.studies.stress.case import Setting
+from warpfea.studies.stress.cases import inside_out
 from warpfea.studies.stress.cases.stretch import stretch
 
 SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
@@ -217,3 +218,14 @@ def test_stress_that_rounds_more_than_positions_ends_at_its_floor(element):
     answer = stretch(Setting("cpu", "float32"), f"{element}-0.05")
     assert answer.passed
     assert answer.error < 1e-5
+
+
+@pytest.mark.parametrize("how", ["squeezed", "twisted"])
+def test_soft_bars_are_found_past_their_bifurcations(how, monkeypatch):
+    """Squeezed to a twentieth or twisted four turns a neo-Hookean bar buckles: its tangent is indefinite."""
+    monkeypatch.setitem(inside_out.CELLS, "H3843", (10, 1, 1))
+    b, bar = inside_out.forced("H3843", inside_out.NEO_HOOKEAN, how)
+    found = wf.solve_static(b.finalize(device="cpu"), load_steps=20)
+    ends = [found.reaction(bar.nodes(side))[0] for side in ("x-", "x+")]
+    assert np.abs(ends[0] + ends[1]).max() < 1e-6 * np.abs(ends).max()
+    assert found.simulation.min_J > 0.0
