@@ -7,7 +7,7 @@ from __future__ import annotations
 
 __all__ = ["MISSES", "reason_for"]
 
-_NEO = "refused on a GPU at a state that is unstable; in float64 and on the CPU it is found"
+_NEO = "refused on a GPU at a state that is unstable; found on the CPU"
 _THIN = "refused for the work spent or without a reason; with two levels on the CPU float32 is named now"
 
 MISSES: dict[tuple[str, str, str], str] = {
