@@ -416,6 +416,16 @@ def test_a_stored_overlap_decays():
     assert force[-20:].mean() == pytest.approx(9.81, rel=0.01)
 
 
+def test_a_body_at_rest_without_forces_takes_no_iterations():
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1))
+    cube = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000), name="cube")
+    b.add_contact(cube, b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor"), mu=0.5, name="pad")
+    report = wf.Simulation(b.finalize(device="cpu"), dt=DT).step()
+    assert report.converged.all()
+    assert report.newton[0] == 0
+
+
 # energies and momentum
 
 
