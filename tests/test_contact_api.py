@@ -536,10 +536,15 @@ def test_a_reset_clears_history():
     np.testing.assert_array_equal(sim.positions(sim.model.bodies[0])[0], first)
 
 
+RAMPED = {"law": "paper", "smoothing": 1e-4}
+"""The paper's implicit law where a step always has a solution: its damping is ramped in over 0.1 mm."""
+
+
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("place", ["plane", "rotation", "ball"])
+@pytest.mark.parametrize("place", ["plane", "path", "rotation", "ball", "capsule"])
 def test_single_precision_runs(place, law):
-    double, single = (simulated(30, place, dtype=dtype, **LAWS[law]) for dtype in ("float64", "float32"))
+    options = RAMPED if law == "paper" else LAWS[law]
+    double, single = (simulated(30, place, dtype=dtype, **options) for dtype in ("float64", "float32"))
     cube = single.model.bodies[0]
     difference = single.positions(cube) - double.positions(double.model.bodies[0])
     assert np.abs(difference).max() < 2e-6
@@ -547,6 +552,17 @@ def test_single_precision_runs(place, law):
     assert abs(energies["ledger_residual"][0]) < 1e-4 * energies["kinetic"][0]
     force = single.contact_record("pad").normal_force[0]
     assert force == pytest.approx(double.contact_record("pad").normal_force[0], abs=2e-2 * force.max())
+
+
+@pytest.mark.parametrize("place", ["plane", "path", "rotation", "ball", "capsule"])
+def test_single_precision_runs_or_is_refused_by_name_with_the_papers_jump(place):
+    """The unramped damping acts at once at the first touch: some steps have no solution, and are halved."""
+    sim = wf.Simulation(thrown(place, dtype="float32", law="paper")[2], dt=DT)
+    try:
+        sim.step(40)
+    except wf.ConvergenceError as error:
+        assert "float32" in str(error)
+    assert np.isfinite(sim.state.displacement.numpy()).all()
 
 
 # commands
