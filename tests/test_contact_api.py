@@ -558,10 +558,12 @@ def test_single_precision_runs(place, law):
 def test_single_precision_runs_or_is_refused_by_name_with_the_papers_jump(place):
     """The unramped damping acts at once at the first touch: some steps have no solution, and are halved."""
     sim = wf.Simulation(thrown(place, dtype="float32", law="paper")[2], dt=DT)
+    refused = ""
     try:
         sim.step(40)
     except wf.ConvergenceError as error:
-        assert "float32" in str(error)
+        refused = str(error)
+    assert not refused or "float32 can't hold this case" in refused
     assert np.isfinite(sim.state.displacement.numpy()).all()
 
 

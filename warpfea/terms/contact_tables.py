@@ -124,7 +124,7 @@ class ContactTables:
         for support in self.model.description.supports:
             if support.law is None and support.node_laws is None and support.rotation is None:
                 held[support.body.slot_offset + support.slots] += support.components
-        return (held > 0).all(axis=1)
+        return np.asarray((held > 0).all(axis=1))
 
     def _share(self, contact: Contact, p: ContactPoints) -> np.ndarray:
         """(F, P) area of each point over that of the region; 0 where it only moves with clamped slots."""
