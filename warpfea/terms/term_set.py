@@ -36,7 +36,7 @@ __all__ = ["KINDS", "TermSet", "all_parts"]
 
 KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Constraints)
 """The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
-LATER = ("per-world parameters",)
+LATER = ("materials per world",)
 """Features of later versions, which `info` lists as left out."""
 STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end")  # fmt: skip
