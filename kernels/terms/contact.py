@@ -19,6 +19,8 @@ __all__ = ["SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
 """Least approach speed that the default law's damping is made for, m/s."""
+PICKS = 4
+"""Choices of the deepest point in an attempt."""
 
 
 @functools.cache
@@ -179,10 +181,17 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.level[world, point] = depth
 
     @wp.kernel(module=module)
-    def pick_deepest(con: Contacts, active: wp.array(dtype=wp.int32), at: Attempt):
-        """The deepest point of each lumped contact; of equals the first."""
+    def pick_deepest(con: Contacts, active: wp.array(dtype=wp.int32), fresh: int, at: Attempt):
+        """The deepest point of each lumped contact, of equals the first; it may change a few times per attempt.
+
+        Where two points are as deep there is no equilibrium with either alone: the last choice stays.
+        """
         world, c = wp.tid()
         if active[world] == 0 or con.lumped[c] == 0:
+            return
+        if fresh != 0:
+            at.picks[world, c] = 0
+        elif at.picks[world, c] >= PICKS:
             return
         best = con.first[c]
         deepest = at.level[world, best]
@@ -190,6 +199,8 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             if at.level[world, point] > deepest:
                 deepest = at.level[world, point]
                 best = point
+        if fresh != 0 or best != at.pick[world, c]:
+            at.picks[world, c] = at.picks[world, c] + 1
         at.pick[world, c] = best
 
     @wp.kernel(module=module)
@@ -232,15 +243,16 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                     if wp.length_sq(force) > f64(0.0):
                         touched = wp.int32(1)
                 else:
-                    held = at.held[world, point]
+                    rec = record_of(con, c, point)
+                    held = at.held[world, rec]
                     time = clock.new_time[world]
                     t = touch(con, facets, his, at, world, c, q, item, point, u, time, inv_h, held[2])
                     new = hold(con, his, at, world, c, point, t)
                     if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
                         held = new
-                        held[0] = wp.min(new[0], his.cap[world, record_of(con, c, point)])
-                        at.held[world, point] = held
-                    at.next[world, point] = new
+                        held[0] = wp.min(new[0], his.cap[world, rec])
+                        at.held[world, rec] = held
+                    at.next[world, rec] = new
                     if t.side == -2:
                         at.through[world] = point + 1
                         held_sum += f64(wp.inf)

@@ -189,6 +189,7 @@ class NewtonLoop:
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
+        ctl.equilibrium = int(not inertia)
         ctl.max_iterations = options.max_newton
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")

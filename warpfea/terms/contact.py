@@ -83,7 +83,7 @@ class Contact(Term):
         lumped, explicit = (B, P) if t.lumped else (1, 1), (B, P) if t.explicit else (1, 1)
         shapes: dict[str, tuple[int, ...]] = {
             "place": (B, K), "turn": (B, K), "level": lumped, "dead": explicit, "dead_spring": explicit,
-            "pick": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R), "rows": (len(RECORD), B, R),
+            "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R), "rows": (len(RECORD), B, R),
             "total": (B, C, len(RECORD)),
         }  # fmt: skip
         attempt = attempt_struct(self.model.dtype)()
@@ -188,21 +188,29 @@ class Contact(Term):
     @part("contact")
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        if self.tables.lumped:
-            for group in self.tables.groups:
-                args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
-                at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
-            args = [self.tables.data, active, s["attempt"]]
-            at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+        if fresh:
+            self._pick(at, active, fresh=1)
         rows = w.rows_of(self)
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], w.u, active, fresh]
             at.launch(k.forces, (m.worlds, group.count), [*args, s["attempt"], w.pool_force, rows])
 
+    def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
+        """Choose the point of each lumped contact, at work.u."""
+        if not self.tables.lumped:
+            return
+        s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
+        for group in self.tables.groups:
+            args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
+            at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
+        args = [self.tables.data, active, fresh, s["attempt"]]
+        at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+
     @part("contact")
     def refresh(self, at: At, flags: wp.array) -> None:
         dim = (self.model.worlds, self.tables.points)
         at.launch(self.kernels.refresh, dim, [flags, at.scratch[self.name]["attempt"]])
+        self._pick(at, flags, fresh=0)
 
     @part("contact")
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
@@ -352,7 +360,13 @@ class Contact(Term):
         every = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
         laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
-        shapes: dict[str, tuple[int, ...]] = {"born": (B,), "place": (B, K), "turn": (B, K), "pick": (B, C)}
+        shapes: dict[str, tuple[int, ...]] = {
+            "born": (B,),
+            "place": (B, K),
+            "turn": (B, K),
+            "pick": (B, C),
+            "picks": (B, C),
+        }
         if history is None:
             history = history_struct()()
             for name, var in history_struct().vars.items():
@@ -360,7 +374,7 @@ class Contact(Term):
                 array = getattr(state, f"contact_{name}") if known else zeros(shapes.get(name, (B, P)), var.type.dtype)
                 setattr(history, name, array)
         attempt = attempt_struct(m.dtype)()
-        for name in ("place", "turn", "pick", "start", "depth", "speed", "level"):
+        for name in ("place", "turn", "pick", "picks", "start", "depth", "speed", "level"):
             dtype = attempt_struct(m.dtype).vars[name].type.dtype
             setattr(attempt, name, zeros(shapes.get(name, (B, P)), dtype))
         attempt.speed.fill_(1.0)
@@ -374,7 +388,7 @@ class Contact(Term):
             launch(self.kernels.settle, dim, [t.data, group.data, state.displacement, attempt])
             args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
             launch(self.kernels.levels, dim, args)
-        launch(self.kernels.pick_deepest, (B, C), [t.data, every, attempt])
+        launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt])
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             args = [t.data, group.data, history, state.displacement, state.time, attempt, gap, force]
