@@ -13,10 +13,10 @@ def bouncing_ball(
     drop: float = 0.2,
     radius: float = 0.05,
     cells: int = 2,
-    E: float = 1e7,
+    E: float = 1e8,
     nu: float = 0.3,
     density: float = 1100.0,
-    stiffness: float = 0.2,
+    stiffness: float = 0.02,
 ) -> wf.ModelBuilder:
     """A ball falls on a floor, and comes up to restitution^2 of the height that it fell from.
 
