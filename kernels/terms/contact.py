@@ -1,7 +1,7 @@
 """Contact of surface points with rigid shapes: forces, their tangent, and what an accepted step keeps and books.
 
-A point's force is the derivative of a scalar: normal_law of its depth, and friction of its anchored slip whose cap mu F_n
-is held in a line search and refreshed at each iterate. The gap and all of the law are in float64.
+A point's force is the derivative of a scalar: `normal_law` of its depth, and `friction` of its anchored slip whose cap
+mu F_n is held in a line search and refreshed at each iterate. The gap and all of the law are in float64.
 """
 
 import functools
@@ -485,6 +485,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     return _types.SimpleNamespace(
         module=module, Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, touch=touch, hold=hold,
         pull=pull, friction_force=friction_force, acts=acts, poses=poses, begin_points=begin_points,
-        settle=settle, explicit_forces=explicit_forces, levels=levels, pick_deepest=pick_deepest, forces=forces, adopt=adopt,
-        product=product, diagonal=diagonal,
+        settle=settle, explicit_forces=explicit_forces, levels=levels, pick_deepest=pick_deepest, forces=forces,
+        adopt=adopt, product=product, diagonal=diagonal,
     )  # fmt: skip

@@ -19,8 +19,8 @@ __all__ = ["BOOKED", "LANES", "book_kernels", "contact_block_kernels"]
 BOOKED = 5  # stored, loss, friction, work of the colliders, the integrator's part
 LANES = 32
 SUMS = len(RECORD) - 1
-FORCES, LAST = 7, (8, 9, 10)
-"""Rows that are averaged over the substeps of a step: the first so many; those that hold at its end: area, stick, stored."""
+FORCES = 7
+"""Rows averaged over the substeps of a step, the first so many; area, stick and stored are those at its end."""
 
 
 @functools.cache
@@ -33,7 +33,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     History, Attempt, Step = history_struct(), attempt_struct(dtype), step_struct()
     Newton = control_struct()
     k = contact_kernels(dtype)
-    touch, hold, pull, acts, along = k.touch, k.hold, k.pull, k.acts, k.along
+    touch, hold, pull, acts = k.touch, k.hold, k.pull, k.acts
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
     elastic = law_functions().elastic
     module = kernel_module(f"contact_{dtype}", max_unroll=SMALL)
@@ -207,7 +207,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def keep_poses(step: Step, newton: Newton, accepted: wp.array(dtype=wp.int32), his: History, at: Attempt):
-        """Colliders of an accepted substep stay where they are, and its energy counts in the bound of first iterates."""
+        """Keep the places of the colliders; the energy of contact counts in the bound of the next first iterate."""
         world, k = wp.tid()
         if accepted[world] == 0:
             return

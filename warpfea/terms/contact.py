@@ -303,47 +303,34 @@ class Contact(Term):
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""
         m, t, B = self.model, self.tables, state.worlds
         launch, laws = Launcher(m.device), m.terms.laws
+        K, P, C = len(t.colliders), t.points, len(t.contacts)
+
+        def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=m.device)
+
         every = wp.ones(B, dtype=wp.int32, device=m.device)
-        value = wp.zeros((B, max(laws.count, 1)), dtype=wp.vec3d, device=m.device)
+        value = zeros((B, max(laws.count, 1)), wp.vec3d)
         laws.evaluate(launch, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
-        P = t.points
+        shapes: dict[str, tuple[int, ...]] = {"born": (B,), "place": (B, K), "turn": (B, K), "pick": (B, C)}
         if history is None:
             history = history_struct()()
             for name, var in history_struct().vars.items():
-                known = state.specs.get(f"contact_{name}")
-                shape = (B,) if name == "born" else (B, len(t.colliders)) if name in ("place", "turn") else (B, P)
-                array = (
-                    getattr(state, f"contact_{name}")
-                    if known
-                    else wp.zeros(shape, dtype=var.type.dtype, device=m.device)
-                )
+                known = f"contact_{name}" in state.specs
+                array = getattr(state, f"contact_{name}") if known else zeros(shapes.get(name, (B, P)), var.type.dtype)
                 setattr(history, name, array)
         attempt = attempt_struct(m.dtype)()
-        for name, shape in (
-            ("place", (B, len(t.colliders))),
-            ("turn", (B, len(t.colliders))),
-            ("pick", (B, len(t.contacts))),
-        ):
-            setattr(
-                attempt, name, wp.zeros(shape, dtype=attempt_struct(m.dtype).vars[name].type.dtype, device=m.device)
-            )
-        for name in ("start", "depth", "speed", "held", "level"):
-            setattr(
-                attempt, name, wp.zeros((B, P), dtype=attempt_struct(m.dtype).vars[name].type.dtype, device=m.device)
-            )
+        for name in ("place", "turn", "pick", "start", "depth", "speed", "level"):
+            dtype = attempt_struct(m.dtype).vars[name].type.dtype
+            setattr(attempt, name, zeros(shapes.get(name, (B, P)), dtype))
         attempt.speed.fill_(1.0)
-        launch(self.kernels.poses, (B, len(t.colliders)), [t.data, value, every, attempt])
-        gap, force = (
-            wp.zeros((B, P), dtype=wp.float64, device=m.device),
-            wp.zeros((B, P), dtype=wp.vec3d, device=m.device),
-        )
+        launch(self.kernels.poses, (B, K), [t.data, value, every, attempt])
+        gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             launch(self.kernels.settle, dim, [t.data, group.data, state.displacement, attempt])
-            launch(
-                self.kernels.levels, dim, [t.data, group.data, history, state.time, state.displacement, every, attempt]
-            )
-        launch(self.kernels.pick_deepest, (B, len(t.contacts)), [t.data, every, attempt])
+            args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
+            launch(self.kernels.levels, dim, args)
+        launch(self.kernels.pick_deepest, (B, C), [t.data, every, attempt])
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             args = [t.data, group.data, history, state.displacement, state.time, attempt, gap, force]

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = ["ContactTables", "FacetGroup", "beta_of", "hunt_crossley_damping"]
 
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
+SMOOTHING = (1e-3, 1e-4)
+"""Of the smooth law where none is given: eps, N, and v_eps, m/s."""
 CONSTANT = 2.0 * math.sqrt(5.0 / 6.0)
 
 
@@ -250,7 +252,7 @@ def law_numbers(contact: Contact) -> dict[str, float]:
     else:
         a = math.sqrt(float(contact_points(contact.surface, contact.points).area.sum()) / math.pi)
     smoothing = contact.smoothing
-    pair = smoothing if isinstance(smoothing, tuple) else (0.0, 0.0)
+    pair = smoothing if isinstance(smoothing, tuple) else SMOOTHING
     return {
         "normal": 4.0 / 3.0 * modulus * a,
         "tangent": 8.0 * shear * a,
