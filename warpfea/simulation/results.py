@@ -97,13 +97,17 @@ class Results:
             moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
             return np.linalg.norm(moved, axis=2)
         if name != "von_mises":
-            samples = body.family.node_samples.shape[1]
-            return np.stack([drawn.node_weights @ np.repeat(row, samples) for row in self.field(name, body)])
+            term, _ = self.model.terms.fields[name]
+            values = term.samples(name, body, self.state)
+            if values is None:
+                values = np.repeat(self.field(name, body), body.family.node_samples.shape[1], axis=1)
+            return np.stack([drawn.node_weights @ row for row in values])
         stress = self._stress(name, body)  # the tensor is interpolated: a bent section shows its neutral axis
         return von_mises(np.stack([drawn.node_weights @ row for row in stress]))
 
     def field(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), or one of a term.
+        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), or one of a term:
+        with contact "contact_pressure" (Pa, elastic, 0 away from contact) and "gap" (m, NaN off surfaces in contact).
 
         The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
         """

@@ -14,6 +14,7 @@ from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, history_struct
 from ..model.state import State
+from .contact_fields import contact_field
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
 from .time_laws import TimeLaws
@@ -298,6 +299,15 @@ class Contact(Term):
         return {contact_block_kernels(self.model.dtype).module}
 
     # at a state
+
+    def sample(self, field: str, body: Any, state: State) -> np.ndarray:
+        """Of a node of a beam the values at the corner of its section with most contact, of a shell at that face."""
+        values = self.samples(field, body, state).reshape(state.worlds, len(body.mesh.points), -1)
+        # least of the gaps; fmin passes over NaN
+        return values.max(axis=2) if field == "contact_pressure" else np.fmin.reduce(values, axis=2)
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        return contact_field(self, field, body, state)
 
     def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""
