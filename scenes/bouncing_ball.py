@@ -12,7 +12,7 @@ def bouncing_ball(
     restitution: float = 0.8,
     drop: float = 0.2,
     radius: float = 0.05,
-    cells: int = 2,
+    cells: int = 4,
     E: float = 1e8,
     nu: float = 0.3,
     density: float = 1100.0,

@@ -11,6 +11,7 @@ from ..base.names import did_you_mean
 from ..model.bodies import Body
 from ..model.state import State
 from ..model.surfaces import reference_points
+from ..terms.contact import Contact
 from ..terms.evaluation import von_mises
 from ..terms.term import FieldSpec
 
@@ -78,6 +79,14 @@ class Results:
     def skin_field(self, name: str, body: Body) -> np.ndarray:
         """(B, skin points) scalars of a field at the drawn surface."""
         return self.field_on(name, body, body.skin)
+
+    def collider_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Where the colliders are: places (B, K, 3), m, turns (B, K, 3, 3), whose columns are a shape's axes in the
+        world, and by how much surfaces lie further out (B, K), m; None of a model without contact."""
+        for term in self.model.terms.all:
+            if isinstance(term, Contact):
+                return term.poses(self.state)
+        return None
 
     @property
     def fields(self) -> dict[str, FieldSpec]:

@@ -300,6 +300,13 @@ class Contact(Term):
 
     # at a state
 
+    def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Places (worlds, colliders, 3), m, and turns (..., 3, 3) of the colliders at a state, and by how much their
+        surfaces lie further out (worlds, colliders), m; None of a state without history."""
+        if "contact_place" not in state.specs:
+            return None
+        return state.contact_place.numpy(), state.contact_turn.numpy(), self.tables.data.grow.numpy()  # type: ignore[attr-defined]
+
     def sample(self, field: str, body: Any, state: State) -> np.ndarray:
         """Of a node of a beam the values at the corner of its section with most contact, of a shell at that face."""
         values = self.samples(field, body, state).reshape(state.worlds, len(body.mesh.points), -1)
