@@ -109,9 +109,7 @@ def near(points: Floats, low: Floats, high: Floats, part: float) -> Floats:
     return np.clip(points, low - margin, high + margin)
 
 
-def split_edges(
-    points: Floats, triangles: npt.NDArray[np.integer[Any]]
-) -> tuple[Floats, npt.NDArray[np.int32]]:
+def split_edges(points: Floats, triangles: npt.NDArray[np.integer[Any]]) -> tuple[Floats, npt.NDArray[np.int32]]:
     """The same triangles with a point of their own for each smooth face at an edge."""
     group, count = smooth_corners(points, triangles)
     corner = np.empty(count, dtype=np.int64)

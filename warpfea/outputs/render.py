@@ -319,7 +319,7 @@ class _Source:
             hint = did_you_mean(name, self.about["fields"])
             raise ModelError(f"{self.path}: has no field {name!r}; fields: {have}{hint}")
         triangles, first, bodies, sheets = [], 0, 0, []
-        for mesh in self.meshes + self.obstacles:
+        for k, mesh in enumerate(self.meshes + self.obstacles):
             counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
             if (counts != 3).any():
                 raise ModelError(f"{self.path}: {mesh.GetPath()} has faces that are not triangles")
@@ -327,7 +327,7 @@ class _Source:
             if mesh.GetPrim().GetCustomDataByKey("warpfea:collider") == "HalfSpace":
                 sheets.append(first)
             first += len(mesh.GetPointsAttr().Get(self.start * self.rate))
-            if mesh in self.meshes:
+            if k < len(self.meshes):
                 bodies = first
         start = self._points(self.start)
         self.origin = 0.5 * (start[:bodies].min(axis=0) + start[:bodies].max(axis=0))

@@ -74,9 +74,7 @@ class ObstaclePrims:
         """Find the prims in a stage that is continued; False if it has others."""
         from pxr import UsdGeom
 
-        there = {
-            str(prim.GetParent().GetPath()) for prim in self.stage.Traverse() if prim.GetCustomDataByKey(KEY)
-        }
+        there = {str(prim.GetParent().GetPath()) for prim in self.stage.Traverse() if prim.GetCustomDataByKey(KEY)}
         worlds = range(self.surface.worlds)
         if there != {self._path(world, name) for name in self.names for world in worlds}:
             return False

@@ -314,7 +314,7 @@ class Contact(Term):
         return values.max(axis=2) if field == "contact_pressure" else np.fmin.reduce(values, axis=2)
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
-        return contact_field(self, field, body, state)
+        return contact_field(self.tables, field, body, state.worlds, lambda: self.at_points(state))
 
     def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""

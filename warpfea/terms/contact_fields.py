@@ -2,41 +2,39 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ..kernels.terms.contact_laws import SMOOTH
 from ..model.discretisation import Discretisation, element_functions
-from ..model.state import State
 from .contact_tables import LAWS, ContactTables
-
-if TYPE_CHECKING:
-    from .contact import Contact
 
 __all__ = ["contact_field"]
 
 
-def contact_field(term: Contact, name: str, body: Any, state: State) -> np.ndarray:
+def contact_field(
+    t: ContactTables, name: str, body: Any, worlds: int, at_points: Callable[[], tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
     """(worlds, nodes x samples) "contact_pressure" or "gap" at the samples of each node of a body.
 
     Every contact point counts at the sample closest to it in the reference. Pressure is the elastic normal force of a
     sample's points over the area that they stand for; of several contacts it adds up. Gap is the smallest of the
-    points, NaN where a sample has none.
+    points, NaN where a sample has none. `at_points` gives gaps and forces of all points.
     """
-    t = term.tables
     mine = [k for k, contact in enumerate(t.contacts) if contact.body is body]
     nodes = len(body.mesh.points) * body.family.node_samples.shape[1]
-    pressure, least = np.zeros((state.worlds, nodes)), np.full((state.worlds, nodes), np.inf)
+    pressure, least = np.zeros((worlds, nodes)), np.full((worlds, nodes), np.inf)
     if mine:
-        gap, force = term.at_points(state)
+        gap, force = at_points()
     for k in mine:
         points = slice(t.first[k], t.first[k + 1])
         nearest = _nearest(t, k)
         area = np.bincount(nearest, weights=t.host[k].area.ravel(), minlength=nodes)
         normal = _normal_force(t, k, gap[:, points], force[:, points])
-        for world in range(state.worlds):
+        for world in range(worlds):
             total = np.bincount(nearest, weights=normal[world], minlength=nodes)
             pressure[world] += np.divide(total, area, out=np.zeros(nodes), where=area > 0.0)
             np.minimum.at(least[world], nearest, gap[world, points])
