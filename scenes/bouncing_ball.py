@@ -6,7 +6,7 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=5e-4, t_end=0.6, integrator="bdf2", tol=1e-6, fps=100.0, speed=0.25, picture=0.6)
+@scene(dt=5e-4, t_end=0.6, integrator="bdf2", tol=1e-6, fps=100.0, speed=0.25, picture=0.45)
 def bouncing_ball(
     *,
     restitution: float = 0.8,

@@ -8,7 +8,7 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=1e-2, t_end=2.3, tol=1e-8, fps=50.0, speed=1.0, picture=2.2)
+@scene(dt=1e-2, t_end=2.3, integrator="bdf2", tol=1e-8, fps=50.0, speed=1.0, picture=2.2)
 def tilting_table(
     *,
     mu: float = 0.3,
