@@ -57,7 +57,9 @@ def test_block_slips_where_the_tangent_of_the_tables_angle_is_mu(mu):
 
 @pytest.mark.parametrize("restitution", [0.5, 0.8])
 def test_ball_comes_up_to_the_square_of_its_restitution(restitution):
-    sim, _, path = simulate("bouncing_ball", cells=2, restitution=restitution, t_end=0.45 if restitution > 0.6 else 0.36)
+    sim, _, path = simulate(
+        "bouncing_ball", cells=2, restitution=restitution, t_end=0.45 if restitution > 0.6 else 0.36
+    )
     height = path[:, 2] - 0.05
     low = int(np.argmin(height))
     assert height[low:].max() == pytest.approx(restitution**2 * 0.2, rel=0.03)
