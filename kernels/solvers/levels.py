@@ -245,25 +245,29 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     def apply_dense(
         matrix: wp.array3d(dtype=S),
         root: wp.array2d(dtype=T),
+        part: int,
         lanes: int,
         r: wp.array2d(dtype=T),
         active: wp.array(dtype=wp.int32),
         x: wp.array2d(dtype=T),
     ):
-        """x = A^-1 r with a dense inverse, `lanes` threads per row."""
+        """x = B r with a dense matrix, `lanes` threads per row.
+
+        `part`: 0: the whole of it; 1: its lower triangle; 2: its upper triangle, with the diagonal.
+        """
         world, index = wp.tid()
         if active[world] == 0:
             return
         lane = index % lanes
         row = wp.min(index / lanes, x.shape[1] - 1)
         # four independent sums, so that enough loads are under way at a time
-        n = r.shape[1]
+        n = wp.where(part == 1, row + 1, r.shape[1])
         s0 = T(0.0)
         s1 = T(0.0)
         s2 = T(0.0)
         s3 = T(0.0)
         last = n - 3 * lanes
-        k = lane
+        k = wp.where(part == 2, row, 0) + lane
         while k < last:
             s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
             s1 += T(matrix[world, row, k + lanes]) * part_of(root, r, world, k + lanes)

@@ -10,9 +10,10 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import Launcher
+from ..kernels.common.traits import Traits
 from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
-from ..kernels.terms.contact_data import RECORD, attempt_struct, history_struct
+from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
 from .contact_fields import contact_field
 from .contact_tables import ContactTables
@@ -53,6 +54,7 @@ class Contact(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
+        self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
         self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
@@ -88,8 +90,13 @@ class Contact(Term):
         attempt = attempt_struct(self.model.dtype)()
         for name, var in attempt_struct(self.model.dtype).vars.items():
             setattr(attempt, name, work.array(f"contact {name}", shapes.get(name, (B, P)), var.type.dtype))
+        clock = clock_struct()()
+        for name in ("time", "new_time", "h", "part"):
+            setattr(clock, name, getattr(work.step, name))
+        clock.time, clock.still = at.state.time, int(not at.inertia)
         scratch = {
             "attempt": attempt,
+            "clock": clock,
             "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
@@ -162,19 +169,18 @@ class Contact(Term):
     @part("contact")
     def begin(self, at: At, active: wp.array) -> None:
         """Colliders at the end of the attempt, points at its beginning."""
-        s, m, w = at.scratch[self.name], self.model, at.work
-        static = int(not at.inertia)
+        s, m = at.scratch[self.name], self.model
         self._poses(at, active)
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
-            args = [self.tables.data, group.data, s["history"], w.step, static]
+            args = [self.tables.data, group.data, s["history"], s["clock"]]
             more = [at.state.displacement, at.state.velocity, active, s["attempt"]]
             at.launch(self.kernels.begin_points, dim, [*args, *more])
             if self.tables.explicit:
                 at.launch(self.kernels.explicit_forces, dim, [*args, *more[1:]])
 
     def prepare(self, at: At, active: wp.array) -> None:
-        """Caps of the first iterate, and the stiffness that blocks are made from."""
+        """The first caps, and the stiffness that blocks are made from."""
         self._forces(at, active, fresh=1)
 
     def force(self, at: At, active: wp.array) -> None:
@@ -183,7 +189,6 @@ class Contact(Term):
     @part("contact")
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        static = int(not at.inertia)
         if self.tables.lumped:
             for group in self.tables.groups:
                 args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
@@ -192,15 +197,13 @@ class Contact(Term):
             at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
         rows = w.rows_of(self)
         for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], w.step, static, w.u, active, fresh]
+            args = [self.tables.data, group.data, s["history"], s["clock"], w.u, active, fresh]
             at.launch(k.forces, (m.worlds, group.count), [*args, s["attempt"], w.pool_force, rows])
 
     @part("contact")
-    def adopt(self, at: At, flags: wp.array) -> None:
-        """Hold the caps of the iterate in the next search."""
-        at.launch(
-            self.kernels.adopt, (self.model.worlds, self.tables.points), [flags, at.scratch[self.name]["attempt"]]
-        )
+    def refresh(self, at: At, flags: wp.array) -> None:
+        dim = (self.model.worlds, self.tables.points)
+        at.launch(self.kernels.refresh, dim, [flags, at.scratch[self.name]["attempt"]])
 
     @part("contact")
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
@@ -225,21 +228,20 @@ class Contact(Term):
     def _finish(self, at: At, accepted: wp.array) -> None:
         """History, books and records of an accepted substep."""
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.books
-        static = int(not at.inertia)
         C = len(self.tables.contacts)
         for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], w.step, static, w.u, accepted, s["attempt"]]
+            args = [self.tables.data, group.data, s["history"], s["clock"], w.u, accepted, s["attempt"]]
             at.launch(k.finish, (m.worlds, group.count), [*args, s["booked"]])
         args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         at.launch(k.partial_records, (m.worlds, C, LANES), args)
-        at.launch(k.total_records, (m.worlds, C), [w.step, static, accepted, s["parts"], s["attempt"]])
+        at.launch(k.total_records, (m.worlds, C), [s["clock"], accepted, s["parts"], s["attempt"]])
 
     @part("contact")
     def commit(self, at: At, accepted: wp.array) -> None:
         s, m, w = at.scratch[self.name], self.model, at.work
         if not s.get("finished"):
             self._finish(at, accepted)
-        args = [w.step, w.newton, accepted, s["history"], s["attempt"]]
+        args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
         at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), args)
 
     def report(self, at: At) -> None:
@@ -327,7 +329,7 @@ class Contact(Term):
 
         every = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
-        laws.evaluate(launch, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
         shapes: dict[str, tuple[int, ...]] = {"born": (B,), "place": (B, K), "turn": (B, K), "pick": (B, C)}
         if history is None:
             history = history_struct()()

@@ -241,6 +241,12 @@ class Term:
     def adopt(self, at: At, flags: wp.array) -> None:
         """A trial was accepted in the flagged worlds: hold its multipliers, caps, ... in the next search."""
 
+    def refresh(self, at: At, flags: wp.array) -> None:
+        """With the trait "walls": take anew, in the flagged worlds, what Newton's method has held so far.
+
+        Forces are evaluated again after it, and judged: the residual is that of what is held now.
+        """
+
     def follow(self, at: At, active: wp.array) -> None:
         """There is a new iterate, and a linear solve to come."""
 
