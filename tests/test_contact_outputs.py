@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 
-import meshio
 import numpy as np
 import pytest
-from PIL import Image
 
 import warpfea as wf
+from warpfea.outputs.frames import Surface
 from warpfea.outputs.obstacles import Obstacles
 from warpfea.outputs.render import render_usd
 
@@ -132,6 +131,7 @@ def test_shapes_are_drawn_where_they_are():
 
 
 def test_usd_has_colliders(tmp_path):
+    from PIL import Image
     from pxr import Usd, UsdGeom
 
     sim = scene(worlds=2)
@@ -182,6 +182,8 @@ def test_usd_of_a_resumed_run_goes_on_with_colliders(tmp_path):
 
 
 def test_vtu_has_colliders_as_a_series_of_their_own(tmp_path):
+    import meshio
+
     folder = tmp_path / "out"
     sim = scene(worlds=2)
     sim.run(0.02, outputs=[wf.VTUWriter(folder, fields=("contact_pressure", "gap"))])
@@ -198,9 +200,12 @@ def test_vtu_has_colliders_as_a_series_of_their_own(tmp_path):
     assert "collider" not in (folder / "out.pvd").read_text()
 
 
-def vivid(image):
+def vivid(path):
     """Share of pixels in the colours of a field."""
-    pixels = np.asarray(image).astype(int)[:, : int(0.8 * image.width)]
+    from PIL import Image
+
+    image = np.asarray(Image.open(path)).astype(int)
+    pixels = image[:, : int(0.8 * image.shape[1])]
     return float((pixels.max(axis=2) - pixels.min(axis=2) > 60).mean())
 
 
@@ -220,4 +225,47 @@ def test_pictures_show_the_body_whatever_the_plane(tmp_path, plane):
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     target = tmp_path / "a.png"
     sim.run(2e-3, outputs=[wf.PNGWriter(target, size=(320, 180), field="contact_pressure", color_range=(0, 1))])
-    assert vivid(Image.open(target)) > 0.08
+    assert vivid(target) > 0.08
+
+
+def test_tilted_planes_of_many_worlds_do_not_cover_other_worlds():
+    b = wf.ModelBuilder()
+    block = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=RUBBER)
+    b.add_contact(block, b.add_collider(wf.HalfSpace((0.3, 0, 1), -0.2)))
+    one, four = (Surface(wf.Simulation(b.finalize(device="cpu", worlds=n), dt=1e-3)) for n in (1, 4))
+
+    def width(surface):
+        square = surface.obstacles.all[0].points[0]
+        return np.linalg.norm(square[1] - square[0])
+
+    assert width(one) == pytest.approx(6.0 * 0.1 * np.sqrt(3.0))
+    assert width(four) == pytest.approx(four.offsets[1, 0])
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        wf.Sphere((0, 0, -1), 0.5),
+        wf.Box((0, 0, -1), (0.4, 0.6, 0.8)),
+        wf.Capsule((0, 0, -1), (0.3, 0, -1), 0.2),
+        wf.Cylinder((0, 0, -1), (0.3, 0, -1), 0.2),
+        wf.HalfSpace((0, 0, 1), -0.2),
+    ],
+)
+def test_surfaces_that_lie_further_out_are_drawn_there(shape):
+    b = wf.ModelBuilder()
+    block = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=RUBBER)
+    b.add_contact(block, b.add_collider(shape))
+    sim = wf.Simulation(b.finalize(device="cpu", worlds=2), dt=1e-3)
+    low, high = np.zeros(3), np.full(3, 0.1)
+    (before,) = Obstacles(sim, low, high).points()
+    (term,) = (term for term in sim.model.terms.all if term.name == "contact")
+    term.tables.data.grow.assign(np.array([[0.0], [0.05]]))
+    (after,) = Obstacles(sim, low, high).points()
+    np.testing.assert_allclose(after[0], before[0], atol=1e-15)
+    moved = after[1] - before[1]
+    if shape.kind == 0:
+        np.testing.assert_allclose(moved, np.broadcast_to((0, 0, 0.05), moved.shape), atol=1e-15)
+        return
+    np.testing.assert_allclose(after[1].max(axis=0) - before[1].max(axis=0), 0.05, atol=1e-12)
+    np.testing.assert_allclose(after[1].min(axis=0) - before[1].min(axis=0), -0.05, atol=1e-12)

@@ -36,6 +36,7 @@ FIELDS: dict[str, tuple[str, str]] = {
     "velocity": ("velocity", "m/s"),
     "strain_energy_density": ("strain energy density", "J/m3"),
     "contact_pressure": ("contact pressure", "Pa"),
+    "gap": ("gap", "m"),
     "J": ("volume ratio J", ""),
 }
 
@@ -141,8 +142,11 @@ class Surface:
         low = np.min([points.min(axis=(0, 1)) for points in start], axis=0)
         high = np.max([points.max(axis=(0, 1)) for points in start], axis=0)
         self.obstacles = Obstacles(sim, low, high)
-        start += [near(points, low, high, 0.5) for points in self.obstacles.bounded()]
-        self.offsets = grid_offsets(self.worlds, self._spacing(start, spacing), self.up_axis)
+        start += [np.asarray(near(points, low, high, 0.5), dtype=np.float64) for points in self.obstacles.bounded()]
+        distance = self._spacing(start, spacing)
+        self.offsets = grid_offsets(self.worlds, distance, self.up_axis)
+        if min(distance) > 0.0:  # a plane may not hide the bodies of other worlds
+            self.obstacles.narrow(min(distance))
 
     def _spacing(
         self, start: list[npt.NDArray[np.float64]], spacing: float | tuple[float, float] | None

@@ -7,7 +7,7 @@ axes, and by how much surfaces lie further out (B, K), m. Others have nothing to
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from warpfea.outputs.normals import smooth_corners
 
 __all__ = ["GREY", "SHEET", "Obstacle", "Obstacles", "names_beside", "near"]
 
+Array = npt.NDArray[np.floating[Any]]
 Floats = npt.NDArray[np.float64]
 GREY = (0.60, 0.60, 0.61)
 """Colour of obstacles, sRGB."""
@@ -78,6 +79,14 @@ class Obstacles:
             grown = np.stack([_grown(shape, points, by) for by in grow[:, k]])
             self.all.append(Obstacle(collider.name, type(shape).__name__, grown, triangles, collider.moves))
 
+    def narrow(self, width: float) -> None:
+        """Make squares at most so wide, m."""
+        for k, obstacle in enumerate(self.all):
+            if obstacle.sheet:
+                middle = obstacle.points.mean(axis=1, keepdims=True)
+                part = min(1.0, width / np.linalg.norm(obstacle.points[0, 1] - obstacle.points[0, 0]))
+                self.all[k] = replace(obstacle, points=middle + part * (obstacle.points - middle))
+
     def __len__(self) -> int:
         return len(self.all)
 
@@ -103,7 +112,7 @@ class Obstacles:
         return [points for points, obstacle in zip(self.points(), self.all) if not obstacle.sheet]
 
 
-def near(points: Floats, low: Floats, high: Floats, part: float) -> Floats:
+def near(points: Array, low: Array, high: Array, part: float) -> Array:
     """Points (..., 3) brought into the box from low to high, grown each way by a part of its diagonal."""
     margin = part * float(np.linalg.norm(high - low))
     return np.clip(points, low - margin, high + margin)

@@ -22,7 +22,7 @@ Floats = npt.NDArray[np.floating[Any]]
 _INK = (45, 50, 60)
 _GREY = (0.62, 0.66, 0.72)
 _BAR = 0.17  # share of the width that the colour bar takes
-_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))  # the font has no µ
 _PAUSE = 0.6  # s that an animation rests on its last frame
 
 
@@ -83,7 +83,10 @@ class Reel:
         for k in chosen:
             frame = self.frames[k]
             colors = np.full(frame.points.shape, OBSTACLE, dtype=np.float32)
-            colors[:n] = _GREY if frame.values is None else map_colors(frame.values, low, high)
+            colors[:n] = _GREY
+            if frame.values is not None:
+                known = np.isfinite(frame.values)
+                colors[:n][known] = map_colors(frame.values[known], low, high)
             image = renderer.render(frame.points[used], colors[used], camera, size)
             yield label(
                 image,

@@ -178,7 +178,7 @@ class VTUWriter(Output):
         files = []
         drawn = zip(self._obstacles.all, self._collider_names, self._obstacles.points())
         for k, (obstacle, name, points) in enumerate(drawn):
-            cells = ("triangle", obstacle.triangles, {})
+            cells: Cells = ("triangle", obstacle.triangles, {})
             for world in range(len(points)):
                 before, file = self._placed.get((k, world), (None, ""))
                 if before is None or not np.array_equal(before, points[world]):
