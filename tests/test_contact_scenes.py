@@ -112,9 +112,9 @@ def test_block_lags_behind_the_belt_by_the_way_that_friction_needs():
 def test_a_body_in_flight_takes_no_more_iterations_for_a_floor_below(dtype, stretch):
     """Stretched at the start it vibrates; in float32 its residual then stays at its rounding."""
     taken = []
+    center = np.array((0.0, 0.0, 0.25))
     for contact in (False, True):
         b = wf.ModelBuilder()
-        center = np.array((0.0, 0.0, 0.25))
         mesh = wf.mesh.sphere(0.05, cells=2, center=center)
         ball = b.add_solid(mesh, material=wf.SVK(E=1e8, nu=0.3, density=1100.0))
         b.set_initial(ball, velocity=lambda X: stretch * (X - center) + (0.0, 0.0, 1.5))
