@@ -243,8 +243,8 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def row_times(
-        matrix: wp.array3d(dtype=S), root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, row: int, first: int,
-        n: int, lanes: int,
+        matrix: wp.array3d(dtype=S), root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, row: int,
+        first: int, n: int, lanes: int,
     ) -> T:  # fmt: skip
         """A lane's part of a row times r, from `first` to n."""
         # four independent sums, so that enough loads are under way at a time

@@ -68,9 +68,12 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, at: Attempt, world: int, c: int, q: int, item: int,
         point: int, u: wp.array2d(dtype=vec3),
     ) -> Outcome:  # fmt: skip
-        """The force on the body does `given` = f . (motion of the collider's material at the point) and, on the relative
+        """What a point leaves.
+
+        The force on the body does `given` = f . (motion of the collider's material at the point) and, on the relative
         motion, -(change of what is stored + loss + friction + the integrator's part). That part is made of its own
-        formulas: chords of convex energies, and what a turning normal and a turning collider leave."""
+        formulas: chords of convex energies, and what a turning normal and a turning collider leave.
+        """
         out = Outcome()
         rec = record_of(con, c, point)
         kc = con.collider[c]

@@ -253,6 +253,8 @@ class NewtonLoop:
         choose = bool(self.candidates) and first
         self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
         self._rarely(self._choose if choose else self._look_for_inversion)
+        if self.terms.traits.walls:  # the first iterate may be the solution, as of a body that falls freely
+            self._refresh()
         self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
 

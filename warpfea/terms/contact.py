@@ -15,6 +15,7 @@ from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
+from .contact_fields import contact_field
 from .contact_parameters import contact_parameters
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
@@ -83,7 +84,8 @@ class Contact(Term):
         lumped, explicit = (B, P) if t.lumped else (1, 1), (B, P) if t.explicit else (1, 1)
         shapes: dict[str, tuple[int, ...]] = {
             "place": (B, K), "turn": (B, K), "level": lumped, "dead": explicit, "dead_spring": explicit,
-            "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R), "rows": (len(RECORD), B, R),
+            "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R),
+            "rows": (len(RECORD), B, R),
             "total": (B, C, len(RECORD)),
         }  # fmt: skip
         attempt = attempt_struct(self.model.dtype)()
@@ -347,6 +349,22 @@ class Contact(Term):
             for world in range(state.worlds):
                 np.add.at(out[world], slots, at_slot[world])
         return out
+
+    def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Places (worlds, colliders, 3), m, and turns (..., 3, 3) of the colliders at a state, and by how much their
+        surfaces lie further out (worlds, colliders), m; None of a state without history."""
+        if "contact_place" not in state.specs:
+            return None
+        return state.contact_place.numpy(), state.contact_turn.numpy(), self.tables.data.grow.numpy()  # type: ignore[attr-defined]
+
+    def sample(self, field: str, body: Any, state: State) -> np.ndarray:
+        """Of a node of a beam the values at the corner of its section with most contact, of a shell at that face."""
+        values = self.samples(field, body, state).reshape(state.worlds, len(body.mesh.points), -1)
+        # least of the gaps; fmin passes over NaN
+        return values.max(axis=2) if field == "contact_pressure" else np.fmin.reduce(values, axis=2)
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        return contact_field(self.tables, field, body, state.worlds, lambda: self.at_points(state))
 
     def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""

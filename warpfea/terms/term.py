@@ -332,3 +332,7 @@ class Term:
     def sample(self, field: str, body: Any, state: State) -> np.ndarray:
         """(worlds, nodes of the body's mesh) values of one of `fields`."""
         raise NotImplementedError
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray | None:
+        """(worlds, nodes x samples of a node) values for drawing, on sections and faces; None: those of `sample`."""
+        return None
