@@ -181,7 +181,9 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.level[world, point] = depth
 
     @wp.kernel(module=module)
-    def pick_deepest(con: Contacts, active: wp.array(dtype=wp.int32), fresh: int, at: Attempt):
+    def pick_deepest(
+        con: Contacts, active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, changed: wp.array(dtype=wp.int32)
+    ):  # fmt: skip
         """The deepest point of each lumped contact, of equals the first; it may change a few times per attempt.
 
         Where two points are as deep there is no equilibrium with either alone: the last choice stays.
@@ -201,6 +203,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                 best = point
         if fresh != 0 or best != at.pick[world, c]:
             at.picks[world, c] = at.picks[world, c] + 1
+            changed[world] = 1
         at.pick[world, c] = best
 
     @wp.kernel(module=module)
