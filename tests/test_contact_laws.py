@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-
 from warpfea.kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
+
 from warpfea.terms.contact_tables import beta_of, hunt_crossley_damping
 
 COUNT = 4000
@@ -33,7 +33,8 @@ def _kernels():
 
     @wp.kernel(module=module)
     def tangent(
-        smooth: int, a: f64, b: f64, slip: wp.array(dtype=vec3d), cap: wp.array(dtype=f64), out: wp.array(dtype=wp.vec2d)
+        smooth: int, a: f64, b: f64, slip: wp.array(dtype=vec3d), cap: wp.array(dtype=f64),
+        out: wp.array(dtype=wp.vec2d),
     ):  # fmt: skip
         i = wp.tid()
         if smooth != 0:
@@ -190,7 +191,7 @@ def run_explicit(lumped, e, per_contact):
 
 @functools.cache
 def _rebound_kernel():
-    """A mass on one contact by backward Euler; each step's equation is solved by bisection, so that only the law counts."""
+    """A mass on one contact by backward Euler; the equation of a step is solved by bisection."""
     normal_law = law_functions().normal_law
     f64 = wp.float64
     module = wp.get_module("contact_rebound_alone")
