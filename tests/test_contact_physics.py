@@ -503,7 +503,12 @@ for integration in ("tied", "split", "full"):
     FAMILIES[f"3243, {integration}"] = lambda b, m, how=integration: bar(b, m, how)
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+TIED = pytest.mark.xfail(strict=True, reason="1e-3: tied shells are not uniform without contact either, see below")
+
+
+@pytest.mark.parametrize(
+    "family", [pytest.param(name, marks=TIED) if name == "3443, tied" else name for name in FAMILIES]
+)
 def test_uniform_pressure_on_a_flat_collider(family):
     pressure, _, _ = pressed(FAMILIES[family])
     assert np.ptp(pressure) < 1e-8 * pressure.mean()
@@ -515,3 +520,50 @@ def test_total_stiffness_does_not_depend_on_the_mesh():
         _, depth, force = pressed(lambda b, m, cells=cells: solid(b, "T4", m, cells))
         totals.append(force / depth.mean())
     assert np.ptp(totals) < 0.01 * totals[0]
+
+
+def test_tied_shells_are_not_uniform_without_contact_either():
+    """Between two equal loads the thickness of a plate of nu = 0.3 differs from node to node by 2e-4; not with "full".
+
+    Points, areas and functions of contact are the same with both.
+    """
+    spread = {}
+    for integration in ("full", "tied"):
+        b = wf.ModelBuilder(gravity=(0, 0, 0))
+        body = plate(b, wf.SVK(E=1e6, nu=0.3, density=1000.0), integration)
+        for sign in (1, -1):
+            b.add_traction(flat_side(body, sign), (0, 0, sign * LOAD))
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=0.02, solver=wf.NewtonPCG(tol=1e-10), record=False)
+        sim.step(400)
+        z = sim.state.displacement.numpy()[0, :, 2]
+        stretch = z[np.abs(z) > 0.5 * np.abs(z).max()]  # of the gradients across the plate
+        spread[integration] = np.ptp(stretch) / np.abs(stretch).mean()
+    assert spread["full"] < 1e-6
+    assert spread["tied"] > 1e-5
+
+
+def carried(turn, depth, cells):
+    """Force on a cube of 0.1 m, N, turned by `turn`, at a depth, over its stiffness per area, N/m^3."""
+    b = wf.ModelBuilder()
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(cells,) * 3, element="T4", map=lambda X: X @ np.array(turn).T)
+    body = b.add_solid(mesh, material=STIFF)
+    contact = b.add_contact(body, b.add_collider(wf.HalfSpace((0, 0, 1))))
+    model = b.finalize(device="cpu")
+    state = model.state()
+    u = state.displacement.numpy()
+    u[:, :, 2] = -depth - mesh.points[:, 2].min()
+    state.displacement.assign(u)
+    term = model.terms.find(Contact)
+    _, force = term.at_points(state)
+    assert np.abs(force[0, :, :2]).max() == 0.0
+    return force[0, :, 2].sum() * term.tables.host[0].area.sum() / law_numbers(contact)["normal"]
+
+
+def test_a_corner_and_an_edge_carry_what_their_area_says():
+    r, s, t = 1 / math.sqrt(2), 1 / math.sqrt(3), 1 / math.sqrt(6)
+    depth = 0.03
+    corner = carried([[r, -r, 0.0], [t, t, -2.0 * t], [s, s, s]], depth, 16)
+    assert corner == pytest.approx(1.5 * depth**3, rel=0.02)
+    edge = carried([[r, -r, 0.0], [0.0, 0.0, -1.0], [r, r, 0.0]], depth, 16)
+    ends = 2.0 * depth**3 / 3.0  # two triangles of area d^2 with a mean depth of d/3
+    assert edge == pytest.approx(math.sqrt(2.0) * 0.1 * depth**2 + ends, rel=0.02)
