@@ -16,6 +16,7 @@ class Traits(NamedTuple):
         stored: terms have a potential of their own, in rows that are summed per world.
         gated: constraints whose violation must fall below a tolerance, and whose multipliers change with the iterate.
         limited: terms may shorten a Newton step.
+        walls: terms have forces that set in suddenly, such as contact.
     """
 
     nonpotential: bool = False
@@ -25,6 +26,7 @@ class Traits(NamedTuple):
     stored: bool = False
     gated: bool = False
     limited: bool = False
+    walls: bool = False
 
     def suffix(self, *names: str) -> str:
         """Part of a module's name that tells the traits in `names` that are there."""

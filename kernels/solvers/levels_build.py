@@ -13,7 +13,12 @@ from ..common.structs import pattern_struct
 from ..common.types import SMALL, kernel_module, precision
 from .levels import TILE, level_struct
 
-__all__ = ["build_kernels"]
+__all__ = ["FACTOR_LANES", "build_kernels"]
+
+FACTOR_LANES = 512
+"""Threads that factor a dense matrix on CUDA."""
+ACROSS = 128
+"""Of these, in a row of the matrix."""
 
 
 @functools.cache
@@ -35,6 +40,8 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     sync = lane_functions(dtype).sync
     # a pivot below this share of its diagonal entry is rounding: the functions are linearly dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
+    # the same of a factorisation, which also takes what is almost a mechanism
+    LEAST_PIVOT = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
     module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
@@ -225,6 +232,72 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         for a in range(4):
             matrix[world, i + a, j] = s[a]
 
+    @wp.kernel(module=module)
+    def factor_dense(
+        lanes: int,
+        diagonal: wp.array2d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        columns: wp.array3d(dtype=T),
+        rows: wp.array3d(dtype=T),
+        matrix: wp.array3d(dtype=T),
+    ):
+        """L^-1 of A = L L^T in place of A, and L^-T above the diagonal; one block per world.
+
+        An inverse of A itself would have errors in its small eigenvalues as large as its large ones times rounding.
+        Where a pivot is not safely positive against the diagonal of A, that takes its place and the rest of its column
+        of L is zero, so that L L^T is positive definite whatever A is. Unknowns without a diagonal get zeros.
+        """
+        thread = wp.tid()
+        lane = thread % lanes
+        world = thread / lanes
+        if active[world] == 0:
+            return
+        n = matrix.shape[1]
+        across = wp.min(lanes, ACROSS)  # threads side by side in a row
+        for k in range(n):
+            for i in range(lane, n, lanes):
+                columns[world, 0, i] = matrix[world, i, k]
+                rows[world, 0, i] = matrix[world, k, i]
+            sync()
+            pivot = columns[world, 0, k]
+            size = wp.abs(diagonal[world, k])
+            safe = pivot > T(LEAST_PIVOT) * size and size > T(0.0)
+            scale = T(0.0)
+            if safe:
+                scale = T(1.0) / wp.sqrt(pivot)
+            elif size > T(0.0):
+                scale = T(1.0) / wp.sqrt(size)
+            # left of column k stands L^-1, from there on what is left of A; a thread updates four rows of a column,
+            # which load at once
+            if safe:
+                i = 4 * ((k + 1) / 4 + lane / across)
+                while i < n:
+                    l = vec4()
+                    for a in range(4):
+                        if i + a > k:
+                            l[a] = scale * columns[world, 0, i + a]
+                    for j in range(lane % across, i + 4, across):
+                        d = scale * wp.where(j > k, columns[world, 0, j], rows[world, 0, j])
+                        s = vec4()
+                        for a in range(4):
+                            s[a] = matrix[world, i + a, j] - l[a] * d
+                        for a in range(4):
+                            matrix[world, i + a, j] = s[a]
+                    i += 4 * (lanes / across)
+                sync()
+            for j in range(lane, n, lanes):
+                if j > k:
+                    matrix[world, j, k] = wp.where(safe, -scale * scale * columns[world, 0, j], T(0.0))
+            for j in range(lane, k + 1, lanes):
+                own = wp.where(safe, scale * rows[world, 0, j], T(0.0))
+                matrix[world, k, j] = wp.where(j == k, scale, own)
+            sync()
+        for item in range(lane, n * n, lanes):
+            i = item / n
+            j = item % n
+            if j > i:
+                matrix[world, i, j] = matrix[world, j, i]
+
     @wp.func
     def inverse_root(d: T) -> T:
         """1/sqrt|d| of an entry of diag A; 0 where there is no unknown."""
@@ -301,6 +374,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         take_pivot=take_pivot,
         take_panels=take_panels,
         eliminate=eliminate,
+        factor_dense=factor_dense,
         store_tiles=store_tiles,
         store_dense=store_dense,
         dense_traces=dense_traces,

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["RECORD", "attempt_struct", "contact_struct", "facet_struct", "history_struct"]
+__all__ = ["RECORD", "attempt_struct", "clock_struct", "contact_struct", "facet_struct", "history_struct"]
 
 RECORD = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "normal_force", "slip", "area",
           "stick", "stored", "loss", "friction", "collider_work", "penetration")  # fmt: skip
@@ -83,6 +83,7 @@ def history_struct():
         speed: wp.array2d(dtype=wp.float64)  # largest approach speed since birth, m/s; 0: not in contact
         mark: wp.array2d(dtype=wp.int32)  # side of the shape + 1, and 16 where it slips
         overlap: wp.array2d(dtype=wp.float64)  # stored at the start, m
+        cap: wp.array2d(dtype=wp.float64)  # mu F_n of the last step, N over the point's share
         stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's share
         born: wp.array(dtype=wp.float64)  # [world] time that overlaps were stored at
         place: wp.array2d(dtype=wp.vec3d)  # of colliders
@@ -111,10 +112,25 @@ def attempt_struct(dtype: str):
         dead_spring: wp.array2d(dtype=wp.vec3d)
         level: wp.array2d(dtype=wp.float64)  # [world, point] depth; with lumped contacts
         pick: wp.array2d(dtype=wp.int32)  # [world, contact] deepest point
+        picks: wp.array2d(dtype=wp.int32)  # how often it was chosen in the attempt
         through: wp.array(dtype=wp.int32)  # [world] a point that went through a shape, + 1
-        deepest: wp.array2d(dtype=wp.float64)  # [world, contact] in this attempt's last evaluation
         rows: wp.array3d(dtype=wp.float64)  # [RECORD, world, facet row]
         total: wp.array3d(dtype=wp.float64)  # [world, contact, RECORD] of the step so far
         elapsed: wp.array(dtype=wp.float64)  # [world] s of the step so far
 
     return Attempt
+
+
+@functools.cache
+def clock_struct():
+    """Times of the substep in hand, [world]."""
+
+    @wp.struct
+    class Clock:
+        time: wp.array(dtype=wp.float64)  # at its start, s
+        new_time: wp.array(dtype=wp.float64)  # at its end
+        h: wp.array(dtype=wp.float64)
+        part: wp.array(dtype=wp.int32)  # 0: the first of its step
+        still: wp.int32  # statics: there are no rates
+
+    return Clock

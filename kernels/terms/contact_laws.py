@@ -122,7 +122,7 @@ def law_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def friction(trial: vec3d, stiffness: f64, cap: f64) -> wp.vec2d:
-        """Huber's potential, J, of a trial force = stiffness x slip that is cut at `cap`, and the part of it that acts."""
+        """Huber's potential, J, of a trial force stiffness x slip, cut at `cap`, and the part of it that acts."""
         size = wp.length(trial)
         if size <= cap:
             return wp.vec2d(f64(0.5) * size * size / stiffness, f64(1.0))

@@ -201,6 +201,7 @@ class JacobiLoop(NewtonLoop):
         launch(k.judge, self.model.worlds, [w.newton, self.control])
         if self.terms.traits.stored:
             self._each("adopt", active)
+            self._each("refresh", active)
         self._any(active, self.iterating)
 
     @labelled("vectors")

@@ -49,10 +49,11 @@ class NewtonPCG:
         max_halvings: how often a rejected step may be halved.
         max_work: iterations of the conjugate gradients in a step, refused attempts included, before it is given up.
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
-            serves), "banded" (Cholesky factors of the whole, kept as well; on the CPU, for chains, strips and slender
-            or small bodies), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
-            "block-jacobi" (the blocks alone), or "auto": on the CPU "banded" where the band is narrow or the model
-            small, else "deflated" for many small bodies on joints, else "two-level".
+            serves; in statics of short chains of beams factors of the whole), "banded" (Cholesky factors of the whole,
+            kept as well; on the CPU, for chains, strips and slender or small bodies), "deflated" (3x3 blocks of every
+            iterate, and the directions of constraints inverted), "block-jacobi" (the blocks alone), or "auto": on the
+            CPU "banded" where the band is narrow or the model small, else "deflated" for many small bodies on joints,
+            else "two-level".
         linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS where that is installed.
         preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
             model's. They are made in the model's precision; float32 halves what an application reads. Another precision
@@ -188,6 +189,7 @@ class NewtonLoop:
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
+        ctl.equilibrium = int(not inertia)
         ctl.max_iterations = options.max_newton
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
@@ -251,6 +253,8 @@ class NewtonLoop:
         choose = bool(self.candidates) and first
         self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
         self._rarely(self._choose if choose else self._look_for_inversion)
+        if self.terms.traits.walls:  # the first iterate may be the solution, as of a body that falls freely
+            self._refresh()
         self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
 
@@ -303,9 +307,20 @@ class NewtonLoop:
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self._rarely(self._search_on)
+        if self.terms.traits.walls:
+            self._refresh()
         self.preconditioner.follow(active)
         self._each("follow", active)
         self._any(active, self.iterating)
+
+    @labelled("control")
+    def _refresh(self) -> None:
+        """Let terms take anew what they hold, where Newton's method has solved for it."""
+        w, flags = self.work, self.work.newton.stepped
+        self.launch(self.kernels.begin_refresh, self.model.worlds, [w.newton, flags])
+        self._each("refresh", flags)
+        self.residual.evaluate(flags, hold=True)
+        self.launch(self.kernels.end_refresh, self.model.worlds, [w.newton, flags])
 
     @labelled("control")
     def _search_on(self) -> None:

@@ -13,6 +13,9 @@ per step for 478; in groups of 160 slots, where they cost the same, statics gain
 
 Where the unknowns have an order in which H is a narrow band, H itself is the only level, factored as a band (band.py).
 
+A model of beams that is inverted as a whole is factored instead in statics, and again with every matrix of the
+operator: there slender bodies need the tangent that Newton's method follows, and directions that are exact.
+
 An odd number of Chebyshev steps keeps C positive whatever the largest eigenvalue is.
 
 With constraints, tiles and coarse matrices contain their penalties. As a constraint may couple slots of several tiles,
@@ -30,7 +33,7 @@ from ..base.launch import labelled
 from ..kernels.common.types import precision
 from ..kernels.solvers.blocks import block_kernels
 from ..kernels.solvers.levels import LANES, TILE, TILE_SLOTS, level_kernels, level_struct
-from ..kernels.solvers.levels_build import build_kernels
+from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
 from ..terms.term import Kept
@@ -123,11 +126,14 @@ class TwoLevel:
         self.adding = model.terms.traits.pooled or model.terms.traits.ties  # terms add to the matrix
         band, pattern = self.levels[0].band, self.assembled.pattern
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
-        # the factors of the operator's own matrix where they cost little (the matrix made here serves for D alone
-        # then); wider ones are kept for longer than that
-        self.follows = band is not None and band.quick and residual.by_matrix and not self.adding
+        # the factors of the operator's own matrix where they cost little, or where equilibria of beams are sought (the
+        # matrix made here serves for D alone then); wider ones are kept for longer than that
+        dense = self.levels[0].dense and self.storage == model.dtype and not residual.at.inertia
+        order = find_band(model) if dense else band
+        self.follows = order is not None and order.quick and residual.by_matrix and not self.adding
         if self.follows:
             residual.on_matrix = self._factor
+            self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if dense else 0), model.types.T)
         self.value = self.assembled.values("preconditioner matrix")
         self.lanes = LANES if model.device.is_cuda else 1
         self.by_row = 0 if model.device.is_cuda else 1
@@ -248,8 +254,13 @@ class TwoLevel:
         flat_r, flat_x = (_flat(a, self.model.types.T, (B, 3 * n)) for a in (r, x))
         lanes = self.launch.lanes(3 * n)
         arrays = self.arrays[depth]
-        args = [arrays.stored, arrays.root, lanes, flat_r, active, flat_x]
-        self.launch(self.kernels.apply_dense, (B, self.launch.padded(3 * n * lanes)), args)
+        dim = (B, self.launch.padded(3 * n * lanes))
+        if self.follows:  # z = L^-T (L^-1 r)
+            for upper, given, out in ((0, flat_r, self.half), (1, self.half, flat_x)):
+                args = [arrays.stored, arrays.root, upper, lanes, given, active, out]
+                self.launch(self.kernels.apply_triangle, dim, args)
+            return
+        self.launch(self.kernels.apply_dense, dim, [arrays.stored, arrays.root, lanes, flat_r, active, flat_x])
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = T r on a level; returns the coarse correction C P^T r, which is still to be interpolated by P."""
@@ -317,9 +328,10 @@ class TwoLevel:
             self._carry()
             self._add(penalties=True)
         self.reuse.made()
+        if self.follows:
+            return
         if self.band:
-            if not self.follows:
-                self._factor(self.value, flags)
+            self.band.make(self.value, flags)
             return
         for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
             value = arrays.value if depth else self.value
@@ -344,8 +356,14 @@ class TwoLevel:
 
     @labelled("build")
     def _factor(self, value: wp.array, flags: wp.array) -> None:
-        assert self.band is not None
-        self.band.make(value, flags)
+        if self.band:
+            self.band.make(value, flags)
+            return
+        level, arrays = self.levels[0], self.arrays[0]
+        lanes = FACTOR_LANES if self.model.device.is_cuda else 1
+        self._fill_dense(level, arrays, value, flags)
+        args = [lanes, arrays.scale, flags, arrays.left, arrays.top, arrays.matrix]
+        self.launch(self.making.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array, *, keep: bool) -> None:
         B, k = self.model.worlds, self.making
@@ -360,12 +378,15 @@ class TwoLevel:
         args = [self.lanes, tiles, int(keep), flags, arrays.diagonal, arrays.column, matrix]
         self.launch(self.making.invert_tiles, self.model.worlds * tiles * self.lanes, args, block_dim=LANES)
 
+    def _fill_dense(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array) -> None:
+        args = [level.pattern.data, value, level.slots, flags, arrays.scale, arrays.matrix]
+        self.launch(self.making.fill_dense, (self.model.worlds, arrays.size // 3), args)
+
     def _invert_dense(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array) -> None:
         """Dense inverse by block Gauss-Jordan, with blocks of the size of a tile."""
         B, N, k, launch = self.model.worlds, arrays.size, self.making, self.launch
         keep = level is self.levels[0]
-        args = [level.pattern.data, value, level.slots, flags, arrays.scale, arrays.matrix]
-        launch(k.fill_dense, (B, N // 3), args)
+        self._fill_dense(level, arrays, value, flags)
         for first in range(0, N, TILE):
             args = [arrays.matrix, arrays.scale, first, flags, arrays.diagonal, arrays.pivot]
             launch(k.take_pivot, (B, TILE, TILE), args)

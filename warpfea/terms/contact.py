@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, PenetrationError
 from ..base.launch import Launcher
+from ..kernels.common.traits import Traits
 from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
-from ..kernels.terms.contact_data import RECORD, attempt_struct, history_struct
+from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
+from .contact_fields import contact_field
+from .contact_parameters import contact_parameters
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
 from .time_laws import TimeLaws
@@ -26,7 +29,6 @@ __all__ = ["Contact"]
 
 TOUCHING = 1e-9
 """Depth at the start, over the model's size, that counts as touch."""
-PARAMETERS = ("mu", "mu_static", "restitution", "stiffness")
 
 
 class Contact(Term):
@@ -52,6 +54,7 @@ class Contact(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
+        self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
         self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
@@ -81,14 +84,20 @@ class Contact(Term):
         lumped, explicit = (B, P) if t.lumped else (1, 1), (B, P) if t.explicit else (1, 1)
         shapes: dict[str, tuple[int, ...]] = {
             "place": (B, K), "turn": (B, K), "level": lumped, "dead": explicit, "dead_spring": explicit,
-            "pick": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R), "rows": (len(RECORD), B, R),
+            "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R),
+            "rows": (len(RECORD), B, R),
             "total": (B, C, len(RECORD)),
         }  # fmt: skip
         attempt = attempt_struct(self.model.dtype)()
         for name, var in attempt_struct(self.model.dtype).vars.items():
             setattr(attempt, name, work.array(f"contact {name}", shapes.get(name, (B, P)), var.type.dtype))
+        clock = clock_struct()()
+        for name in ("time", "new_time", "h", "part"):
+            setattr(clock, name, getattr(work.step, name))
+        clock.time, clock.still = at.state.time, int(not at.inertia)
         scratch = {
             "attempt": attempt,
+            "clock": clock,
             "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
@@ -161,19 +170,18 @@ class Contact(Term):
     @part("contact")
     def begin(self, at: At, active: wp.array) -> None:
         """Colliders at the end of the attempt, points at its beginning."""
-        s, m, w = at.scratch[self.name], self.model, at.work
-        static = int(not at.inertia)
+        s, m = at.scratch[self.name], self.model
         self._poses(at, active)
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
-            args = [self.tables.data, group.data, s["history"], w.step, static]
+            args = [self.tables.data, group.data, s["history"], s["clock"]]
             more = [at.state.displacement, at.state.velocity, active, s["attempt"]]
             at.launch(self.kernels.begin_points, dim, [*args, *more])
             if self.tables.explicit:
                 at.launch(self.kernels.explicit_forces, dim, [*args, *more[1:]])
 
     def prepare(self, at: At, active: wp.array) -> None:
-        """Caps of the first iterate, and the stiffness that blocks are made from."""
+        """The first caps, and the stiffness that blocks are made from."""
         self._forces(at, active, fresh=1)
 
     def force(self, at: At, active: wp.array) -> None:
@@ -182,24 +190,29 @@ class Contact(Term):
     @part("contact")
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        static = int(not at.inertia)
-        if self.tables.lumped:
-            for group in self.tables.groups:
-                args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
-                at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
-            args = [self.tables.data, active, s["attempt"]]
-            at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+        if fresh:
+            self._pick(at, active, fresh=1)
         rows = w.rows_of(self)
         for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], w.step, static, w.u, active, fresh]
+            args = [self.tables.data, group.data, s["history"], s["clock"], w.u, active, fresh]
             at.launch(k.forces, (m.worlds, group.count), [*args, s["attempt"], w.pool_force, rows])
 
+    def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
+        """Choose the point of each lumped contact, at work.u."""
+        if not self.tables.lumped:
+            return
+        s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
+        for group in self.tables.groups:
+            args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
+            at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
+        args = [self.tables.data, active, fresh, s["attempt"]]
+        at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+
     @part("contact")
-    def adopt(self, at: At, flags: wp.array) -> None:
-        """Hold the caps of the iterate in the next search."""
-        at.launch(
-            self.kernels.adopt, (self.model.worlds, self.tables.points), [flags, at.scratch[self.name]["attempt"]]
-        )
+    def refresh(self, at: At, flags: wp.array) -> None:
+        dim = (self.model.worlds, self.tables.points)
+        at.launch(self.kernels.refresh, dim, [flags, at.scratch[self.name]["attempt"]])
+        self._pick(at, flags, fresh=0)
 
     @part("contact")
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
@@ -224,21 +237,20 @@ class Contact(Term):
     def _finish(self, at: At, accepted: wp.array) -> None:
         """History, books and records of an accepted substep."""
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.books
-        static = int(not at.inertia)
         C = len(self.tables.contacts)
         for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], w.step, static, w.u, accepted, s["attempt"]]
+            args = [self.tables.data, group.data, s["history"], s["clock"], w.u, accepted, s["attempt"]]
             at.launch(k.finish, (m.worlds, group.count), [*args, s["booked"]])
         args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         at.launch(k.partial_records, (m.worlds, C, LANES), args)
-        at.launch(k.total_records, (m.worlds, C), [w.step, static, accepted, s["parts"], s["attempt"]])
+        at.launch(k.total_records, (m.worlds, C), [s["clock"], accepted, s["parts"], s["attempt"]])
 
     @part("contact")
     def commit(self, at: At, accepted: wp.array) -> None:
         s, m, w = at.scratch[self.name], self.model, at.work
         if not s.get("finished"):
             self._finish(at, accepted)
-        args = [w.step, w.newton, accepted, s["history"], s["attempt"]]
+        args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
         at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), args)
 
     def report(self, at: At) -> None:
@@ -297,53 +309,104 @@ class Contact(Term):
     def block_modules(self) -> set[wp.Module]:
         return {contact_block_kernels(self.model.dtype).module}
 
+    def explain(self, at: At, world: int) -> tuple[type[PenetrationError], str] | None:
+        number = int(at.scratch[self.name]["attempt"].through.numpy()[world]) - 1
+        if number < 0:
+            return None
+        t = self.tables
+        k = int(np.searchsorted(t.first, number, side="right")) - 1
+        contact = t.contacts[k]
+        return PenetrationError, (
+            f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
+            f"{self._where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
+            "smaller dt, a larger stiffness= of the contact, or a thicker shape"
+        )
+
+    def parameters(self) -> dict[str, Callable[[Any], None]]:
+        return contact_parameters(self.tables)
+
+    def facts(self) -> list[dict[str, Any]]:
+        """Of each contact, in the order they were added, what `Model.info` tells: with the points that count, and those
+        left out, which clamped slots hold."""
+        t, out = self.tables, []
+        for contact in self.model.description.contacts:
+            k = t.number[contact.index]
+            facts = {"name": contact.name, "body": contact.body.name, "collider": contact.collider.name}
+            numbers = {"points": int((t.shares[k] > 0.0).sum()), "left_out": t.left_out[k]}
+            out.append(facts | {"law": contact.law, "model": contact.model} | numbers)
+        return out
+
     # at a state
+
+    def nodal_force(self, state: State) -> np.ndarray:
+        """Elastic forces of all contacts on slots, (worlds, slots, 3), N, at a state."""
+        _, force = self.at_points(state)
+        t, out = self.tables, np.zeros((state.worlds, self.model.slots, 3))
+        for k, (contact, p) in enumerate(zip(t.contacts, t.host)):
+            at_point = force[:, t.first[k] : t.first[k + 1]].reshape(-1, *p.area.shape, 3)
+            at_slot = np.einsum("bfpk,fpl->bflk", at_point, p.shape)
+            slots = p.conn + contact.body.slot_offset
+            for world in range(state.worlds):
+                np.add.at(out[world], slots, at_slot[world])
+        return out
+
+    def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Places (worlds, colliders, 3), m, and turns (..., 3, 3) of the colliders at a state, and by how much their
+        surfaces lie further out (worlds, colliders), m; None of a state without history."""
+        if "contact_place" not in state.specs:
+            return None
+        return state.contact_place.numpy(), state.contact_turn.numpy(), self.tables.data.grow.numpy()  # type: ignore[attr-defined]
+
+    def sample(self, field: str, body: Any, state: State) -> np.ndarray:
+        """Of a node of a beam the values at the corner of its section with most contact, of a shell at that face."""
+        values = self.samples(field, body, state).reshape(state.worlds, len(body.mesh.points), -1)
+        # least of the gaps; fmin passes over NaN
+        return values.max(axis=2) if field == "contact_pressure" else np.fmin.reduce(values, axis=2)
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        return contact_field(self.tables, field, body, state.worlds, lambda: self.at_points(state))
 
     def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""
         m, t, B = self.model, self.tables, state.worlds
         launch, laws = Launcher(m.device), m.terms.laws
+        K, P, C = len(t.colliders), t.points, len(t.contacts)
+
+        def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=m.device)
+
         every = wp.ones(B, dtype=wp.int32, device=m.device)
-        value = wp.zeros((B, max(laws.count, 1)), dtype=wp.vec3d, device=m.device)
-        laws.evaluate(launch, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
-        P = t.points
+        value = zeros((B, max(laws.count, 1)), wp.vec3d)
+        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+        shapes: dict[str, tuple[int, ...]] = {
+            "born": (B,),
+            "place": (B, K),
+            "turn": (B, K),
+            "pick": (B, C),
+            "picks": (B, C),
+        }
         if history is None:
             history = history_struct()()
             for name, var in history_struct().vars.items():
-                known = state.specs.get(f"contact_{name}")
-                shape = (B,) if name == "born" else (B, len(t.colliders)) if name in ("place", "turn") else (B, P)
-                array = (
-                    getattr(state, f"contact_{name}")
-                    if known
-                    else wp.zeros(shape, dtype=var.type.dtype, device=m.device)
-                )
+                known = f"contact_{name}" in state.specs
+                array = getattr(state, f"contact_{name}") if known else zeros(shapes.get(name, (B, P)), var.type.dtype)
                 setattr(history, name, array)
         attempt = attempt_struct(m.dtype)()
-        for name, shape in (
-            ("place", (B, len(t.colliders))),
-            ("turn", (B, len(t.colliders))),
-            ("pick", (B, len(t.contacts))),
-        ):
-            setattr(
-                attempt, name, wp.zeros(shape, dtype=attempt_struct(m.dtype).vars[name].type.dtype, device=m.device)
-            )
-        for name in ("start", "depth", "speed", "held", "level"):
-            setattr(
-                attempt, name, wp.zeros((B, P), dtype=attempt_struct(m.dtype).vars[name].type.dtype, device=m.device)
-            )
+        for name in ("place", "turn", "pick", "picks", "start", "depth", "speed", "level"):
+            dtype = attempt_struct(m.dtype).vars[name].type.dtype
+            setattr(attempt, name, zeros(shapes.get(name, (B, P)), dtype))
         attempt.speed.fill_(1.0)
-        launch(self.kernels.poses, (B, len(t.colliders)), [t.data, value, every, attempt])
-        gap, force = (
-            wp.zeros((B, P), dtype=wp.float64, device=m.device),
-            wp.zeros((B, P), dtype=wp.vec3d, device=m.device),
-        )
+        if "contact_place" in state.specs:  # statics puts its time back to 0
+            attempt.place, attempt.turn = history.place, history.turn
+        else:
+            launch(self.kernels.poses, (B, K), [t.data, value, every, attempt])
+        gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             launch(self.kernels.settle, dim, [t.data, group.data, state.displacement, attempt])
-            launch(
-                self.kernels.levels, dim, [t.data, group.data, history, state.time, state.displacement, every, attempt]
-            )
-        launch(self.kernels.pick_deepest, (B, len(t.contacts)), [t.data, every, attempt])
+            args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
+            launch(self.kernels.levels, dim, args)
+        launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt])
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             args = [t.data, group.data, history, state.displacement, state.time, attempt, gap, force]

@@ -10,6 +10,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import PARTS
+from ..base.names import did_you_mean, listing
 from ..kernels.common.traits import Traits
 from ..kernels.step.control import REPORT
 from ..kernels.step.ledger import LEDGER, booked_struct
@@ -25,7 +26,7 @@ from .elements import Elements
 from .followers import Followers
 from .supports import Supports
 from .term import At, FieldSpec, Term
-from .time_laws import TimeLaws
+from .time_laws import TimeLaws, control_array
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -35,7 +36,7 @@ __all__ = ["KINDS", "TermSet", "all_parts"]
 
 KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Constraints)
 """The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
-LATER = ("per-world parameters",)
+LATER = ("materials per world",)
 """Features of later versions, which `info` lists as left out."""
 STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end")  # fmt: skip
@@ -183,7 +184,8 @@ class TermSet:
         out: dict[str, bool] = {}
         for kind in kinds:
             out |= kind.features(self.model)
-        return out | {term.name: True for term in self.all if type(term) not in KINDS}
+        out |= {term.name: True for term in self.all if type(term) not in KINDS}
+        return out | {"controls": bool(self.laws.controls)}
 
     def hash(self, h: Any) -> None:
         """Feed what defines the terms into a hash."""
@@ -207,16 +209,35 @@ class TermSet:
         """Fields that users may ask for beside those of the elements."""
         return {name: (term, spec) for term in self.all for name, spec in term.fields.items()}
 
+    # what users set and ask for
+
+    @property
+    def contact(self) -> Contact | None:
+        """The term of contact with obstacles, or None."""
+        return self.find(Contact)
+
+    def set_parameter(self, name: Any, values: Any) -> None:
+        """See Model.set_parameter."""
+        known = {key: put for term in self.all for key, put in term.parameters().items()}
+        if name in known:
+            known[name](values)
+            return
+        if isinstance(name, str) and any(name.startswith(f"{body.name}.") for body in self.model.bodies):
+            raise NotImplementedError(f"set_parameter({name!r}): materials per world are not part of this version")
+        hint = did_you_mean(name, known)
+        raise ModelError(f"set_parameter: parameter {name!r} is unknown; there are: {listing(known)}{hint}")
+
     # for one simulation
 
     def allocate(self, work: Workspace, at: At) -> None:
         """Let the terms register history and make scratch."""
         owner: dict[str, str] = {}
+        controls = [control_array(name) for name in self.laws.controls]
         for term in self.all:
             before = len(at.state.asked)
             term.register(at)
             for name in at.state.asked[before:]:
-                if name in owner or name in STATE or name.startswith(MEMORY):
+                if name in owner or name in STATE or name in controls or name.startswith(MEMORY):
                     taken = f"term {owner[name]!r}" if name in owner else "the state itself"
                     raise ModelError(f"term {term.name!r}: the state's array {name!r} is that of {taken}; rename it")
                 owner[name] = term.name
