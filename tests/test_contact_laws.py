@@ -26,7 +26,7 @@ def _kernels():
     @wp.kernel(module=module)
     def normal(
         law: int, lumped: int, k: f64, g: wp.array(dtype=f64), ramp: f64, eps: f64, delta: wp.array(dtype=f64),
-        delta_n: wp.array(dtype=f64), out: wp.array(dtype=vec3d),
+        delta_n: wp.array(dtype=f64), out: wp.array(dtype=wp.vec4d),
     ):  # fmt: skip
         i = wp.tid()
         out[i] = normal_law(law, lumped, k, g[i], ramp, eps, delta[i], delta_n[i])
@@ -51,7 +51,7 @@ def law_at(law, lumped, k, g, ramp, eps, delta, delta_n):
     arrays = [
         wp.array(np.broadcast_to(x, shape).astype(float), dtype=wp.float64, device="cpu") for x in (g, delta, delta_n)
     ]
-    out = wp.zeros(shape, dtype=wp.vec3d, device="cpu")
+    out = wp.zeros(shape, dtype=wp.vec4d, device="cpu")
     inputs = [law, lumped, k, arrays[0], ramp, eps, arrays[1], arrays[2], out]
     wp.launch(_kernels()[0], shape[0], inputs, device="cpu")
     return out.numpy()

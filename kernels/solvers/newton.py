@@ -399,7 +399,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         wishes = wishes and ctl.wish[world] == 0 and ctl.negative[world] == 0
         wishes = wishes and (ctl.tame[world] == 0 or ctl.mixed[world] == 2)
         if wp.static(walls):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
-            wishes = wishes and ctl.refreshed[world] == 0
+            wishes = wishes and ctl.refreshed[world] == 0 and ctl.mixed[world] != 2
         leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or leap:
             take(ctl, world, stands, leap)
