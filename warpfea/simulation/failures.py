@@ -62,6 +62,10 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
     reason, hint = _why(sim, code, world)
+    if sim.integrator.stabilise and work.step.mass_factor.numpy()[world] == 0.0:
+        hint += (
+            "; at full load the springs of stabilise= are gone: supports and contact alone do not hold the bodies there"
+        )
     return ConvergenceError(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "

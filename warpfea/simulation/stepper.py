@@ -109,6 +109,7 @@ class Stepper:
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running = self.running
         w.step.max_halvings = self.solver.max_halvings
+        w.step.stabilise = self.integrator.stabilise
         if self.integrator.multistep:
             w.step.previous_h = state.previous_step
             w.step.previous_end = state.previous_end
