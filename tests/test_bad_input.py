@@ -156,9 +156,7 @@ LATER = {
     "set_parameter": lambda b, s: b.finalize(device="cpu").set_parameter("bar.E", 1.0),
     "contact_force": lambda b, s: b.finalize(device="cpu").contact_force(None),
     "contact_record": lambda b, s: wf.Simulation(b.finalize(device="cpu"), dt=1.0).contact_record(None),
-    "controls": lambda b, s: wf.Simulation(b.finalize(device="cpu"), dt=1.0).controls,
     "GeneralizedAlpha": lambda b, s: wf.GeneralizedAlpha,
-    "Control": lambda b, s: wf.Control,
 }
 
 

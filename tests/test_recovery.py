@@ -5,6 +5,9 @@ import pytest
 import warp as wp
 
 import warpfea as wf
+from warpfea.studies.stress.case import Setting
+from warpfea.studies.stress.cases import inside_out
+from warpfea.studies.stress.cases.stretch import stretch
 
 SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 SOFT = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
@@ -180,3 +183,49 @@ def test_a_refusal_by_rounding_is_named():
         wf.ConvergenceError, match=r"float32 can't hold this case: .* after [0-8] halvings.*take float64"
     ):
         wf.solve_static(b.finalize(device="cpu", dtype="float32"), load_steps=3)
+
+
+def thin(element, dtype):
+    """A steel bar of slenderness 500 that its tip load bends by a twentieth of its length."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    mesh = wf.mesh.box((1, 2e-3, 2e-3), cells=(20, 1, 1), element=element)
+    bar = b.add_solid(mesh, material=wf.SVK(E=2e11, nu=0.3), element=element)
+    b.clamp(bar.nodes("x-"), slots="all" if element == "T10" else "position+gradient-y+gradient-z")
+    b.add_traction(bar.surface("x+"), (0, 0, -1e4))
+    return b.finalize(device="cpu", dtype=dtype)
+
+
+@pytest.mark.parametrize("element", ["T10", "H3843"])
+@pytest.mark.parametrize("preconditioner", ["banded", "two-level"])
+def test_forces_that_drown_in_rounding_are_refused_without_halving(element, preconditioner):
+    solver = wf.NewtonPCG(max_pcg=2000, max_newton=50, preconditioner=preconditioner)
+    with pytest.raises(wf.ConvergenceError, match=r"float32 can't hold this case: .* after 0 halvings.*take float64"):
+        wf.solve_static(thin(element, "float32"), load_steps=3, solver=solver)
+
+
+def test_work_that_is_spent_within_rounding_names_the_precision():
+    solver = wf.NewtonPCG(max_work=9000, preconditioner="block-jacobi")
+    with pytest.raises(wf.ConvergenceError, match=r"float32 can't hold this case: .*max_work = 9000.*take float64"):
+        wf.solve_static(thin("T10", "float32"), load_steps=3, solver=solver)
+    with pytest.raises(wf.ConvergenceError, match="max_work = 9000") as caught:
+        wf.solve_static(thin("T10", "float64"), load_steps=3, solver=solver)
+    assert "can't hold" not in str(caught.value)
+
+
+@pytest.mark.parametrize("element", ["T10", "H3843"])
+def test_stress_that_rounds_more_than_positions_ends_at_its_floor(element):
+    """A cube pressed to a twentieth in single precision: the residual stalls, and the error that is left is told."""
+    answer = stretch(Setting("cpu", "float32"), f"{element}-0.05")
+    assert answer.passed
+    assert answer.error < 1e-5
+
+
+@pytest.mark.parametrize("how", ["squeezed", "twisted"])
+def test_soft_bars_are_found_past_their_bifurcations(how, monkeypatch):
+    """Squeezed to a twentieth or twisted four turns a neo-Hookean bar buckles: its tangent is indefinite."""
+    monkeypatch.setitem(inside_out.CELLS, "H3843", (10, 1, 1))
+    b, bar = inside_out.forced("H3843", inside_out.NEO_HOOKEAN, how)
+    found = wf.solve_static(b.finalize(device="cpu"), load_steps=20)
+    ends = [found.reaction(bar.nodes(side))[0] for side in ("x-", "x+")]
+    assert np.abs(ends[0] + ends[1]).max() < 1e-6 * np.abs(ends).max()
+    assert found.simulation.min_J > 0.0

@@ -50,6 +50,7 @@ from .builder.builder import ModelBuilder  # noqa: E402
 from .builder.joints import GROUND  # noqa: E402
 from .builder.scene import scene  # noqa: E402
 from .elements.sections import Rectangle  # noqa: E402
+from .laws import Control  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
 from .model.bodies import Body  # noqa: E402
 from .model.contacts import Box, Capsule, Cylinder, HalfSpace, Sphere  # noqa: E402
@@ -76,6 +77,7 @@ __all__ = [
     "Checkpoint",
     "CheckpointError",
     "ConstraintError",
+    "Control",
     "ConvergenceError",
     "Cylinder",
     "ElementSet",
@@ -117,7 +119,6 @@ __all__ = [
 
 _LATER = {
     "TriMesh": "rigid triangle meshes",
-    "Control": "controls between steps",
     "GeneralizedAlpha": "generalised-alpha steps",
 }
 

@@ -1,4 +1,4 @@
-"""Time laws: a constant, samples (times, values), or a `wp.func` of t."""
+"""Time laws: a constant, samples (times, values), a `wp.func` of t, or a `Control`."""
 
 from __future__ import annotations
 
@@ -10,24 +10,66 @@ import warp as wp
 
 from .base.errors import ModelError
 
-__all__ = ["TimeLaw", "time_law"]
+__all__ = ["Control", "TimeLaw", "time_law"]
+
+SIZES = {1: "a scalar", 3: "a vector"}
+
+
+@dataclass(frozen=True)
+class Control:
+    """A time law whose values the caller writes between steps, in each world its own: `sim.controls[name]`.
+
+    A value is held during a step, and a drive is where it says at the step's end. In statics it grows with the load as
+    a constant does. The same control may drive several things.
+
+    Args:
+        name: by which `sim.controls` knows it; unique in a model.
+        size: 1 for what is driven by a number (pressure, angle, travel), 3 for a vector.
+        initial: number, or (size,): the value at the start and after `sim.reset`, in the unit of what it drives.
+
+    Raises:
+        ModelError: the name is no text, or size or initial value are out of range.
+    """
+
+    name: str
+    size: int = 1
+    initial: Any = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise ModelError(f"a control needs a name, got {self.name!r}")
+        if isinstance(self.size, bool) or not isinstance(self.size, (int, np.integer)) or self.size not in SIZES:
+            raise ModelError(f"control {self.name!r}: size = {self.size!r} must be 1 (number) or 3 (vector)")
+        try:
+            value = np.asarray(self.initial, dtype=float)
+        except (TypeError, ValueError):
+            value = np.full(1, np.nan)
+        if value.shape not in ((), (self.size,)) or not np.all(np.isfinite(value)):
+            expected = f"a finite number{' or 3 of them' if self.size == 3 else ''}"
+            raise ModelError(f"control {self.name!r}: initial = {self.initial!r} must be {expected}")
+        object.__setattr__(self, "size", int(self.size))
+        object.__setattr__(self, "initial", tuple(np.broadcast_to(value, (self.size,)).tolist()))
 
 
 @dataclass(frozen=True, eq=False)
 class TimeLaw:
-    """A value over time: samples, interpolated linearly and constant outside of them; or a function of t.
+    """A value over time: samples, interpolated linearly and constant outside of them; a function of t; or a control.
 
     Attributes:
-        times: (n,) s; one for a constant, empty for a function.
+        times: (n,) s; one for a constant, empty for a function or a control.
         values: (n, 3) in the unit of what the law drives; of scalar laws the first column.
         function: wp.func of t (s), or None.
         scalar: whether the value is a scalar.
+        control: what holds the values, or None.
+        ramped: a control grows with the load of statics.
     """
 
     times: np.ndarray
     values: np.ndarray
     function: Any = None
     scalar: bool = False
+    control: Control | None = None
+    ramped: bool = True
 
 
 def _widen(values: np.ndarray, scalar: bool) -> np.ndarray:
@@ -42,13 +84,19 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
     """The time law that a user has given.
 
     Args:
-        value: number or 3-vector; (times (n,), values (n,) or (n, 3)); or a wp.func of t; times in s.
+        value: number or 3-vector; (times (n,), values (n,) or (n, 3)); a wp.func of t; or a Control; times in s.
         what: name used in errors.
         scalar: a scalar law instead of a vector law.
 
     Raises:
-        ModelError: a Python function, a wrong shape, times that do not increase, or a value that is not finite.
+        ModelError: a Python function, a wrong shape, times that do not increase, a value that is not finite, or a
+            control of another size.
     """
+    if isinstance(value, Control):
+        if value.size != (1 if scalar else 3):
+            needed = SIZES[1 if scalar else 3]
+            raise ModelError(f"{what}: control {value.name!r} has size {value.size}, but {needed} is to be driven")
+        return TimeLaw(np.zeros(0), np.zeros((0, 3)), scalar=scalar, control=value)
     if isinstance(value, wp.Function):
         return TimeLaw(np.zeros(0), np.zeros((0, 3)), value, scalar)
     if callable(value):
@@ -69,7 +117,8 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
         try:
             values = np.asarray(value, dtype=float)[None]
         except (TypeError, ValueError) as error:
-            raise ModelError(f"{what} = {value!r} is not a number, vector, (times, values) or wp.func") from error
+            kinds = "number, vector, (times, values), wp.func or Control"
+            raise ModelError(f"{what} = {value!r} is not a {kinds}") from error
         times = np.zeros(1)
         if values.shape != (1, *width):
             raise ModelError(f"{what} has shape {values.shape[1:]}, expected {width or 'a number'}")

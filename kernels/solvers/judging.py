@@ -28,7 +28,14 @@ NEAR = 1.0e3
 SETTLING = 10.0
 """A residual can only be at its floor when the last step was below this many accepted errors."""
 FAR = 3
-"""An attempt that begins far from its end may take so many times more iterations."""
+"""An attempt may take so many times more iterations where `patience` says so."""
+ALIKE = 64.0
+"""A stall may be put down to rounding too where the last step was below this many roundings in the norm of energy: of
+laws that are steep at small J the stress rounds far more than the positions."""
+DROWNED = 32.0
+"""Roundings of the positions up to which a residual as large as the forces says nothing of the equilibrium."""
+COARSE = 1.0e-10
+"""Rounding above which the precision is single."""
 TRIES = 3
 """Solves that may find the error of a stalled iterate too large before the step is given up."""
 
@@ -158,11 +165,23 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         ctl.mixed[world] = 0
 
     @wp.func
+    def patience(ctl: Control, world: int) -> int:
+        """How many times `max_iterations` an attempt may take: more where it begins far from its end, or where a law
+        that keeps its own tangent left a state without positive curvature, which shorter steps meet again."""
+        far = wp.max(ctl.choose[world], ctl.bent[world] * (1 - ctl.linear_stress))
+        return 1 + FAR * far
+
+    @wp.func
     def give_up(ctl: Control, world: int, why: int):
-        """End without convergence."""
+        """End without convergence. In single precision a residual as large as the forces, of no more than `DROWNED`
+        roundings, is put down to those, whatever it ends by: a shorter step has smaller forces in the same noise."""
         ctl.active[world] = 0
         ctl.searching[world] = 0
         ctl.failed[world] = why
+        stuck = why == FAIL_ITERATIONS or why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE
+        drowned = ctl.floor_excess[world] <= f64(DROWNED) and ctl.relative[world] > f64(0.5)
+        if stuck and drowned and ctl.eps > f64(COARSE) and ctl.iterations[world] > 0:
+            ctl.failed[world] = FAIL_FLOOR
         if wp.static(gated):
             if why != FAIL_NAN and why != FAIL_JACOBIAN and unsatisfied(ctl, world):
                 ctl.failed[world] = FAIL_CONSTRAINT
@@ -176,9 +195,13 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
         step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
         most = f64(SETTLING) * ctl.floor_bound
-        limit = ctl.max_iterations * (1 + FAR * ctl.choose[world])
+        limit = ctl.max_iterations * patience(ctl, world)
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
-        near = ctl.floor_excess[world] <= f64(NEAR) and ctl.strict_count[world] < TRIES
+        alike = f64(ALIKE) * ctl.eps
+        near = ctl.floor_excess[world] <= f64(NEAR)
+        if not near and ctl.floor_excess[world] < f64(1.0e300):
+            near = step <= alike * alike * energy
+        near = near and ctl.strict_count[world] < TRIES
         still = ctl.reduction[world] > f64(STALLED) and ctl.reused[world] == 0
         if ctl.excess[world] <= f64(1.0):
             accept(ctl, world)
@@ -201,5 +224,5 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         objective=objective, magnitude=magnitude, largest_violation=largest_violation, measure=measure, record=record,
-        accept=accept, ask=ask, give_up=give_up, settle=settle, fail=fail,
+        accept=accept, ask=ask, patience=patience, give_up=give_up, settle=settle, fail=fail,
     )  # fmt: skip

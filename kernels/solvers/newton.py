@@ -8,7 +8,6 @@ import warp as wp
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module
 from .control import (
-    FAIL_CONSTRAINT,
     FAIL_CURVATURE,
     FAIL_FLOOR,
     FAIL_ITERATIONS,
@@ -20,7 +19,8 @@ from .control import (
     LANES,
     control_struct,
 )
-from .judging import FAR, TRIES, judging_functions
+from .judging import TRIES, judging_functions
+from .outer import outer_kernels
 from .pcg import pcg_struct
 from .vectors import vector_kernels
 
@@ -38,12 +38,12 @@ TURN, SHRINK = 0.5, 0.4
 """Most that such a step turns or stretches an element, and what remains of it when the best iterate was restored."""
 ROUNDS = 3
 """Linear solves of an attempt, over its iterations: those that lead to no step are bounded too."""
+LOST = 10
+"""Such solves that may lead to no step before the tangent is followed as it is; with 0 soft solids take longer."""
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1
 """Tolerance of the first solve of a step that begins far from its end: what it is solved to is lost."""
-REFRESH = 0.1
-"""Relative residual from which on what terms hold (caps of friction) is taken anew at each iterate."""
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
 
@@ -59,9 +59,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     PCG = pcg_struct()
     stored, gated, limited, walls = traits.stored, traits.gated, traits.limited, traits.walls
     judging = judging_functions(traits)
-    objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
+    objective, magnitude = judging.objective, judging.magnitude
     measure, settle, fail = judging.measure, judging.settle, judging.fail
-    accept, give_up, record = judging.accept, judging.give_up, judging.record
+    accept, give_up, record, patience = judging.accept, judging.give_up, judging.record, judging.patience
     module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited', 'walls')}")
 
     @wp.kernel(module=module)
@@ -158,6 +158,12 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.limit[world] = f64(1.0)
 
     @wp.func
+    def lost(ctl: Control, world: int) -> bool:
+        """Whether solves with other matrices than the tangent have led nowhere too often, of laws that have a tangent
+        of their own: past a bifurcation it alone knows the way down."""
+        return ctl.linear_stress == 0 and ctl.rounds[world] - ctl.iterations[world] > LOST
+
+    @wp.func
     def open_search(ctl: Control, world: int):
         """See whether the direction leads anywhere."""
         ctl.bent[world] = wp.max(ctl.bent[world], ctl.negative[world])
@@ -173,7 +179,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             if ctl.leaps[world] > 0:
                 ctl.restoring[world] = 1
             else:
-                ctl.mixed[world] = 2
+                ctl.mixed[world] = wp.where(lost(ctl, world), 0, 2)
                 ctl.tame[world] = 1
                 ctl.alpha[world] = f64(0.0)
         elif ctl.slope[world] >= f64(0.0):
@@ -260,7 +266,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             wp.atomic_max(ctl.any_hard, 0, 1)
         elif pcg.total[world] >= max_work:
             give_up(ctl, world, FAIL_WORK)
-        elif ctl.rounds[world] > ROUNDS * (1 + FAR * ctl.choose[world]) * ctl.max_iterations:
+        elif ctl.rounds[world] > ROUNDS * patience(ctl, world) * ctl.max_iterations:
             give_up(ctl, world, FAIL_ITERATIONS)
         else:
             open_search(ctl, world)
@@ -319,13 +325,13 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 ctl.restoring[world] = 0
                 ctl.radius[world] = f64(SHRINK) * ctl.radius[world]
                 ctl.leaps[world] = 0
-                ctl.mixed[world] = 2
+                ctl.mixed[world] = wp.where(lost(ctl, world), 0, 2)
                 ctl.tame[world] = 1
         else:
             ctl.iterations[world] = ctl.iterations[world] + 1
             if ctl.tame[world] != 0:
                 ctl.tame[world] = 0
-                ctl.mixed[world] = 1
+                ctl.mixed[world] = wp.where(lost(ctl, world), 0, 1)
         ctl.total_iterations[world] = ctl.total_iterations[world] + 1
         ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
         ctl.reduction[world] = ratio
@@ -339,31 +345,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             settle(ctl, world)
         if not stands and ctl.strict[world] == 0 and (leap or ctl.leaps[world] > 0):
             watch(ctl, world, old_phi, old_norm)
-
-    @wp.kernel(module=module)
-    def begin_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
-        """Flag the worlds where what terms hold is to be taken anew: Newton's method has solved for it so far."""
-        world = wp.tid()
-        flags[world] = 0
-        if ctl.active[world] != 0:
-            last = ctl.iterations[world] + 1 >= ctl.max_iterations
-            if ctl.relative[world] <= f64(REFRESH) or last:
-                flags[world] = 1
-
-    @wp.kernel(module=module)
-    def end_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
-        """Judge the iterate, in the flagged worlds with what terms hold now."""
-        world = wp.tid()
-        if ctl.active[world] == 0:
-            return
-        if flags[world] != 0:
-            measure(ctl, world)
-            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
-            ctl.phi_magnitude[world] = magnitude(ctl, world)
-            ctl.leaps[world] = 0
-            settle(ctl, world)
-        else:
-            record(ctl, world)
 
     @wp.func
     def shorten(ctl: Control, world: int, reused: bool):
@@ -427,25 +408,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             shorten(ctl, world, reused)
 
     @wp.kernel(module=module)
-    def judge_outer(ctl: Control, running: wp.array(dtype=wp.int32), tol: f64, limit: int):
-        """Classical multiplier updates: another inner solve where a constraint is still violated."""
-        world = wp.tid()
-        ctl.stepped[world] = 0
-        if running[world] == 0 or ctl.failed[world] != 0:
-            return
-        if largest_violation(ctl, world) <= tol:
-            return
-        if ctl.outer[world] >= limit:
-            ctl.failed[world] = FAIL_CONSTRAINT
-            return
-        ctl.outer[world] = ctl.outer[world] + 1
-        ctl.iterations[world] = 0
-        ctl.suspect[world] = 0
-        ctl.turned[world] = 0
-        ctl.active[world] = 1
-        ctl.stepped[world] = 1
-
-    @wp.kernel(module=module)
     def any_set(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
         """out[0] = 1 where any world's flag is set; out must be 0 before."""
         world = wp.tid()
@@ -453,8 +415,10 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             wp.atomic_max(out, 0, 1)
 
     vectors = vector_kernels(dtype, module)
+    outer = outer_kernels(traits, module)
     return _types.SimpleNamespace(
         **vars(vectors),
+        **vars(outer),
         module=module,
         measure=measure,
         accept=accept,
@@ -466,9 +430,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         judge_floor=judge_floor,
         free_step=free_step,
         begin_search=begin_search,
-        begin_refresh=begin_refresh,
-        end_refresh=end_refresh,
         judge_trial=judge_trial,
-        judge_outer=judge_outer,
         any_set=any_set,
     )

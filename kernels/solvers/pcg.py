@@ -44,6 +44,7 @@ def pcg_struct():
         energy: wp.array(dtype=wp.float64)  # that energy, sum of alpha r.z, and what it was when last looked at
         seen: wp.array(dtype=wp.float64)
         negative: wp.array(dtype=wp.int32)  # the solve met a direction without positive curvature
+        flip: wp.array(dtype=wp.int32)  # such a direction is taken as if its curvature were positive
         max_iterations: wp.int32
 
     return PCGControl
@@ -148,6 +149,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.first_norm[world] = norm
         ctl.iterations[world] = 0
         ctl.negative[world] = 0
+        ctl.flip[world] = 1 - newton.linear_stress
         strict = newton.strict[world] != 0
         # a linear prediction must be that of the whole step, too; of other laws it is none so far away
         whole = newton.mixed[world] == 1 and newton.linear_stress != 0
@@ -187,7 +189,8 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     ):
         """x += alpha p, r -= alpha H p with alpha = r.z / p.H p.
 
-        A direction of no positive curvature ends the solve: it is taken in full if it is the first, else not at all.
+        A direction of no positive curvature ends the solve: it is taken in full if it is the first, else not at all;
+        with `flip` as far as the same curvature, were it positive, would have it: it leads off a saddle.
         """
         world, slot = wp.tid()
         if world == 0 and slot == 0:
@@ -203,6 +206,8 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             length = rz / pHp
         elif ctl.iterations[world] == 0:
             length = f64(1.0)
+        elif ctl.flip[world] != 0 and pHp < f64(0.0) and wp.isfinite(pHp):
+            length = -rz / pHp
         if slot == 0:
             ctl.energy[world] = ctl.energy[world] + length * rz
         alpha = T(length)

@@ -8,11 +8,9 @@ import warp as wp
 from ..common.entries import add_block_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SMALL, kernel_module, precision
-from ..solvers.control import control_struct
-from ..step.control import step_struct
-from .contact import SLIPS, contact_kernels
-from .contact_data import RECORD, attempt_struct, contact_struct, facet_struct, history_struct
+from .contact_data import RECORD, attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import PAPER, SMOOTH, law_functions
+from .contact_touch import SLIPS, touch_functions
 
 __all__ = ["BOOKED", "LANES", "book_kernels", "contact_block_kernels"]
 
@@ -30,9 +28,8 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     vec3 = p.vec3
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets = contact_struct(), facet_struct(dtype)
-    History, Attempt, Step = history_struct(), attempt_struct(dtype), step_struct()
-    Newton = control_struct()
-    k = contact_kernels(dtype)
+    History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
+    k = touch_functions(dtype)
     touch, hold, pull, acts = k.touch, k.hold, k.pull, k.acts
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
     elastic = law_functions().elastic
@@ -40,7 +37,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def finish(
-        con: Contacts, facets: Facets, his: History, step: Step, still: int, u: wp.array2d(dtype=vec3),
+        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3),
         accepted: wp.array(dtype=wp.int32), at: Attempt, booked: wp.array3d(dtype=f64),
     ):  # fmt: skip
         """Books of an accepted substep per facet, and the history after it.
@@ -58,9 +55,9 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             booked[j, world, row] = f64(0.0)
         for j in range(SUMS + 1):
             at.rows[j, world, row] = f64(0.0)
-        h = step.h[world]
+        h = clock.h[world]
         inv_h = f64(0.0)
-        if still == 0:
+        if clock.still == 0:
             inv_h = f64(1.0) / h
         lumped = con.lumped[c]
         law = con.law[c]
@@ -73,7 +70,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
                 rec = record_of(con, c, point)
                 live = his.speed[world, rec] > f64(0.0)
                 held = at.held[world, point]
-                t = touch(con, facets, his, at, world, c, q, item, point, u, step.new_time[world], inv_h, held[2])
+                t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
                 before = at.depth[world, point]
                 change = t.depth - before
                 spring = elastic(lumped, k_n, t.depth)
@@ -139,7 +136,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
                 at.rows[14, world, row] = wp.max(at.rows[14, world, row], t.depth)
                 if t.depth > f64(0.0):
                     speed = at.speed[world, point]
-                    if still == 0:
+                    if clock.still == 0:
                         speed = wp.max(speed, change / h)
                     if law != PAPER:
                         kept = wp.transpose(at.turn[world, kc]) * kept
@@ -179,13 +176,13 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def total_records(
-        step: Step, still: int, accepted: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=f64), at: Attempt
+        clock: Clock, accepted: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=f64), at: Attempt
     ):  # fmt: skip
         """The record of the step so far: forces averaged over time, work added up."""
         world, c = wp.tid()
         if accepted[world] == 0:
             return
-        h = step.h[world]
+        h = clock.h[world]
         past = at.elapsed[world]
         for j in range(SUMS + 1):
             total = f64(0.0)
@@ -198,7 +195,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             if past == f64(0.0):
                 old = f64(0.0)
             if j < FORCES:
-                if still == 0:
+                if clock.still == 0:
                     total = (past * old + h * total) / (past + h)
             elif j == SUMS:
                 total = wp.max(total, old)
@@ -207,7 +204,10 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             at.total[world, c, j] = total
 
     @wp.kernel(module=module)
-    def keep_poses(step: Step, newton: Newton, accepted: wp.array(dtype=wp.int32), his: History, at: Attempt):
+    def keep_poses(
+        clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
+        accepted: wp.array(dtype=wp.int32), his: History, at: Attempt,
+    ):  # fmt: skip
         """Keep the places of the colliders; the energy of contact counts in the bound of the next first iterate."""
         world, k = wp.tid()
         if accepted[world] == 0:
@@ -215,8 +215,8 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         his.place[world, k] = at.place[world, k]
         his.turn[world, k] = at.turn[world, k]
         if k == 0:
-            at.elapsed[world] = at.elapsed[world] + step.h[world]
-            newton.potential[world] = newton.potential[world] + newton.term_sums[1, world]
+            at.elapsed[world] = at.elapsed[world] + clock.h[world]
+            potential[world] = potential[world] + term_sums[1, world]
 
     @wp.kernel(module=module)
     def write_records(at: Attempt, first: int, report: wp.array2d(dtype=f64)):

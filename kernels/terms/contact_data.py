@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["RECORD", "attempt_struct", "contact_struct", "facet_struct", "history_struct"]
+__all__ = ["RECORD", "attempt_struct", "clock_struct", "contact_struct", "facet_struct", "history_struct"]
 
 RECORD = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "normal_force", "slip", "area",
           "stick", "stored", "loss", "friction", "collider_work", "penetration")  # fmt: skip
@@ -119,3 +119,18 @@ def attempt_struct(dtype: str):
         elapsed: wp.array(dtype=wp.float64)  # [world] s of the step so far
 
     return Attempt
+
+
+@functools.cache
+def clock_struct():
+    """Times of the substep in hand, [world]."""
+
+    @wp.struct
+    class Clock:
+        time: wp.array(dtype=wp.float64)  # at its start, s
+        new_time: wp.array(dtype=wp.float64)  # at its end
+        h: wp.array(dtype=wp.float64)
+        part: wp.array(dtype=wp.int32)  # 0: the first of its step
+        still: wp.int32  # statics: there are no rates
+
+    return Clock

@@ -33,6 +33,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     Laws = law_struct()
     # a module per kind of load: a scene compiles what it uses
     laws_module = kernel_module(f"laws_{dtype}")
+    controls_module = kernel_module(f"controls_{dtype}")
     dead_module = kernel_module(f"dead_load_{dtype}")
     explicit_module = kernel_module(f"explicit_{dtype}")
     drive_module = kernel_module(f"drive_{dtype}")
@@ -64,6 +65,26 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         s = (t - laws.times[k]) / (laws.times[k + 1] - laws.times[k])
         s = wp.clamp(s, f64(0.0), f64(1.0))
         value[world, law] = (f64(1.0) - s) * laws.values[k] + s * laws.values[k + 1]
+
+    @wp.kernel(module=controls_module)
+    def evaluate_control(
+        control: wp.array2d(dtype=f64),
+        law: int,
+        ramped: int,
+        ramp: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=wp.vec3d),
+    ):
+        """Value of the law that a control is; it carries the ramp of a static load path where a constant does."""
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        x = wp.vec3d()
+        for c in range(control.shape[1]):
+            x[c] = control[world, c]
+        if ramped != 0:
+            x = ramp[world] * x
+        value[world, law] = x
 
     @wp.kernel(module=dead_module)
     def dead_load(
@@ -168,6 +189,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         evaluate_laws=evaluate_laws,
+        evaluate_control=evaluate_control,
         dead_load=dead_load,
         work_rows=work_rows,
         add_explicit=add_explicit,

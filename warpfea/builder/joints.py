@@ -110,10 +110,10 @@ def pin_rows(gap: Vector, law: TimeLaw | None = None) -> list[Row]:
 
 
 def _right_side(law: TimeLaw | None, component: int = 0) -> dict[str, Any]:
-    """A constant is fixed: statics must not ramp it, as it does laws."""
+    """A constant is fixed: statics must not ramp it, nor a control."""
     if law is not None and len(law.values) == 1:
         return {"fixed": float(law.values[0, component])}
-    return {"law": law}
+    return {"law": replace(law, ramped=False) if law is not None and law.control is not None else law}
 
 
 def _dp(a: Vector, b: Vector) -> Row:
@@ -210,6 +210,11 @@ def _dist(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: float) -> 
         raise ModelError(f"{what}: its two points coincide, so that the distance has no direction; pin them instead")
     if law is not None and len(law.values) and law.values[:, 0].min() <= 0.0:
         raise ModelError(f"{what}: the distance must be positive, the law falls to {law.values[:, 0].min():g} m")
+    if law is not None and law.control is not None and not law.control.initial[0] > 0.0:
+        raise ModelError(
+            f"{what}: the distance must be positive, control {law.control.name!r} begins at "
+            f"{law.control.initial[0]:g} m; give it an initial value"
+        )
     return Row(DISTANCE, gap, constant(np.zeros(3)), **(_right_side(law) if law else {"fixed": length}))
 
 

@@ -299,7 +299,7 @@ class Model:
         }
 
     def state(self) -> State:
-        """A new State with the initial displacements and velocities of the bodies."""
+        """A new State with the initial displacements and velocities of the bodies, and values of controls."""
         out = State(self.worlds, self.device)
         vec3 = self.types.vec3
         u = np.zeros((self.slots, 3))
@@ -314,6 +314,7 @@ class Model:
         out.register("displacement", vec3, (self.slots,), u)
         out.register("velocity", vec3, (self.slots,), v)
         out.register("time", wp.float64)
+        self.terms.laws.register(out)
         return out
 
     def mass_matrix(self) -> sp.csr_matrix:

@@ -23,6 +23,7 @@ from ..kernels.solvers.control import (
 from ..kernels.solvers.judging import NEAR
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
+from .jumps import jumping_drives
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -41,6 +42,8 @@ REASONS = {
 }
 UNSTABLE = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
 """Failures that an indefinite tangent may explain."""
+UNKNOWN = 1e30
+"""Estimate of the error where there is none."""
 OPEN = 1e-4
 """Violation at the start, over the model's size, that a dynamic run refuses to snap shut."""
 
@@ -66,10 +69,11 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         hint += (
             "; at full load the springs of stabilise= are gone: supports and contact alone do not hold the bodies there"
         )
+    jumps = "" if code == FAIL_FLOOR else jumping_drives(sim, world)
     return ConvergenceError(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
-        f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}",
+        f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}{jumps}",
         time=time, world=world, residuals=history, element=element, state=sim.state,
     )  # fmt: skip
 
@@ -81,21 +85,25 @@ def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
     direct = sim.stepper.newton.direct
     if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
         return "H is singular (a body or mechanism that nothing holds?)", ""
+    near = float(work.newton.floor_excess.numpy()[world]) <= NEAR
+    finer = "; take float64" if dtype == "float32" else "; take fewer, stouter elements, or look at the units"
     if code == FAIL_FLOOR:
         eta = float(work.newton.eta.numpy()[world])
-        hint = "; take float64" if dtype == "float32" else "; take fewer, stouter elements, or look at the units"
-        return f"{dtype} can't hold this case: rounding leaves an estimated error of {eta:.2g} of the solution", hint
+        left = "what is left of the residual is within rounding"
+        if eta < UNKNOWN:
+            left = f"rounding leaves an estimated error of {eta:.2g} of the solution"
+        return f"{dtype} can't hold this case: {left}", finer
     if code == FAIL_WORK:
-        spent = f"{int(work.pcg.total.numpy()[world])} iterations of the conjugate gradients"
-        hint = f"; look for slivers and extreme contrasts of stiffness, or raise max_work = {sim.solver.max_work}"
-        return f"the step has taken {spent}", hint
+        spent = f"the step has taken {int(work.pcg.total.numpy()[world])} iterations of the conjugate gradients"
+        limit = f"max_work = {sim.solver.max_work}"
+        if near and dtype == "float32":
+            return f"float32 can't hold this case: the residual is within rounding, and {spent} ({limit})", finer
+        return spent, f"; look for slivers and extreme contrasts of stiffness, or raise {limit}"
     if code == FAIL_INVERTED:
         return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
-    near = float(work.newton.floor_excess.numpy()[world]) <= NEAR
     bent = sim.integrator.static and int(work.newton.bent.numpy()[world])
     if code in UNSTABLE and near and (dtype == "float32" or not bent):
-        hint = "; take float64" if dtype == "float32" else "; take fewer, stouter elements, or look at the units"
-        return f"{dtype} can't hold this case: what is left of the residual is within rounding", hint
+        return f"{dtype} can't hold this case: what is left of the residual is within rounding", finer
     if code in UNSTABLE and bent:
         return f"{REASONS[code]}: the equilibrium is unstable there (it buckles or snaps through)", (
             "; find what follows by a motion with damping, or prescribe displacements in place of loads"
@@ -137,7 +145,7 @@ def _unsatisfied(sim: Any, world: int, time: float, halvings: int) -> Constraint
     return ConstraintError(
         f"{_step_from(sim, time)}: constraints could not be satisfied in world {world} after "
         f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or with "
-        f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}",
+        f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}{jumping_drives(sim, world)}",
         joints=names, violations=values, time=time, world=world, state=sim.state,
     )  # fmt: skip
 

@@ -23,6 +23,7 @@ from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
 from .checks import check_choice, check_constraint_tol, check_dt, check_model, check_state, check_steps
+from .controls import Controls
 from .failures import check_closed, step_error
 from .reports import JointRecord, ProbeRecord, StepReport, describe, idle_report
 from .results import Results
@@ -55,6 +56,9 @@ class Simulation(Results):
             several only once all have failed.
         inversion: a step that turns an element inside out, J <= 0 at a quadrature point where J was positive, is
             refused ("refuse"), or passes where the law allows it ("report": StepReport.min_J tells).
+
+    Attributes:
+        controls: what the caller writes between steps, see Controls.
 
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
@@ -103,6 +107,7 @@ class Simulation(Results):
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
                 on_compile=on_compile or bar,
             )  # fmt: skip
+        self.controls = Controls(model, self.state)
         self.compile_s = clock.perf_counter() - began
         self.dt = dt
         check_closed(self)
@@ -414,11 +419,6 @@ class Simulation(Results):
     def contact_force(self, contact: Any) -> Any:
         """Contact is not part of this version."""
         raise NotImplementedError("contact_force: contact is not part of this version")
-
-    @property
-    def controls(self) -> Any:
-        """Controls are not part of this version."""
-        raise NotImplementedError("controls: values that a caller writes between steps are not part of this version")
 
     def resume(self, path: Any) -> None:
         """Continue from a checkpoint, bit for bit. Raises CheckpointError if it is of another model."""

@@ -97,7 +97,8 @@ def solve_static(
     """Find the static equilibrium.
 
     A pseudo-time runs from 0 to 1 in `load_steps` equal parts. Constant loads, gravity and drives grow in proportion to
-    it; laws over time are taken at it. A load step that fails is halved. Viscosity plays no part.
+    it, and so do the values of controls that the start has; laws over time are taken at it. A load step that fails is
+    halved. Viscosity plays no part.
 
     Args:
         load_steps: number of load steps; "auto": the whole load at once, halved where it is refused.

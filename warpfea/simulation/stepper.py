@@ -64,6 +64,7 @@ class Stepper:
         )
         vec3 = model.types.vec3
         state.sealed = False
+        model.terms.laws.register(state)
         if integrator.multistep:
             state.register("previous_displacement", vec3, (model.slots,))
             state.register("previous_velocity", vec3, (model.slots,))
@@ -311,7 +312,19 @@ class Stepper:
     def _laws(self, active: wp.array) -> None:
         """Values of the time laws at the end of the attempt."""
         w = self.work
-        self.terms.laws.evaluate(self.launch, w.step.new_time, w.step.ramp, active, w.law_value)
+        self.terms.laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
+
+    def law_values(self, time: float) -> np.ndarray:
+        """Values of the time laws at a time, s, or part of the load (B, laws, 3); the step's own stay."""
+        m, w = self.model, self.work
+        kept = [(array, array.numpy().copy()) for array in (w.step.new_time, w.step.ramp, w.law_value)]
+        w.step.new_time.fill_(time)
+        w.step.ramp.fill_(time if self.integrator.static else 1.0)
+        self._laws(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
+        values = w.law_value.numpy().copy()
+        for array, before in kept:
+            array.assign(before)
+        return values
 
     def _book(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state

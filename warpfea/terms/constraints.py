@@ -291,7 +291,7 @@ class Constraints(Term):
 
         every = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
-        laws.evaluate(launch, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
         mul = multiplier_struct()()
         for name in ("value", "target", "last", "scale", "force", "change", "trial", "merit", "excess", "stiffness"):
             setattr(mul, name, zeros((B, con.count), wp.float64))

@@ -13,7 +13,7 @@ from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
 from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
-from ..kernels.terms.contact_data import RECORD, attempt_struct, history_struct
+from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
@@ -89,8 +89,13 @@ class Contact(Term):
         attempt = attempt_struct(self.model.dtype)()
         for name, var in attempt_struct(self.model.dtype).vars.items():
             setattr(attempt, name, work.array(f"contact {name}", shapes.get(name, (B, P)), var.type.dtype))
+        clock = clock_struct()()
+        for name in ("time", "new_time", "h", "part"):
+            setattr(clock, name, getattr(work.step, name))
+        clock.time, clock.still = at.state.time, int(not at.inertia)
         scratch = {
             "attempt": attempt,
+            "clock": clock,
             "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
@@ -163,12 +168,11 @@ class Contact(Term):
     @part("contact")
     def begin(self, at: At, active: wp.array) -> None:
         """Colliders at the end of the attempt, points at its beginning."""
-        s, m, w = at.scratch[self.name], self.model, at.work
-        static = int(not at.inertia)
+        s, m = at.scratch[self.name], self.model
         self._poses(at, active)
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
-            args = [self.tables.data, group.data, s["history"], w.step, static]
+            args = [self.tables.data, group.data, s["history"], s["clock"]]
             more = [at.state.displacement, at.state.velocity, active, s["attempt"]]
             at.launch(self.kernels.begin_points, dim, [*args, *more])
             if self.tables.explicit:
@@ -184,7 +188,6 @@ class Contact(Term):
     @part("contact")
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        static = int(not at.inertia)
         if self.tables.lumped:
             for group in self.tables.groups:
                 args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
@@ -193,7 +196,7 @@ class Contact(Term):
             at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
         rows = w.rows_of(self)
         for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], w.step, static, w.u, active, fresh]
+            args = [self.tables.data, group.data, s["history"], s["clock"], w.u, active, fresh]
             at.launch(k.forces, (m.worlds, group.count), [*args, s["attempt"], w.pool_force, rows])
 
     @part("contact")
@@ -224,21 +227,20 @@ class Contact(Term):
     def _finish(self, at: At, accepted: wp.array) -> None:
         """History, books and records of an accepted substep."""
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.books
-        static = int(not at.inertia)
         C = len(self.tables.contacts)
         for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], w.step, static, w.u, accepted, s["attempt"]]
+            args = [self.tables.data, group.data, s["history"], s["clock"], w.u, accepted, s["attempt"]]
             at.launch(k.finish, (m.worlds, group.count), [*args, s["booked"]])
         args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         at.launch(k.partial_records, (m.worlds, C, LANES), args)
-        at.launch(k.total_records, (m.worlds, C), [w.step, static, accepted, s["parts"], s["attempt"]])
+        at.launch(k.total_records, (m.worlds, C), [s["clock"], accepted, s["parts"], s["attempt"]])
 
     @part("contact")
     def commit(self, at: At, accepted: wp.array) -> None:
         s, m, w = at.scratch[self.name], self.model, at.work
         if not s.get("finished"):
             self._finish(at, accepted)
-        args = [w.step, w.newton, accepted, s["history"], s["attempt"]]
+        args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
         at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), args)
 
     def report(self, at: At) -> None:
@@ -310,7 +312,7 @@ class Contact(Term):
 
         every = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
-        laws.evaluate(launch, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
         shapes: dict[str, tuple[int, ...]] = {"born": (B,), "place": (B, K), "turn": (B, K), "pick": (B, C)}
         if history is None:
             history = history_struct()()

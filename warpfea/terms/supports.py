@@ -140,4 +140,5 @@ def _arms(support: Support, anchor: np.ndarray) -> np.ndarray:
 def _same_law(a: TimeLaw | None, b: TimeLaw | None) -> bool:
     if a is None or b is None:
         return a is b
-    return a.function is b.function and np.array_equal(a.times, b.times) and np.array_equal(a.values, b.values)
+    same = a.function is b.function and a.control == b.control
+    return same and np.array_equal(a.times, b.times) and np.array_equal(a.values, b.values)

@@ -242,7 +242,7 @@ class Term:
         """A trial was accepted in the flagged worlds: hold its multipliers, caps, ... in the next search."""
 
     def refresh(self, at: At, flags: wp.array) -> None:
-        """With the trait "walls": take anew, at the iterate of the flagged worlds, what Newton's method has held so far.
+        """With the trait "walls": take anew, in the flagged worlds, what Newton's method has held so far.
 
         Forces are evaluated again after it, and judged: the residual is that of what is held now.
         """

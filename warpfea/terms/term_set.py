@@ -25,7 +25,7 @@ from .elements import Elements
 from .followers import Followers
 from .supports import Supports
 from .term import At, FieldSpec, Term
-from .time_laws import TimeLaws
+from .time_laws import TimeLaws, control_array
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -183,7 +183,8 @@ class TermSet:
         out: dict[str, bool] = {}
         for kind in kinds:
             out |= kind.features(self.model)
-        return out | {term.name: True for term in self.all if type(term) not in KINDS}
+        out |= {term.name: True for term in self.all if type(term) not in KINDS}
+        return out | {"controls": bool(self.laws.controls)}
 
     def hash(self, h: Any) -> None:
         """Feed what defines the terms into a hash."""
@@ -212,11 +213,12 @@ class TermSet:
     def allocate(self, work: Workspace, at: At) -> None:
         """Let the terms register history and make scratch."""
         owner: dict[str, str] = {}
+        controls = [control_array(name) for name in self.laws.controls]
         for term in self.all:
             before = len(at.state.asked)
             term.register(at)
             for name in at.state.asked[before:]:
-                if name in owner or name in STATE or name.startswith(MEMORY):
+                if name in owner or name in STATE or name in controls or name.startswith(MEMORY):
                     taken = f"term {owner[name]!r}" if name in owner else "the state itself"
                     raise ModelError(f"term {term.name!r}: the state's array {name!r} is that of {taken}; rename it")
                 owner[name] = term.name

@@ -7,30 +7,57 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.errors import ModelError
 from ..kernels.terms.loads import law_function_kernel, law_struct, load_kernels
-from ..laws import TimeLaw
+from ..laws import Control, TimeLaw
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
+    from ..model.state import State
 
-__all__ = ["TimeLaws", "argument_precision"]
+__all__ = ["TimeLaws", "argument_precision", "control_array"]
 
 
 class TimeLaws:
-    """Laws are numbered as they are added, then uploaded; `evaluate` fills one row of values per world."""
+    """Laws are numbered as they are added, then uploaded; `evaluate` fills one row of values per world.
+
+    Attributes:
+        controls: those that drive something, by name; their values are arrays of the state, see `control_array`.
+    """
 
     def __init__(self, model: Model) -> None:
         self.model = model
         self.kernels = load_kernels(model.dtype)
         self.laws: list[TimeLaw] = []
         self.functions: list[tuple[Any, int]] = []
+        self.controls: dict[str, Control] = {}
+        self.controlled: dict[tuple[str, bool], int] = {}
         self.data = law_struct()()
 
     def add(self, law: TimeLaw) -> int:
-        """The number of a new law."""
+        """The number of a law; of a control the one that it has already.
+
+        Raises:
+            ModelError: another control has the name.
+        """
+        if law.control is not None:
+            known = self.controls.setdefault(law.control.name, law.control)
+            if known != law.control:
+                raise ModelError(
+                    f"two controls have the name {known.name!r}: {known} and {law.control}; give each its own, or use "
+                    "one for both"
+                )
+            if (known.name, law.ramped) in self.controlled:
+                return self.controlled[known.name, law.ramped]
+            self.controlled[known.name, law.ramped] = len(self.laws)
         self.laws.append(law)
         return len(self.laws) - 1
+
+    def register(self, state: State) -> None:
+        """Give a state the arrays of the controls' values, where it has none."""
+        for control in self.controls.values():
+            state.register(control_array(control.name), wp.float64, (control.size,), control.initial)
 
     @property
     def count(self) -> int:
@@ -52,19 +79,26 @@ class TimeLaws:
                 self.functions.append((law_function_kernel(law.function, law.scalar, take), k))
 
     def evaluate(
-        self, launch: Launcher, time: wp.array, ramp: wp.array, active: wp.array, value: wp.array
-    ) -> None:  # fmt: skip
-        """value[world, law] at times [world]; constants are multiplied by the ramp [world] of a static load path."""
+        self, launch: Launcher, state: State, time: wp.array, ramp: wp.array, active: wp.array, value: wp.array
+    ) -> None:
+        """value[world, law] at times [world]; constants are multiplied by the ramp [world] of a static load path.
+
+        So are controls, whose values are in the state.
+        """
         if not self.laws:
             return
         B = self.model.worlds
         launch(self.kernels.evaluate_laws, (B, self.count), [self.data, time, ramp, active, value])
         for kernel, law in self.functions:
             launch(kernel, B, [law, time, active, value])
+        for (name, ramped), law in self.controlled.items():
+            args = [getattr(state, control_array(name)), law, int(ramped), ramp, active, value]
+            launch(self.kernels.evaluate_control, B, args)
 
     def modules(self) -> set[wp.Module]:
         """Modules that `evaluate` launches."""
         out = {kernel.module for kernel, _ in self.functions}
+        out |= {self.kernels.evaluate_control.module} if self.controls else set()
         return out | ({self.kernels.evaluate_laws.module} if self.laws else set())
 
     def hash(self, h: Any) -> None:
@@ -73,6 +107,13 @@ class TimeLaws:
             h.update(law.times.tobytes() + law.values.tobytes())
             if law.function is not None:
                 h.update(law.function.key.encode())
+            if law.control is not None:
+                h.update(f"{law.control!r} {law.ramped}".encode())
+
+
+def control_array(name: str) -> str:
+    """Name of the state's array [world, size] with the values of a control."""
+    return f"control_{name}"
 
 
 def argument_precision(function: wp.Function, default: str) -> str:

@@ -1,0 +1,69 @@
+"""What goes around Newton's iteration: multipliers of the classical method, and what terms hold while it solves."""
+
+import types as _types
+
+import warp as wp
+
+from ..common.traits import Traits
+from .control import FAIL_CONSTRAINT, control_struct
+from .judging import judging_functions
+
+__all__ = ["outer_kernels"]
+
+REFRESH = 0.1
+"""Relative residual from which on what terms hold (caps of friction) is taken anew at each iterate."""
+
+
+def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
+    """Kernels in the module of Newton's."""
+    f64 = wp.float64
+    Control = control_struct()
+    judging = judging_functions(traits)
+    objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
+    measure, settle, record = judging.measure, judging.settle, judging.record
+
+    @wp.kernel(module=module)
+    def begin_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
+        """Flag the worlds where what terms hold is to be taken anew: Newton's method has solved for it so far."""
+        world = wp.tid()
+        flags[world] = 0
+        if ctl.active[world] != 0:
+            last = ctl.iterations[world] + 1 >= ctl.max_iterations
+            if ctl.relative[world] <= f64(REFRESH) or last:
+                flags[world] = 1
+
+    @wp.kernel(module=module)
+    def end_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
+        """Judge the iterate, in the flagged worlds with what terms hold now."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        if flags[world] != 0:
+            measure(ctl, world)
+            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+            ctl.phi_magnitude[world] = magnitude(ctl, world)
+            ctl.leaps[world] = 0
+            settle(ctl, world)
+        else:
+            record(ctl, world)
+
+    @wp.kernel(module=module)
+    def judge_outer(ctl: Control, running: wp.array(dtype=wp.int32), tol: f64, limit: int):
+        """Classical multiplier updates: another inner solve where a constraint is still violated."""
+        world = wp.tid()
+        ctl.stepped[world] = 0
+        if running[world] == 0 or ctl.failed[world] != 0:
+            return
+        if largest_violation(ctl, world) <= tol:
+            return
+        if ctl.outer[world] >= limit:
+            ctl.failed[world] = FAIL_CONSTRAINT
+            return
+        ctl.outer[world] = ctl.outer[world] + 1
+        ctl.iterations[world] = 0
+        ctl.suspect[world] = 0
+        ctl.turned[world] = 0
+        ctl.active[world] = 1
+        ctl.stepped[world] = 1
+
+    return _types.SimpleNamespace(judge_outer=judge_outer, begin_refresh=begin_refresh, end_refresh=end_refresh)

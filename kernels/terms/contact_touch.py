@@ -1,0 +1,202 @@
+"""A surface point against its obstacle: where it is, its normal force, its friction, and their derivative."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import precision
+from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct
+from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
+from .contact_shapes import shape_functions
+
+__all__ = ["SLIPS", "touch_functions"]
+
+SLIPS = 16
+"""Of a point's mark: it slips; below are the sides."""
+
+
+@functools.cache
+def touch_functions(dtype: str) -> _types.SimpleNamespace:
+    """Device functions in one precision of the displacements; all but these is float64."""
+    vec3 = precision(dtype).vec3
+    f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
+    Contacts, Facets = contact_struct(), facet_struct(dtype)
+    History, Attempt = history_struct(), attempt_struct(dtype)
+    shapes, laws = shape_functions(), law_functions()
+    distance, sweep = shapes.distance, shapes.sweep
+    normal_law, friction, smooth_friction = laws.normal_law, laws.friction, laws.smooth_friction
+
+    @wp.struct
+    class Touch:
+        """A point at an iterate; forces are of the whole region."""
+
+        n: vec3d  # outward normal of the shape
+        depth: f64
+        side: wp.int32
+        law: vec3d  # normal force, its derivative, its potential
+        slip: vec3d  # tangential motion in the step
+        q: vec3d  # spring: tangential slip since it was anchored
+        y: vec3d  # place in the collider's frame
+
+    @wp.func
+    def along(facets: Facets, field: wp.array2d(dtype=vec3), world: int, point: int, item: int) -> vec3d:
+        """sum_i s_i field_i at a point."""
+        out = vec3d()
+        for i in range(facets.conn.shape[0]):
+            out += f64(facets.shape[point, i, item]) * vec3d(field[world, facets.conn[i, item]])
+        return out
+
+    @wp.func
+    def plane(n: vec3d, a: vec3d) -> vec3d:
+        """The part of a that is normal to n."""
+        return a - wp.dot(n, a) * n
+
+    @wp.func
+    def record_of(con: Contacts, c: int, point: int) -> int:
+        """Where the history of a point is."""
+        if con.lumped[c] != 0:
+            return con.first[c]
+        return point
+
+    @wp.func
+    def allowance(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
+        """What is left of a stored overlap."""
+        left = f64(1.0) - (time - his.born[world]) / con.decay[c]
+        return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
+
+    @wp.func
+    def reach(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
+        """Distance from the shape at which contact begins."""
+        grown = con.offset[c] + con.grow[world, con.collider[c]]
+        return grown - allowance(con, his, world, c, point, time)
+
+    @wp.func
+    def rate_of(con: Contacts, at: Attempt, world: int, c: int, point: int, inv_h: f64) -> f64:
+        """Damping per depth of the normal law: chi/h, or gamma_n/h."""
+        if con.law[c] == DEFAULT:
+            return con.damping[world, c] * inv_h / at.speed[world, point]
+        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * con.normal_damping[c] * inv_h
+
+    @wp.func
+    def tangent_damping(con: Contacts, world: int, c: int, stiffness: f64) -> f64:
+        """gamma_t of Eq. (80), N s/m."""
+        return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(con.mass[c] * stiffness)
+
+    @wp.func
+    def touch(
+        con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
+        u: wp.array2d(dtype=vec3), time: f64, inv_h: f64, shrink: f64,
+    ) -> Touch:  # fmt: skip
+        """A point at displacements u."""
+        out = Touch()
+        k = con.collider[c]
+        rec = record_of(con, c, point)
+        x = facets.X[q, item] + along(facets, u, world, q, item)
+        turn = at.turn[world, k]
+        out.y = wp.transpose(turn) * (x - at.place[world, k])
+        side = wp.int32(-1)
+        live = his.speed[world, rec] > f64(0.0)
+        if live:
+            side = his.mark[world, rec] % SLIPS - 1
+        out.side = sweep(con.kind[k], con.size[k], at.start[world, point], out.y, side)
+        d = distance(con.kind[k], con.size[k], out.y, out.side)
+        out.n = turn * vec3d(d[0], d[1], d[2])
+        out.depth = reach(con, his, world, c, point, time) - d[3]
+        rate = rate_of(con, at, world, c, point, inv_h)
+        k_n = con.scale[world, c] * con.normal[c]
+        out.law = normal_law(con.law[c], con.lumped[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
+                             at.depth[world, point])  # fmt: skip
+        motion = turn * (out.y - at.start[world, point])
+        out.slip = plane(out.n, motion)
+        spring = vec3d()
+        if live:
+            spring = his.spring[world, rec]
+            if con.law[c] != PAPER:
+                spring = shrink * (turn * spring)
+        out.q = plane(out.n, spring + motion)
+        return out
+
+    @wp.func
+    def hold(con: Contacts, his: History, at: Attempt, world: int, c: int, point: int, t: Touch) -> vec3d:
+        """Cap, k_t and shrinkage of the spring at an iterate."""
+        rec = record_of(con, c, point)
+        mu = con.mu_static[world, c]
+        live = his.speed[world, rec] > f64(0.0)
+        if live and his.mark[world, rec] >= SLIPS:
+            mu = con.mu[world, c]
+        stiffness = con.scale[world, c] * con.tangent[c]
+        shrink = f64(1.0)
+        if con.lumped[c] != 0:
+            depth = wp.max(t.depth, f64(0.0))
+            stiffness *= wp.sqrt(depth)
+            before = at.depth[world, point]
+            if live and depth < before and con.law[c] == DEFAULT:
+                shrink = wp.sqrt(depth / before)
+        return vec3d(mu * t.law[0], stiffness, shrink)
+
+    @wp.func
+    def pull(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64) -> wp.vec4d:
+        """Friction that resists the motion, as a trial force and in w its whole stiffness (spring and damper)."""
+        gamma = tangent_damping(con, world, c, held[1]) * inv_h
+        trial = held[1] * t.q + gamma * t.slip
+        return wp.vec4d(trial[0], trial[1], trial[2], held[1] + gamma)
+
+    @wp.func
+    def friction_potential(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64) -> f64:
+        """J, with a cap that is held."""
+        if held[0] <= f64(0.0):
+            return f64(0.0)
+        if con.law[c] == SMOOTH:
+            return smooth_friction(t.slip, inv_h, con.speed_eps[c], held[0])[0]
+        w = pull(con, world, c, t, held, inv_h)
+        if w[3] <= f64(0.0):
+            return f64(0.0)
+        return friction(vec3d(w[0], w[1], w[2]), w[3], held[0])[0]
+
+    @wp.func
+    def friction_force(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64) -> vec3d:
+        """What friction adds to the residual, N."""
+        if held[0] <= f64(0.0):
+            return vec3d()
+        if con.law[c] == SMOOTH:
+            return smooth_friction(t.slip, inv_h, con.speed_eps[c], held[0])[1] * t.slip
+        w = pull(con, world, c, t, held, inv_h)
+        if w[3] <= f64(0.0):
+            return vec3d()
+        trial = vec3d(w[0], w[1], w[2])
+        return friction(trial, w[3], held[0])[1] * trial
+
+    @wp.func
+    def point_stiffness(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64) -> mat33d:
+        """Derivative of the force that a point adds to the residual, positive: without that of the normal."""
+        K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
+        if held[0] > f64(0.0):
+            P = wp.identity(n=3, dtype=f64) - wp.outer(t.n, t.n)
+            if con.law[c] == SMOOTH:
+                part = smooth_friction(t.slip, inv_h, con.speed_eps[c], held[0])[1]
+                v = inv_h * t.slip
+                root = wp.dot(v, v) + con.speed_eps[c] * con.speed_eps[c]
+                K += part * (P - wp.outer(v, v) / root)
+            else:
+                w = pull(con, world, c, t, held, inv_h)
+                trial = vec3d(w[0], w[1], w[2])
+                size2 = wp.dot(trial, trial)
+                if size2 <= held[0] * held[0]:
+                    K += w[3] * P
+                else:
+                    K += (w[3] * held[0] / wp.sqrt(size2)) * (P - wp.outer(trial, trial) / size2)
+        return K
+
+    @wp.func
+    def acts(con: Contacts, at: Attempt, world: int, c: int, point: int) -> f64:
+        """1 unless another point stands for the contact."""
+        if con.lumped[c] != 0 and at.pick[world, c] != point:
+            return f64(0.0)
+        return f64(1.0)
+
+    return _types.SimpleNamespace(
+        Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, tangent_damping=tangent_damping,
+        touch=touch, hold=hold, pull=pull, friction_potential=friction_potential, friction_force=friction_force,
+        point_stiffness=point_stiffness, acts=acts,
+    )  # fmt: skip

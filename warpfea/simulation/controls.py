@@ -1,0 +1,145 @@
+"""Controls of a simulation: the values that a caller writes between steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..base.names import did_you_mean, listing
+from ..laws import Control
+from ..terms.time_laws import control_array
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..model.state import State
+
+__all__ = ["ControlValue", "Controls"]
+
+
+class Controls(Mapping[str, "ControlValue"]):
+    """The controls that drive something in a model, by name: `sim.controls["jaw"][:] = 0.1`."""
+
+    def __init__(self, model: Model, state: State) -> None:
+        self._values = {
+            name: ControlValue(control, getattr(state, control_array(name)))
+            for name, control in model.terms.laws.controls.items()
+        }
+
+    def __getitem__(self, name: str) -> ControlValue:
+        if name not in self._values:
+            known = f"it has: {listing(self._values)}{did_you_mean(name, self._values)}"
+            raise ModelError(f"control {name!r} drives nothing in this model; {known}")
+        return self._values[name]
+
+    def __setitem__(self, name: str, values: Any) -> None:
+        """As `controls[name][:] = values`."""
+        self[name].assign(values)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return f"Controls({', '.join(map(repr, self._values.values()))})"
+
+
+class ControlValue:
+    """Values [world, size] of one control, in the unit of what it drives; what is written acts from the next step on.
+
+    `value[:] = x`, `value[mask] = x` and `value[2, 0] = x` write with numpy's rules, one number per world also as
+    (worlds,); `assign` also takes a Warp array. `array` is the memory of the state: kernels may write to it, and
+    `wp.to_torch(value.array)` or `torch.from_dlpack(value)` share it without a copy. What is written there is not
+    checked.
+
+    Attributes:
+        control: what was declared.
+        array: Warp array [world, size], float64.
+    """
+
+    def __init__(self, control: Control, array: wp.array) -> None:
+        self.control = control
+        self.array = array
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(worlds, size)."""
+        return tuple(self.array.shape)
+
+    def numpy(self) -> np.ndarray:
+        """A copy (worlds, size)."""
+        return self.array.numpy().copy()
+
+    def assign(self, values: Any) -> None:
+        """Write the values of all worlds.
+
+        Args:
+            values: what broadcasts to (worlds, size), (worlds,) of a scalar control; or a Warp array (worlds, size) of
+                float64, which is copied on the device and not checked for values that are not finite.
+
+        Raises:
+            ModelError: another shape or type, or a value that is not finite; nothing is written then.
+        """
+        if not isinstance(values, wp.array):
+            self[:] = values
+            return
+        if values.shape != self.shape or values.dtype != wp.float64:
+            got = f"{values.dtype.__name__}{values.shape}"
+            raise ModelError(f"{self._what} takes a Warp array float64{self.shape}, got {got}")
+        wp.copy(self.array, values)
+
+    def __setitem__(self, key: Any, values: Any) -> None:
+        whole = key is Ellipsis or (isinstance(key, slice) and key == slice(None))
+        target = np.empty(self.shape) if whole else self.numpy()
+        try:
+            given = np.asarray(values, dtype=float)
+            part = target[key]
+            if part.ndim == 2 and part.shape[1] == 1 and given.shape == part.shape[:1]:
+                given = given[:, None]
+            target[key] = given
+        except (TypeError, ValueError, IndexError) as error:
+            raise ModelError(f"{self._what} has values {self.shape}: {error}") from error
+        # what is not written may be what it is: a world that went wrong can be mended alone
+        if not np.all(np.isfinite(given)):
+            world, component = map(int, np.argwhere(~np.isfinite(target))[0])
+            where = f"world {world}" + (f", component {component}" if self.shape[1] > 1 else "")
+            raise ModelError(f"{self._what}: {target[world, component]} of {where} is not finite")
+        self.array.assign(target)
+
+    def __getitem__(self, key: Any) -> Any:
+        """A copy that can't be written to, so that `value[0][1] = x` is no silent loss."""
+        values = self.numpy()
+        values.flags.writeable = False
+        out = values[key]
+        if isinstance(out, np.ndarray):
+            out.flags.writeable = False
+        return out
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        if copy is False:
+            raise ValueError(f"{self._what} is copied from the device; take .array")
+        return self.numpy().astype(dtype or float)
+
+    def __dlpack__(self, stream: Any = None) -> Any:
+        return self.array.__dlpack__(stream)
+
+    def __dlpack_device__(self) -> Any:
+        return self.array.__dlpack_device__()
+
+    def __repr__(self) -> str:
+        return f"ControlValue({self.control.name!r}, {self.numpy().tolist()})"
+
+    @property
+    def _what(self) -> str:
+        return f"control {self.control.name!r}"

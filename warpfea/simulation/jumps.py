@@ -1,0 +1,80 @@
+"""Drives that jump within a step that was refused."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..kernels.terms.constraints import TURN
+
+if TYPE_CHECKING:
+    from ..laws import TimeLaw
+    from ..model.model import Model
+
+__all__ = ["jumping_drives"]
+
+RATIO = 10.0
+"""A drive that jumps moves so many times farther than in an equal time before."""
+ANGLE = 0.1
+"""Least angle that counts as a jump, rad."""
+
+
+def jumping_drives(sim: Any, world: int) -> str:
+    """What to tell of the drives that jump within the last attempt of a world's refused step; "" without any.
+
+    A travel counts from the size of an element on, m, an angle from `ANGLE` on.
+    """
+    drives = _drives(sim.model)
+    if not drives:
+        return ""
+    step = sim.stepper.work.step
+    end, h = float(step.new_time.numpy()[world]), float(step.h.numpy()[world])
+    late, start, early = (sim.stepper.law_values(end - k * h)[world] for k in range(3))
+    least = _element_size(sim.model)
+    told = []
+    for name, angular, entries in drives:
+        moved, before = (
+            max(float(np.linalg.norm((b[number] - a[number]) * mask)) for number, mask in entries)
+            for a, b in ((start, late), (early, start))
+        )
+        if moved > max(RATIO * before, ANGLE if angular else least):
+            told.append(f"{name} by {moved:.3g} {'rad' if angular else 'm'}")
+    if not told:
+        return ""
+    span = f"{100.0 * h:.3g} % of the load" if sim.integrator.static else f"{h:.3g} s"
+    return f"; a drive jumps within {span}: {', '.join(told[:4])}{', ...' if len(told) > 4 else ''}; give it a ramp"
+
+
+def _drives(model: Model) -> list[tuple[str, bool, list[tuple[int, np.ndarray]]]]:
+    """Name of each drive, whether it turns, and the numbers of its laws with the components that they prescribe."""
+    number = {id(law): k for k, law in enumerate(model.terms.laws.laws)}
+    out: list[tuple[str, bool, list[tuple[int, np.ndarray]]]] = []
+
+    def add(name: str, angular: bool, laws: list[tuple[TimeLaw, np.ndarray]]) -> None:
+        entries = [(number[id(law)], mask) for law, mask in laws if id(law) in number]
+        if entries:
+            out.append((name, angular, entries))
+
+    for joint in model.constraints.joints if model.constraints else ():
+        rows = [row for row in joint.rows if row.law is not None]
+        laws = [(row.law, np.eye(3)[row.component]) for row in rows if row.law is not None]
+        add(f"joint {joint.name!r}", any(row.kind == TURN for row in rows), laws)
+    for support in model.description.supports:
+        turns = support.rotation is not None
+        mask = np.eye(3)[0] if turns else np.asarray(support.components, dtype=float)
+        known = support.node_laws or ([support.law] if support.law is not None else [])
+        add(f"the drive of body {support.body.name!r}", turns, [(law, mask) for law in known])
+    return out
+
+
+def _element_size(model: Model) -> float:
+    """Median diagonal of the elements' boxes, m."""
+    sizes = []
+    for block in model.blocks:
+        for part in block.parts:
+            points = part.body.reference[part.conn]
+            place = (part.body.slot_kind[part.conn] == 0)[:, :, None]
+            low, high = np.where(place, points, np.inf).min(axis=1), np.where(place, points, -np.inf).max(axis=1)
+            sizes.append(np.linalg.norm(high - low, axis=1))
+    return float(np.median(np.concatenate(sizes)))
