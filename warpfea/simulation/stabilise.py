@@ -17,10 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Springs", "spring_stiffness"]
 
-SOFT = 1e-6
-"""Stiffness without gravity, over that of the stiffest body."""
-
-
 def spring_stiffness(model: Model, stabilise: Any) -> float:
     """N/m per kg that `solve_static(stabilise=)` asks for; 0: none. ModelError for what is none, or a missing density."""
     if stabilise is False or stabilise is None:
@@ -33,14 +29,8 @@ def spring_stiffness(model: Model, stabilise: Any) -> float:
     require_density(model.bodies, "stabilise")
     if stabilise is not True:
         return float(stabilise)
-    gravity = float(np.linalg.norm(model.terms.dead.gravity_host, axis=1).max())
-    if gravity > 0.0:
-        return gravity / model.size
-    return (
-        SOFT
-        * max(effective_modulus(b)[0] * float(element_volumes(b).sum()) / body_mass_total(b) for b in model.bodies)
-        / model.size**2
-    )
+    stiffest = max(effective_modulus(b)[0] * float(element_volumes(b).sum()) / body_mass_total(b) for b in model.bodies)
+    return stiffest / model.size**2
 
 
 class Springs(Output):
