@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Springs", "spring_stiffness"]
 
+SOFT = 1e-3
+"""Default stiffness, over E / (density size^2) of the stiffest body."""
+
+
 def spring_stiffness(model: Model, stabilise: Any) -> float:
     """N/m per kg that `solve_static(stabilise=)` asks for; 0: none. ModelError for what is none, or a missing density."""
     if stabilise is False or stabilise is None:
@@ -30,7 +34,7 @@ def spring_stiffness(model: Model, stabilise: Any) -> float:
     if stabilise is not True:
         return float(stabilise)
     stiffest = max(effective_modulus(b)[0] * float(element_volumes(b).sum()) / body_mass_total(b) for b in model.bodies)
-    return stiffest / model.size**2
+    return SOFT * stiffest / model.size**2
 
 
 class Springs(Output):
