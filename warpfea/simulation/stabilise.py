@@ -22,7 +22,7 @@ SOFT = 1e-3
 
 
 def spring_stiffness(model: Model, stabilise: Any) -> float:
-    """N/m per kg that `solve_static(stabilise=)` asks for; 0: none. ModelError for what is none, or a missing density."""
+    """N/m per kg that `solve_static(stabilise=)` asks for; 0: none. ModelError for a bad value or a missing density."""
     if stabilise is False or stabilise is None:
         return 0.0
     good = isinstance(stabilise, (bool, int, float, np.integer, np.floating))

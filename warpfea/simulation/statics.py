@@ -108,8 +108,8 @@ def solve_static(
         state: start; by default model.state(). It is copied.
         stabilise: hold bodies that only contact, or nothing yet, holds: each part of them by a spring per mass of
             (1 - load) times this many N/m per kg, from the last equilibrium to the next, and none at full load. True:
-            |gravity| over the model's size; without gravity 1e-6 E / (density size^2) of the stiffest body. A smaller
-            value moves a body further in a load step, a larger one lets it lag. `StaticResult.stabilise` tells what the
+            1e-3 E / (density size^2) of the stiffest body and the model's size. A smaller value moves a body further in
+            a load step and closes wider gaps, a larger one lets it lag. `StaticResult.stabilise` tells what the
             springs carried.
         outputs: writers (PNGWriter, USDWriter, VTUWriter, ...), which get each load step as a state; what they say of
             time is the part of the load, 0 to 1, and pictures are labelled "load 100 %".
@@ -147,7 +147,7 @@ def begin_static(
     if isinstance(count, (bool, str)) or not (isinstance(count, (int, np.integer)) and count >= 1):
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number, or 'auto'")
     check_model(model)
-    if np.any(model.terms.dead.gravity_host):
+    if model.terms.dead.pulls:
         require_density(model.bodies, "gravity")
     springs = spring_stiffness(model, stabilise)
     if not springs:
