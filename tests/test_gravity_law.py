@@ -51,7 +51,7 @@ def test_the_ledger_closes_where_a_body_is_held():
 
 def test_statics_takes_a_law_at_the_part_of_the_load():
     tips = []
-    tilt = ((0.0, 0.5, 1.0), ((0, 0, 0), (0, 0, -20.0), (5.0, 0, -10.0)))
+    tilt = ((0.0, 0.5, 1.0), ((0, 0, 0), (10.0, 0, -20.0), (5.0, 0, -10.0)))
     for gravity in ((5.0, 0, -10.0), tilt):
         b, body = cube(gravity)
         b.clamp(body.nodes("z-"))
