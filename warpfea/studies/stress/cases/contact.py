@@ -15,12 +15,13 @@ import numpy as np
 import warpfea as wf
 
 from ..build import DOWN, Count
-from ..case import Answer, Setting, case
+from ..case import DTYPES, Answer, Setting, case
 
 GROUP = "contact"
 SIDE, DENSITY, G = 0.1, 1000.0, 9.81
 MODULI, STEPS = (1e4, 1e6, 1e8, 1e11), (1e-5, 1e-3, 1e-2)
 GRID = tuple((E, h) for E in MODULI for h in STEPS)
+NAMED = {dtype: ["collider", "inside out", "J <= 0"] for dtype in DTYPES}
 SINGLE = {"float32": ["float32"]}
 FAST = 100.0
 """Speed of impacts, m/s."""
@@ -164,7 +165,7 @@ OBSTACLES = {
 
 @case(
     "contact-impact", GROUP, values=tuple((name, E) for name in OBSTACLES for E in (1e6, 1e8)), quick="none",
-    refusal=dict.fromkeys(("float64", "float32"), ["collider", "inside out", "J <= 0"]),
+    refusal=NAMED,
 )  # fmt: skip
 def impact(setting: Setting, value: tuple[str, float]) -> Answer:
     """A cube at 100 m/s onto a half-space, a thin box, a sphere, h = 10 ms, ten of its sides a step: none gets behind."""
@@ -326,7 +327,7 @@ def extreme_restitution(setting: Setting, e: float) -> Answer:
 
 @case(
     "contact-jump", GROUP, values=(0.005, 0.05, 0.5), quick="none",
-    refusal=dict.fromkeys(("float64", "float32"), ["collider", "inside out", "J <= 0"]),
+    refusal=NAMED,
 )  # fmt: skip
 def jump(setting: Setting, height: float) -> Answer:
     """The floor jumps by 5, 50 or 500 mm into a resting cube of 100 mm within a step: above it after, or refused."""
