@@ -22,15 +22,18 @@ import warp as wp
 
 from ... import mesh as meshes
 from ...builder.builder import ModelBuilder
+from ...kernels.terms.contact_data import RECORD
 from ...materials import SVK
 from ...model.contacts import HalfSpace
 from ...simulation.simulation import Simulation
+from ...terms.contact import Contact
 from .measure import solver, write
 
 __all__ = ["BARS", "SCENES", "ContactRow", "contact"]
 
 SIZE = (1.0, 1.0, 0.5)
 LAW = SVK(E=1e7, nu=0.3, density=1000.0)
+WEIGHT = 9.81 * 1000.0 * SIZE[0] * SIZE[1] * SIZE[2]
 DT, LONG_DT = 1e-3, 1e-2
 SPEED, UNTIL = 20.0, 1.0
 STEPS, REPEAT, WARM_UP = 10, 3, 10
@@ -54,6 +57,7 @@ class ContactRow:
         ratio: ms over those of the scene beside, or None.
         ratio_per_newton: the same of ms per Newton iteration.
         bar: largest ratio wanted.
+        carried: mean normal force over the block's weight.
     """
 
     scene: str
@@ -70,13 +74,15 @@ class ContactRow:
     ratio: float | None
     ratio_per_newton: float | None
     bar: float | None
+    carried: float
 
 
 @dataclass
 class _Runner:
     sim: Simulation
-    points: int
+    term: Contact | None
     times: list[float]
+    carried: float = 0.0
     newton: int = 0
     pcg: int = 0
     halvings: int = 0
@@ -90,19 +96,20 @@ class _Runner:
                 self.newton += int(report.newton[0])
                 self.pcg += int(report.pcg[0])
                 self.halvings += int(report.halvings[0])
+                if self.term is not None:
+                    column = self.term.report_offset + RECORD.index("normal_force")
+                    self.carried += float(self.sim.stepper.work.report.numpy()[0, column]) / WEIGHT
 
 
 def cells_for(unknowns: int) -> int:
-    """Cells along the block's height for a free block of about so many unknowns."""
-    return min(range(1, 200), key=lambda n: abs(3 * (4 * n + 1) ** 2 * (2 * n + 1) - unknowns))
+    """Cells along the block's length for a free block of about so many unknowns."""
+    return min(range(2, 400), key=lambda n: abs(3 * (2 * n + 1) ** 2 * (2 * (n // 2) + 1) - unknowns))
 
 
 def build(scene: str, cells: int) -> ModelBuilder:
-    """A scene with so many cells along the block's height."""
+    """A scene with so many cells along the block's length."""
     b = ModelBuilder()
-    block = b.add_solid(
-        meshes.box(SIZE, cells=(2 * cells, 2 * cells, cells)), material=LAW, element="T10", name="block"
-    )
+    block = b.add_solid(meshes.box(SIZE, cells=(cells, cells, cells // 2)), material=LAW, element="T10", name="block")
     low = block.surface("z-")
     if scene in ("none", "apart"):
         b.clamp(block.nodes("z+"))
@@ -120,9 +127,9 @@ def build(scene: str, cells: int) -> ModelBuilder:
 
 def _start(scene: str, cells: int, dtype: str, device: Any, tol: float | None) -> _Runner:
     model = build(scene, cells).finalize(device=device, dtype=dtype)
-    term = next((term for term in model.terms if term.name == "contact"), None)
+    term = next((term for term in model.terms if isinstance(term, Contact)), None)
     sim = Simulation(model, dt=DT, solver=solver(tol), ledger=False)
-    out = _Runner(sim, term.tables.points if term else 0, [])
+    out = _Runner(sim, term, [])
     if scene == "sliding":
         sim.dt = LONG_DT
         out.step(round(UNTIL / LONG_DT), counted=False)
@@ -154,7 +161,7 @@ def measure(
                 scene,
                 dtype,
                 r.sim.model.info()["unknowns"],
-                r.points,
+                r.term.tables.points if r.term else 0,
                 1e3 * time[scene],
                 r.newton / n,
                 r.pcg / n,
@@ -165,6 +172,7 @@ def measure(
                 ratio,
                 per_newton,
                 BARS[scene][kind] if scene in BARS else None,
+                r.carried / n,
             )
         )
     return rows
@@ -193,7 +201,7 @@ def contact(options: argparse.Namespace) -> None:
 
 HEADER = (
     f"{'scene':8} {'dtype':8} {'unknowns':>8} {'points':>7} {'ms/step':>9} {'Newton':>6} {'PCG':>6} {'launches':>8} "
-    f"{'beside':>8} {'ratio':>6} {'bar':>4} {'per Newton':>10}"
+    f"{'beside':>8} {'ratio':>6} {'bar':>4} {'per Newton':>10} {'N / m g':>7}"
 )
 
 
@@ -204,5 +212,5 @@ def _line(r: ContactRow) -> str:
     return (
         f"{r.scene:8} {r.dtype:8} {r.unknowns:8d} {r.points:7d} {r.ms_per_step:9.2f} {r.newton_per_step:6.2f} "
         f"{r.pcg_per_step:6.1f} {r.launches:8d} {r.beside or '-':>8} {text(r.ratio):>6} {text(r.bar):>4} "
-        f"{text(r.ratio_per_newton):>10}"
+        f"{text(r.ratio_per_newton):>10} {r.carried:7.3f}"
     )

@@ -168,7 +168,7 @@ OBSTACLES = {
     refusal=NAMED,
 )  # fmt: skip
 def impact(setting: Setting, value: tuple[str, float]) -> Answer:
-    """A cube at 100 m/s onto a half-space, a thin box, a sphere, h = 10 ms, ten of its sides a step: none gets behind."""
+    """A cube at 100 m/s onto a half-space, a thin box, a sphere, ten of its sides a step: it does not get behind."""
     name, E = value
     s = scene(OBSTACLES[name], E=E, gravity=(0, 0, 0), place=(0, 0, 0.3), mu=0.3, restitution=0.5)
     s.builder.set_initial(s.body, velocity=(0, 0, -FAST))
