@@ -149,6 +149,29 @@ def test_statics_and_worlds():
     assert list(s.time > 0) == [False, True, True, False]
 
 
+def test_contact():
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    soft = wf.NeoHookean(mu=4e5, k=1e7, density=1000.0)
+    box = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=soft, name="box")
+    floor = b.add_collider(wf.HalfSpace(normal=(0, 0, 1), offset=0.0), name="floor")
+    pad = b.add_contact(box, floor, mu=0.5, restitution=0.5, name="pad")
+    model = b.finalize(device="cpu", worlds=2)
+    model.set_parameter("pad.mu", [0.1, 0.5])
+    sim = wf.Simulation(model, dt=1e-3)
+    sim.step(5)
+    c = sim.contact_record(pad)
+    assert c.time.shape == (5,)
+    assert c.force.shape == c.moment.shape == (2, 5, 3)
+    for values in (c.normal_force, c.penetration, c.slip, c.area, c.stick, c.stored, c.loss, c.friction):
+        assert values.shape == (2, 5)
+    assert c.collider_work.shape == (2, 5)
+    assert sim.contact_force(pad).shape == (2, 6)
+    assert model.contact_force(sim.state).shape == (2, model.slots, 3)
+    names = ("contact", "contact_loss", "friction", "collider_work")
+    assert all(sim.energies()[name].shape == (2,) for name in names)
+    assert issubclass(wf.PenetrationError, wf.ConvergenceError)
+
+
 def test_errors_derive_from_one():
     names = ["MeshError", "ModelError", "ConvergenceError", "ConstraintError", "PenetrationError", "CapacityError"]
     for name in [*names, "CheckpointError", "OutputError"]:

@@ -154,8 +154,6 @@ LATER = {
     "TriMesh": lambda b, s: wf.TriMesh,
     "energy_momentum": lambda b, s: wf.Simulation(b.finalize(device="cpu"), dt=1.0, integrator="energy_momentum"),
     "set_parameter": lambda b, s: b.finalize(device="cpu").set_parameter("bar.E", 1.0),
-    "contact_force": lambda b, s: b.finalize(device="cpu").contact_force(None),
-    "contact_record": lambda b, s: wf.Simulation(b.finalize(device="cpu"), dt=1.0).contact_record(None),
     "GeneralizedAlpha": lambda b, s: wf.GeneralizedAlpha,
 }
 

@@ -15,8 +15,9 @@ import pytest
 
 from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.colormap import TABLE, map_colors, to_linear, to_srgb
-from warpfea.outputs.frames import FrameClock, Surface, grid_offsets, vertex_normals
-from warpfea.outputs.raycaster import Camera, Renderer, nice_number, smooth_corners
+from warpfea.outputs.frames import FrameClock, Surface, grid_offsets
+from warpfea.outputs.normals import smooth_corners, vertex_normals
+from warpfea.outputs.raycaster import Camera, Renderer, nice_number
 from warpfea.outputs.render import GIFWriter, PNGWriter, render_usd
 from warpfea.outputs.usd import USDWriter, validate_usd
 from warpfea.outputs.vtk import VTUWriter

@@ -15,10 +15,14 @@ from warpfea.builder.scene import Scene, find, load_file, names
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 BUILTIN = [
+    "beam_over_cylinders",
+    "belt",
+    "bouncing_ball",
     "cantilever",
     "chain",
     "double_pendulum",
     "four_bar",
+    "gripper",
     "hook",
     "hung_plate",
     "mixed",
@@ -27,6 +31,7 @@ BUILTIN = [
     "rollup",
     "slider_crank",
     "spin",
+    "tilting_table",
     "twist",
 ]
 
@@ -211,7 +216,7 @@ def test_the_registry_lists_without_importing():
 
 def test_names_and_find():
     assert names() == BUILTIN
-    with pytest.raises(wf.ModelError, match="no scene 'crane'; there are cantilever, chain, double_pendulum"):
+    with pytest.raises(wf.ModelError, match="no scene 'crane'; there are beam_over_cylinders, belt, bouncing_ball"):
         find("crane")
 
 
@@ -221,7 +226,9 @@ def test_every_scene_is_described_and_builds(name):
     assert scene.description.endswith(".")
     assert all(p.doc and not p.required for p in scene.parameters.values())
     builder = scene()
-    assert builder.description.supports or builder.description.joints or name == "spin"  # floats
+    assert (
+        builder.description.supports or builder.description.joints or builder.description.contacts or name == "spin"
+    )  # floats
     assert builder.description.probes
     assert scene.picture is None or scene.picture < scene.t_end
 

@@ -130,5 +130,6 @@ def control_struct():
         max_iterations: wp.int32
         components: wp.int32
         nonpotential: wp.int32
+        equilibrium: wp.int32  # statics
 
     return NewtonControl

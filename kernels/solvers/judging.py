@@ -174,13 +174,14 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def give_up(ctl: Control, world: int, why: int):
         """End without convergence. In single precision a residual as large as the forces, of no more than `DROWNED`
-        roundings, is put down to those, whatever it ends by: a shorter step has smaller forces in the same noise."""
+        roundings, is put down to those in statics, whatever it ends by: a smaller load has smaller forces in the same
+        noise."""
         ctl.active[world] = 0
         ctl.searching[world] = 0
         ctl.failed[world] = why
         stuck = why == FAIL_ITERATIONS or why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE
         drowned = ctl.floor_excess[world] <= f64(DROWNED) and ctl.relative[world] > f64(0.5)
-        if stuck and drowned and ctl.eps > f64(COARSE) and ctl.iterations[world] > 0:
+        if stuck and drowned and ctl.eps > f64(COARSE) and ctl.iterations[world] > 0 and ctl.equilibrium != 0:
             ctl.failed[world] = FAIL_FLOOR
         if wp.static(gated):
             if why != FAIL_NAN and why != FAIL_JACOBIAN and unsatisfied(ctl, world):

@@ -241,33 +241,19 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         else:
             return r[world, k]
 
-    @wp.kernel(module=module)
-    def apply_dense(
-        matrix: wp.array3d(dtype=S),
-        root: wp.array2d(dtype=T),
-        part: int,
-        lanes: int,
-        r: wp.array2d(dtype=T),
-        active: wp.array(dtype=wp.int32),
-        x: wp.array2d(dtype=T),
-    ):
-        """x = B r with a dense matrix, `lanes` threads per row.
-
-        `part`: 0: the whole of it; 1: its lower triangle; 2: its upper triangle, with the diagonal.
-        """
-        world, index = wp.tid()
-        if active[world] == 0:
-            return
-        lane = index % lanes
-        row = wp.min(index / lanes, x.shape[1] - 1)
+    @wp.func
+    def row_times(
+        matrix: wp.array3d(dtype=S), root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, row: int,
+        first: int, n: int, lanes: int,
+    ) -> T:  # fmt: skip
+        """A lane's part of a row times r, from `first` to n."""
         # four independent sums, so that enough loads are under way at a time
-        n = wp.where(part == 1, row + 1, r.shape[1])
         s0 = T(0.0)
         s1 = T(0.0)
         s2 = T(0.0)
         s3 = T(0.0)
         last = n - 3 * lanes
-        k = wp.where(part == 2, row, 0) + lane
+        k = first
         while k < last:
             s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
             s1 += T(matrix[world, row, k + lanes]) * part_of(root, r, world, k + lanes)
@@ -277,7 +263,48 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         while k < n:
             s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
             k += lanes
-        s = scalar_sum((s0 + s1) + (s2 + s3), lanes)
+        return (s0 + s1) + (s2 + s3)
+
+    @wp.kernel(module=module)
+    def apply_dense(
+        matrix: wp.array3d(dtype=S),
+        root: wp.array2d(dtype=T),
+        lanes: int,
+        r: wp.array2d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        x: wp.array2d(dtype=T),
+    ):
+        """x = A^-1 r with a dense inverse, `lanes` threads per row."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        lane = index % lanes
+        row = wp.min(index / lanes, x.shape[1] - 1)
+        s = scalar_sum(row_times(matrix, root, r, world, row, lane, r.shape[1], lanes), lanes)
+        if lane == 0:
+            if wp.static(scaled):
+                s = s * root[world, row]
+            x[world, row] = s
+
+    @wp.kernel(module=module)
+    def apply_triangle(
+        matrix: wp.array3d(dtype=S),
+        root: wp.array2d(dtype=T),
+        upper: int,
+        lanes: int,
+        r: wp.array2d(dtype=T),
+        active: wp.array(dtype=wp.int32),
+        x: wp.array2d(dtype=T),
+    ):
+        """The same with the lower triangle of a matrix or, `upper`, with its upper one, diagonal included."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        lane = index % lanes
+        row = wp.min(index / lanes, x.shape[1] - 1)
+        first = wp.where(upper != 0, row, 0) + lane
+        n = wp.where(upper != 0, r.shape[1], row + 1)
+        s = scalar_sum(row_times(matrix, root, r, world, row, first, n, lanes), lanes)
         if lane == 0:
             if wp.static(scaled):
                 s = s * root[world, row]
@@ -290,4 +317,5 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         chebyshev=chebyshev,
         subtract_product=subtract_product,
         apply_dense=apply_dense,
+        apply_triangle=apply_triangle,
     )

@@ -98,7 +98,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             give_up(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
             give_up(ctl, world, FAIL_NAN)
-        elif wp.static(walls):
+        elif wp.static(walls) and ctl.norm[world] > f64(0.0):
             record(ctl, world)  # what is held is not that of this iterate: it can't be accepted
         else:
             settle(ctl, world)

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.traits import Traits
 from .control import FAIL_CONSTRAINT, control_struct
-from .judging import judging_functions
+from .judging import NEAR, judging_functions
 
 __all__ = ["outer_kernels"]
 
@@ -29,7 +29,9 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         flags[world] = 0
         if ctl.active[world] != 0:
             last = ctl.iterations[world] + 1 >= ctl.max_iterations
-            if ctl.relative[world] <= f64(REFRESH) or last:
+            # within rounding it may not fall below that
+            rounding = ctl.floor_excess[world] <= f64(NEAR)
+            if ctl.relative[world] <= f64(REFRESH) or rounding or last:
                 flags[world] = 1
 
     @wp.kernel(module=module)

@@ -19,6 +19,8 @@ __all__ = ["SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
 """Least approach speed that the default law's damping is made for, m/s."""
+PICKS = 4
+"""Choices of the deepest point in an attempt."""
 
 
 @functools.cache
@@ -67,7 +69,13 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Where the points are as an attempt begins, and the approach speed that damping is made for."""
         world, item, q = wp.tid()
-        if active[world] == 0 or facets.share[q, item] == f64(0.0):
+        if active[world] == 0:
+            return
+        if q == 0 and item == 0 and facets.row == 0:
+            at.through[world] = 0
+            if clock.part[world] == 0:
+                at.elapsed[world] = f64(0.0)
+        if facets.share[q, item] == f64(0.0):
             return
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
@@ -89,10 +97,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             approach = wp.dot(turn * vec3d(d[0], d[1], d[2]), moved - along(facets, v_n, world, q, item))
             speed = wp.max(speed, approach)
         at.speed[world, point] = speed
-        if q == 0 and item == 0 and facets.row == 0:
-            at.through[world] = 0
-            if clock.part[world] == 0:
-                at.elapsed[world] = f64(0.0)
 
     @wp.kernel(module=module)
     def settle(con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), at: Attempt):
@@ -177,10 +181,17 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.level[world, point] = depth
 
     @wp.kernel(module=module)
-    def pick_deepest(con: Contacts, active: wp.array(dtype=wp.int32), at: Attempt):
-        """The deepest point of each lumped contact; of equals the first."""
+    def pick_deepest(con: Contacts, active: wp.array(dtype=wp.int32), fresh: int, at: Attempt):
+        """The deepest point of each lumped contact, of equals the first; it may change a few times per attempt.
+
+        Where two points are as deep there is no equilibrium with either alone: the last choice stays.
+        """
         world, c = wp.tid()
         if active[world] == 0 or con.lumped[c] == 0:
+            return
+        if fresh != 0:
+            at.picks[world, c] = 0
+        elif at.picks[world, c] >= PICKS:
             return
         best = con.first[c]
         deepest = at.level[world, best]
@@ -188,6 +199,8 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             if at.level[world, point] > deepest:
                 deepest = at.level[world, point]
                 best = point
+        if fresh != 0 or best != at.pick[world, c]:
+            at.picks[world, c] = at.picks[world, c] + 1
         at.pick[world, c] = best
 
     @wp.kernel(module=module)
@@ -230,15 +243,16 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                     if wp.length_sq(force) > f64(0.0):
                         touched = wp.int32(1)
                 else:
-                    held = at.held[world, point]
+                    rec = record_of(con, c, point)
+                    held = at.held[world, rec]
                     time = clock.new_time[world]
                     t = touch(con, facets, his, at, world, c, q, item, point, u, time, inv_h, held[2])
                     new = hold(con, his, at, world, c, point, t)
                     if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
                         held = new
-                        held[0] = wp.min(new[0], his.cap[world, record_of(con, c, point)])
-                        at.held[world, point] = held
-                    at.next[world, point] = new
+                        held[0] = wp.min(new[0], his.cap[world, rec])
+                        at.held[world, rec] = held
+                    at.next[world, rec] = new
                     if t.side == -2:
                         at.through[world] = point + 1
                         held_sum += f64(wp.inf)

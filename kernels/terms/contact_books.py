@@ -30,22 +30,134 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     Contacts, Facets = contact_struct(), facet_struct(dtype)
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
     k = touch_functions(dtype)
-    touch, hold, pull, acts = k.touch, k.hold, k.pull, k.acts
+    touch, hold, pull, acts, Touch = k.touch, k.hold, k.pull, k.acts, k.Touch
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
     elastic = law_functions().elastic
     module = kernel_module(f"contact_{dtype}", max_unroll=SMALL)
+
+    @wp.struct
+    class Outcome:
+        """What a point leaves after a substep, of the whole region."""
+
+        touch: Touch
+        force: vec3d  # on the body, N
+        normal: f64
+        kept: vec3d  # stretch of its friction spring, m
+        cap: f64
+        slips: wp.int32
+        slid: vec3d  # slip in the substep, m
+        stored: f64  # J, as all below
+        loss: f64
+        rubbed: f64
+        given: f64  # by the collider
+        left: f64  # the integrator's part, less what the ledger finds of it by itself
+
+    @wp.func
+    def spring_after(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64, pulled: vec3d) -> vec3d:
+        """The friction spring that stays: cut to the force where it slips, Eq. (83) of the paper's law."""
+        w = pull(con, world, c, t, held, inv_h)
+        if wp.length(vec3d(w[0], w[1], w[2])) <= held[0]:
+            return t.q
+        kept = (f64(1.0) / held[1]) * pulled
+        if con.law[c] == PAPER:  # this turns the spring where gamma_t v is above the cap
+            kept -= ((w[3] - held[1]) / held[1]) * t.slip
+        return kept
+
+    @wp.func
+    def outcome(
+        con: Contacts, facets: Facets, his: History, clock: Clock, at: Attempt, world: int, c: int, q: int, item: int,
+        point: int, u: wp.array2d(dtype=vec3),
+    ) -> Outcome:  # fmt: skip
+        """What a point leaves.
+
+        The force on the body does `given` = f . (motion of the collider's material at the point) and, on the relative
+        motion, -(change of what is stored + loss + friction + the integrator's part). That part is made of its own
+        formulas: chords of convex energies, and what a turning normal and a turning collider leave.
+        """
+        out = Outcome()
+        rec = record_of(con, c, point)
+        kc = con.collider[c]
+        law = con.law[c]
+        inv_h = f64(0.0)
+        if clock.still == 0:
+            inv_h = f64(1.0) / clock.h[world]
+        held = at.held[world, rec]
+        t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
+        change = t.depth - at.depth[world, point]
+        spring = elastic(con.lumped[c], con.scale[world, c] * con.normal[c], t.depth)
+        normal = t.law[0]
+        pulled = friction_force(con, world, c, t, held, inv_h)
+        w = pull(con, world, c, t, held, inv_h)
+        out.slips = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > held[0] or law == SMOOTH, 1, 0)
+        base = vec3d()  # the spring as it was, in the tangent plane
+        if his.speed[world, rec] > f64(0.0):
+            base = his.spring[world, rec]
+            if law != PAPER:
+                base = at.turn[world, kc] * base
+            base = plane(t.n, base)
+        if con.dead[c] != 0:
+            normal = wp.dot(at.dead[world, point], t.n)
+            pulled = normal * t.n - at.dead[world, point]
+            out.kept = at.dead_spring[world, point]
+            out.slips = wp.where(wp.length(pulled) >= f64(0.999999) * con.mu[world, c] * normal, 1, 0)
+        elif normal > f64(0.0) and law != SMOOTH and held[1] > f64(0.0):
+            out.kept = spring_after(con, world, c, t, held, inv_h, pulled)
+        out.touch = t
+        out.normal = normal
+        out.cap = held[0]
+        out.force = normal * t.n - pulled
+        out.stored = spring[1] + f64(0.5) * held[1] * wp.dot(out.kept, out.kept)
+        gain = out.stored - his.stored[world, rec]
+        out.loss = (normal - spring[0]) * change
+        out.slid = t.slip - (out.kept - base)
+        out.rubbed = wp.dot(pulled - held[1] * out.kept, out.kept - base) + wp.dot(pulled, out.slid)
+        back = his.turn[world, kc] * (t.y - at.start[world, point])  # relative motion, in the old frame
+        chord = spring[0] * change + held[1] * wp.dot(out.kept, out.kept - base) - gain
+        turned = -wp.dot(out.force, back) - (normal * change + wp.dot(pulled, t.slip))
+        x = at.turn[world, kc] * t.y + at.place[world, kc]
+        out.given = wp.dot(out.force, x - (his.turn[world, kc] * t.y + his.place[world, kc]))
+        # the ledger takes for the integrator what the work of the force leaves; it is to find these formulas
+        x_n = his.turn[world, kc] * at.start[world, point] + his.place[world, kc]
+        out.left = chord + turned + wp.dot(out.force, x - x_n) + gain + out.loss + out.rubbed
+        return out
+
+    @wp.func
+    def remember(con: Contacts, his: History, clock: Clock, at: Attempt, world: int, c: int, point: int, o: Outcome):
+        """Keep the history of a point."""
+        rec = record_of(con, c, point)
+        if o.touch.depth <= f64(0.0):
+            his.spring[world, rec] = vec3d()
+            his.stored[world, rec] = f64(0.0)
+            his.cap[world, rec] = f64(0.0)
+            his.speed[world, rec] = f64(0.0)
+            his.mark[world, rec] = 0
+            return
+        speed = at.speed[world, point]
+        if clock.still == 0:
+            speed = wp.max(speed, (o.touch.depth - at.depth[world, point]) / clock.h[world])
+        kept = o.kept
+        if con.law[c] != PAPER:
+            kept = wp.transpose(at.turn[world, con.collider[c]]) * kept
+        his.spring[world, rec] = kept
+        his.stored[world, rec] = o.stored
+        his.cap[world, rec] = o.cap
+        his.speed[world, rec] = speed
+        mark = wp.max(o.touch.side, -1) + 1
+        if o.slips != 0 and o.cap > f64(0.0):
+            mark += SLIPS
+        his.mark[world, rec] = mark
+
+    @wp.func
+    def add(rows: wp.array3d(dtype=f64), k: int, world: int, row: int, value: f64):
+        """rows[k, world, row] += value."""
+        rows[k, world, row] = rows[k, world, row] + value
 
     @wp.kernel(module=module)
     def finish(
         con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3),
         accepted: wp.array(dtype=wp.int32), at: Attempt, booked: wp.array3d(dtype=f64),
     ):  # fmt: skip
-        """Books of an accepted substep per facet, and the history after it.
-
-        The force on the body does collider_work = f . (motion of the collider's material at the point) and, on the
-        relative motion, -(change of what is stored + loss + friction + the integrator's part). That part is made of its
-        own formulas: chords of convex energies, and what a turning normal and a turning collider leave.
-        """
+        """Books of an accepted substep and the record of it per facet, and the history after it."""
         world, item = wp.tid()
         if accepted[world] == 0:
             return
@@ -55,105 +167,31 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             booked[j, world, row] = f64(0.0)
         for j in range(SUMS + 1):
             at.rows[j, world, row] = f64(0.0)
-        h = clock.h[world]
-        inv_h = f64(0.0)
-        if clock.still == 0:
-            inv_h = f64(1.0) / h
-        lumped = con.lumped[c]
-        law = con.law[c]
-        kc = con.collider[c]
-        k_n = con.scale[world, c] * con.normal[c]
         for q in range(facets.points):
             point = facets.point + item * facets.points + q
             share = facets.share[q, item] * acts(con, at, world, c, point)
             if share > f64(0.0):
-                rec = record_of(con, c, point)
-                live = his.speed[world, rec] > f64(0.0)
-                held = at.held[world, point]
-                t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
-                before = at.depth[world, point]
-                change = t.depth - before
-                spring = elastic(lumped, k_n, t.depth)
-                normal = t.law[0]
-                pulled = friction_force(con, world, c, t, held, inv_h)
-                kept = vec3d()  # the spring that stays
-                w = pull(con, world, c, t, held, inv_h)
-                trial = vec3d(w[0], w[1], w[2])
-                slips = wp.length(trial) > held[0] or law == SMOOTH
-                old = vec3d()
-                if live:
-                    old = his.spring[world, rec]
-                    if law != PAPER:
-                        old = at.turn[world, kc] * old
-                if con.dead[c] != 0:
-                    force = at.dead[world, point]
-                    normal = wp.dot(force, t.n)
-                    pulled = normal * t.n - force
-                    kept = at.dead_spring[world, point]
-                    slips = wp.length(pulled) >= f64(0.999999) * con.mu[world, c] * normal
-                elif normal > f64(0.0) and law != SMOOTH and held[1] > f64(0.0):
-                    kept = t.q
-                    if slips:
-                        kept = (f64(1.0) / held[1]) * pulled
-                        if law == PAPER:  # Eq. (83), which turns the spring where gamma_t v is above the cap
-                            kept -= ((w[3] - held[1]) / held[1]) * t.slip
-                inside = t.depth > f64(0.0) or law == SMOOTH
-                stored = spring[1] + f64(0.5) * held[1] * wp.dot(kept, kept)
-                past_stored = his.stored[world, rec]
-                force = normal * t.n - pulled
-                loss = (normal - spring[0]) * change
-                base = plane(t.n, old)
-                slid = t.slip - (kept - base)
-                rubbed = wp.dot(pulled - held[1] * kept, kept - base) + wp.dot(pulled, slid)
-                back = his.turn[world, kc] * (t.y - at.start[world, point])  # relative motion, in the old frame
-                chord = spring[0] * change + held[1] * wp.dot(kept, kept - base) - (stored - past_stored)
-                turned = -wp.dot(force, back) - (normal * change + wp.dot(pulled, t.slip))
-                x = at.turn[world, kc] * t.y + at.place[world, kc]
-                carried = x - (his.turn[world, kc] * t.y + his.place[world, kc])
-                given = wp.dot(force, carried)
-                booked[0, world, row] = booked[0, world, row] + share * stored
-                booked[1, world, row] = booked[1, world, row] + share * loss
-                booked[2, world, row] = booked[2, world, row] + share * rubbed
-                booked[3, world, row] = booked[3, world, row] + share * given
-                # the ledger takes for the integrator what the work of the force leaves; it is to find these formulas
-                x_n = his.turn[world, kc] * at.start[world, point] + his.place[world, kc]
-                left = -wp.dot(force, x - x_n) - (stored - past_stored) - loss - rubbed
-                booked[4, world, row] = booked[4, world, row] + share * (chord + turned - left)
-                area = facets.area[q, item]
-                moment = wp.cross(x, force)
+                o = outcome(con, facets, his, clock, at, world, c, q, item, point, u)
+                add(booked, 0, world, row, share * o.stored)
+                add(booked, 1, world, row, share * o.loss)
+                add(booked, 2, world, row, share * o.rubbed)
+                add(booked, 3, world, row, share * o.given)
+                add(booked, 4, world, row, share * o.left)
+                x = at.turn[world, con.collider[c]] * o.touch.y + at.place[world, con.collider[c]]
+                moment = wp.cross(x, o.force)
                 for j in range(3):
-                    at.rows[j, world, row] = at.rows[j, world, row] + share * force[j]
-                    at.rows[3 + j, world, row] = at.rows[3 + j, world, row] + share * moment[j]
-                at.rows[6, world, row] = at.rows[6, world, row] + share * normal
-                if inside:
-                    at.rows[7, world, row] = at.rows[7, world, row] + area * wp.where(slips, wp.length(slid), f64(0.0))
-                    at.rows[8, world, row] = at.rows[8, world, row] + area
-                    at.rows[9, world, row] = at.rows[9, world, row] + wp.where(slips, f64(0.0), area)
-                at.rows[10, world, row] = at.rows[10, world, row] + share * stored
-                at.rows[11, world, row] = at.rows[11, world, row] + share * loss
-                at.rows[12, world, row] = at.rows[12, world, row] + share * rubbed
-                at.rows[13, world, row] = at.rows[13, world, row] + share * given
-                at.rows[14, world, row] = wp.max(at.rows[14, world, row], t.depth)
-                if t.depth > f64(0.0):
-                    speed = at.speed[world, point]
-                    if clock.still == 0:
-                        speed = wp.max(speed, change / h)
-                    if law != PAPER:
-                        kept = wp.transpose(at.turn[world, kc]) * kept
-                    his.spring[world, rec] = kept
-                    his.stored[world, rec] = stored
-                    his.cap[world, rec] = held[0]
-                    his.speed[world, rec] = speed
-                    side = wp.max(t.side, -1) + 1
-                    if slips and held[0] > f64(0.0):
-                        side += SLIPS
-                    his.mark[world, rec] = side
-                else:
-                    his.spring[world, rec] = vec3d()
-                    his.stored[world, rec] = f64(0.0)
-                    his.cap[world, rec] = f64(0.0)
-                    his.speed[world, rec] = f64(0.0)
-                    his.mark[world, rec] = 0
+                    add(at.rows, j, world, row, share * o.force[j])
+                    add(at.rows, 3 + j, world, row, share * moment[j])
+                add(at.rows, 6, world, row, share * o.normal)
+                if o.touch.depth > f64(0.0) or con.law[c] == SMOOTH:
+                    area = facets.area[q, item]
+                    add(at.rows, 7, world, row, area * f64(o.slips) * wp.length(o.slid))
+                    add(at.rows, 8, world, row, area)
+                    add(at.rows, 9, world, row, area * f64(1 - o.slips))
+                for j in range(4):
+                    at.rows[10 + j, world, row] = booked[j, world, row]
+                at.rows[14, world, row] = wp.max(at.rows[14, world, row], o.touch.depth)
+                remember(con, his, clock, at, world, c, point, o)
 
     @wp.kernel(module=module)
     def partial_records(

@@ -112,8 +112,8 @@ def attempt_struct(dtype: str):
         dead_spring: wp.array2d(dtype=wp.vec3d)
         level: wp.array2d(dtype=wp.float64)  # [world, point] depth; with lumped contacts
         pick: wp.array2d(dtype=wp.int32)  # [world, contact] deepest point
+        picks: wp.array2d(dtype=wp.int32)  # how often it was chosen in the attempt
         through: wp.array(dtype=wp.int32)  # [world] a point that went through a shape, + 1
-        deepest: wp.array2d(dtype=wp.float64)  # [world, contact] in this attempt's last evaluation
         rows: wp.array3d(dtype=wp.float64)  # [RECORD, world, facet row]
         total: wp.array3d(dtype=wp.float64)  # [world, contact, RECORD] of the step so far
         elapsed: wp.array(dtype=wp.float64)  # [world] s of the step so far

@@ -63,10 +63,6 @@ class ConstraintError(Error):
         self.state = state
 
 
-class PenetrationError(Error):
-    """An impact exceeds what the contact penalty can hold."""
-
-
 class CapacityError(Error):
     """A device has too little memory for a model, a simulation or a step.
 
@@ -114,6 +110,10 @@ class ConvergenceError(Error):
         self.residuals = residuals or []
         self.element = element
         self.state = state
+
+
+class PenetrationError(ConvergenceError):
+    """A step of a model with contact was not accepted, and a point of a body went through an obstacle in it."""
 
 
 class UsageError(Error):

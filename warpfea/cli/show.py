@@ -119,6 +119,7 @@ def _info_table(content: dict[str, Any]) -> str:
     rows = [["scene", c["scene"]], ["device", f"{c['device']}, {c['dtype']}, {c['integrator']}"]]
     rows += _body_rows(c["bodies"])
     rows += _joint_rows(c["joints"])
+    rows += _contact_rows(c["contacts"])
     if "mesh" in c:
         rows += _mesh_rows(c["mesh"])[1:]
     rows.append(["model", f"{c['unknowns']} unknowns, {mass_text(c['mass'])}, {box_text(c['bounding_box'])}"])
@@ -168,6 +169,23 @@ def _joint_rows(joints: list[dict[str, Any]]) -> list[list[str]]:
     for j in joints:
         counts.setdefault(j["kind"], []).append(j["rows"])
     return [["joints", ", ".join(f"{len(n)} {kind} ({sum(n)} equations)" for kind, n in counts.items())]]
+
+
+def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
+    """A row for each contact; of many a count."""
+    if len(contacts) > MANY:
+        left = sum(c["left_out"] for c in contacts)
+        return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_clamped(left)}"]]
+    return [
+        [f"contact {c['name']}", f"body {c['body']} on {c['collider']}, law {c['law']}, {c['model']}, "
+         f"{c['points']} points{_clamped(c['left_out'])}"]
+        for c in contacts
+    ]  # fmt: skip
+
+
+def _clamped(count: int) -> str:
+    """What to say of points that are left out."""
+    return f", {count} clamped ones left out" if count else ""
 
 
 def render(options: argparse.Namespace) -> int:

@@ -46,11 +46,12 @@ KEYS = (
     "violation",
     "versions",
     "left_out",
+    "contacts",
 )
 MANY = 12
-"""Joints that are listed one by one."""
+"""Joints and contacts that are listed one by one."""
 WORST = 4
-"""Joints listed of more."""
+"""Joints and contacts listed of more."""
 NO_J = 1e30
 """What a step reports for the smallest J where no element has one."""
 
@@ -65,7 +66,8 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     those accepted short of the tolerance (Jacobi), `floored_steps` those whose residual rounding stopped above it,
     and `max_floor` the largest error that was estimated there (`StepReport.floor`), 0 without such steps; energies and
     probes are the last values, of statics the strain energy alone; `violation` is the largest of the constraints in any
-    step, m.
+    step, m; `contacts` has by name the largest normal_force, N, and penetration, m, of any step, and the last force, N,
+    area, m^2, and stick.
     """
     probes = {}
     for probe in sim.model.probes:
@@ -106,6 +108,7 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
         "violation": sim.max_violation,
         "versions": versions(),
         "left_out": sim.model.info()["left_out"],
+        "contacts": _contacts(sim),
     }
     assert tuple(content) == KEYS
     return {name: plain(value) for name, value in content.items()}
@@ -151,6 +154,7 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
         u = ", ".join(_text(x) for x in values["displacement"])
         rows.append([f"probe {name}", f"displaced by ({u}) m"])
     rows += _joints(sim)
+    rows += _contact_rows(s["contacts"])
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return table(rows)
 
@@ -210,6 +214,31 @@ def _joints(sim: Simulation) -> list[list[str]]:
         rows.append([f"joint {joints[k].name}", text])
     if len(rows) < len(joints):
         rows.append(["joints", f"{len(joints)} in all, of which these are violated most"])
+    return rows
+
+
+def _contacts(sim: Simulation) -> dict[str, Any]:
+    """Of each contact that has been recorded the largest and the last values."""
+    out = {}
+    for contact in sim.model.description.contacts:
+        record = sim.contact_record(contact)
+        if record.time.size:
+            largest = {name: np.nanmax(getattr(record, name)[0]) for name in ("normal_force", "penetration")}
+            out[contact.name] = largest | {name: getattr(record, name)[0, -1] for name in ("force", "area", "stick")}
+    return out
+
+
+def _contact_rows(contacts: dict[str, Any]) -> list[list[str]]:
+    """A row for each contact; of many those with the largest forces and a count."""
+    names = sorted(contacts, key=lambda name: -(contacts[name]["normal_force"] or 0.0))
+    shown = contacts if len(contacts) <= MANY else names[:WORST]
+    rows = []
+    for name in shown:
+        c = contacts[name]
+        text = f"normal force up to {_text(c['normal_force'])} N, penetration up to {_text(c['penetration'])} m"
+        rows.append([f"contact {name}", f"{text}, at the end {_text(c['area'])} m^2 in contact"])
+    if len(rows) < len(contacts):
+        rows.append(["contacts", f"{len(contacts)} in all, of which these have the largest forces"])
     return rows
 
 

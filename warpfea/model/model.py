@@ -43,7 +43,7 @@ class Source(Protocol):
 
 
 class Model:
-    """Made by ModelBuilder.finalize; constant but for `set_gravity`.
+    """Made by ModelBuilder.finalize; constant but for `set_gravity` and `set_parameter`.
 
     Attributes:
         bodies: the bodies, in the order they were added.
@@ -162,7 +162,7 @@ class Model:
             self.free_host[rows] *= 1.0 - support.components
             if support.law is None and support.node_laws is None:
                 self.clamped_host[rows] |= support.components.astype(bool)
-        if not self.free_host.any():
+        if not self.free_host.any() and not self.description.contacts:
             raise ModelError("every component of every node is prescribed: nothing is left to solve for")
 
     def _assemble_mass(self) -> None:
@@ -257,7 +257,7 @@ class Model:
         return dict(self._memory)
 
     def info(self) -> dict[str, Any]:
-        """Features in and left out, counts, bytes of the constants, kernels' modules of the elements."""
+        """Features in and left out, counts, contacts, bytes of the constants, kernels' modules of the elements."""
         features = self.features
         return {
             "bodies": [
@@ -282,6 +282,7 @@ class Model:
                 {"name": j.name, "kind": j.kind, "rows": len(j.rows), "between": j.between}
                 for j in (self.constraints.joints if self.constraints else ())
             ],
+            "contacts": self.terms.contact.facts() if self.terms.contact else [],
             "features": [k for k, on in features.items() if on],
             "left_out": [k for k, on in features.items() if not on] + list(self.terms.later),
             "blocks": [
@@ -374,12 +375,29 @@ class Model:
         self.terms.dead.set_gravity(gravity)
 
     def contact_force(self, state: State) -> np.ndarray:
-        """Contact is not part of this version."""
-        raise NotImplementedError("contact_force: contact is not part of this version")
+        """Elastic part of the forces of contact at a state, without damping, [world, slot, 3], N; on the bodies.
+
+        The state of a simulation knows the springs of friction and where colliders are; with another they are where
+        their paths are at its time, and there is no friction.
+        """
+        if self.terms.contact is None:
+            return np.zeros((self.worlds, self.slots, 3))
+        return self.terms.contact.nodal_force(state)
 
     def set_parameter(self, name: str, values: Any) -> None:
-        """Per-world material parameters are not part of this version."""
-        raise NotImplementedError("set_parameter: per-world material parameters are not part of this version")
+        """Set a parameter in all worlds; simulations take the new values from their next step on.
+
+        Args:
+            name: "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
+                ModelBuilder.add_contact; where mu_static equals mu, it follows mu. "K.offset" with the name K of a
+                collider: of a HalfSpace the offset of its plane, m; of other shapes by how much the surface lies
+                further out, m. A surface that comes to lie in a body pushes it out.
+            values: a number, or (worlds,).
+
+        Raises:
+            ModelError: an unknown name, a wrong shape, or a value out of range.
+        """
+        self.terms.set_parameter(name, values)
 
     def fingerprint(self) -> str:
         """Hash of all that a checkpoint must agree with: topology, geometry, laws, precision, supports, worlds."""

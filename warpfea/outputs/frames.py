@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from warpfea.base.checks import is_number
 from warpfea.base.errors import ModelError, OutputError
+from warpfea.outputs.obstacles import Obstacles, near
 
 __all__ = [
     "FrameClock",
@@ -24,7 +25,6 @@ __all__ = [
     "field_label",
     "grid_offsets",
     "is_static",
-    "vertex_normals",
 ]
 
 Array = npt.NDArray[Any]
@@ -36,6 +36,7 @@ FIELDS: dict[str, tuple[str, str]] = {
     "velocity": ("velocity", "m/s"),
     "strain_energy_density": ("strain energy density", "J/m3"),
     "contact_pressure": ("contact pressure", "Pa"),
+    "gap": ("gap", "m"),
     "J": ("volume ratio J", ""),
 }
 
@@ -123,30 +124,8 @@ def grid_offsets(worlds: int, spacing: tuple[float, float], up_axis: str = "Z") 
     return offsets
 
 
-def vertex_normals(points: Array, triangles: Array) -> npt.NDArray[np.float32]:
-    """(P, 3) unit normals, area-weighted over the triangles of each point; (0, 0, 1) where there are none."""
-    points = points - points.mean(axis=0)
-    corner = [points[triangles[:, k]] for k in range(3)]
-    area = np.cross(corner[1] - corner[0], corner[2] - corner[0])
-    return unit_rows(scatter_rows(triangles.ravel(), np.repeat(area, 3, axis=0), len(points)))
-
-
-def scatter_rows(index: Array, rows: Array, count: int) -> npt.NDArray[np.float64]:
-    """(count, 3) sums of `rows` (n, 3) that share an index, in a fixed order."""
-    return np.stack([np.bincount(index, weights=rows[:, k], minlength=count) for k in range(3)], axis=1)
-
-
-def unit_rows(rows: Array) -> npt.NDArray[np.float32]:
-    """(n, 3) rows scaled to length one; a zero row becomes (0, 0, 1)."""
-    scale = float(np.abs(rows).max(initial=0.0)) or 1.0
-    rows = rows / scale
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    good = length > 1e-20
-    return np.asarray(np.where(good, rows / np.where(good, length, 1.0), (0.0, 0.0, 1.0)), dtype=np.float32)
-
-
 class Surface:
-    """The drawn surfaces of a simulation: which bodies, and where each world is laid out.
+    """The drawn surfaces of a simulation: which bodies and obstacles, and where each world is laid out.
 
     `spacing` (m) is the distance of neighbouring worlds, one number or (first, second horizontal axis);
     without it, 1.25 times the size of one world when the run starts, at least half of its largest size.
@@ -160,7 +139,14 @@ class Surface:
             raise OutputError("nothing to draw: no body has a surface")
         start = [self.points_of(sim, body) for body in self.bodies]
         self.counts = [points.shape[1] for points in start]
-        self.offsets = grid_offsets(self.worlds, self._spacing(start, spacing), self.up_axis)
+        low = np.min([points.min(axis=(0, 1)) for points in start], axis=0)
+        high = np.max([points.max(axis=(0, 1)) for points in start], axis=0)
+        self.obstacles = Obstacles(sim, low, high)
+        start += [np.asarray(near(points, low, high, 0.5), dtype=np.float64) for points in self.obstacles.bounded()]
+        distance = self._spacing(start, spacing)
+        self.offsets = grid_offsets(self.worlds, distance, self.up_axis)
+        if min(distance) > 0.0:  # a plane may not hide the bodies of other worlds
+            self.obstacles.narrow(min(distance))
 
     def _spacing(
         self, start: list[npt.NDArray[np.float64]], spacing: float | tuple[float, float] | None
@@ -188,20 +174,40 @@ class Surface:
         return points
 
     def triangles(self) -> npt.NDArray[np.int32]:
-        """(T, 3) triangles of all worlds and bodies in the order of `points`."""
+        """(T, 3) triangles of all worlds, bodies and obstacles in the order of `points`."""
         blocks, first = [], 0
-        for body, count in zip(self.bodies, self.counts, strict=True):
+        for triangles, count in self._meshes():
             for _ in range(self.worlds):
-                blocks.append(np.asarray(body.skin.triangles, dtype=np.int32) + first)
+                blocks.append(np.asarray(triangles, dtype=np.int32) + first)
                 first += count
         return np.concatenate(blocks)
 
+    def _meshes(self) -> list[tuple[Array, int]]:
+        """Triangles of a world and points of each body, then of each obstacle."""
+        bodies = [(body.skin.triangles, count) for body, count in zip(self.bodies, self.counts, strict=True)]
+        return bodies + [(obstacle.triangles, obstacle.points.shape[1]) for obstacle in self.obstacles.all]
+
+    @property
+    def body_points(self) -> int:
+        """How many of `points` belong to bodies; they come first."""
+        return self.worlds * sum(self.counts)
+
+    def sheets(self) -> list[int]:
+        """First point of each square that stands for a half-space, in the order of `points`."""
+        out, first = [], self.body_points
+        for obstacle in self.obstacles.all:
+            count = obstacle.points.shape[1]
+            if obstacle.sheet:
+                out += [first + world * count for world in range(self.worlds)]
+            first += self.worlds * count
+        return out
+
     def points(self, sim: Any) -> npt.NDArray[np.float64]:
-        """(P, 3) present points (m) of all bodies and worlds, with the grid offsets."""
-        blocks = [self.points_of(sim, body) + self.offsets[:, None, :] for body in self.bodies]
-        return np.concatenate([block.reshape(-1, 3) for block in blocks])
+        """(P, 3) present points (m) of all worlds, of the bodies and then the obstacles, with the grid offsets."""
+        blocks = [self.points_of(sim, body) for body in self.bodies] + self.obstacles.points()
+        return np.concatenate([(block + self.offsets[:, None, :]).reshape(-1, 3) for block in blocks])
 
     def values(self, sim: Any, field: str) -> npt.NDArray[np.float32]:
-        """(P,) values of a scalar field in the order of `points`."""
+        """(body_points,) values of a scalar field in the order of `points`."""
         values = [np.asarray(sim.skin_field(field, body), dtype=np.float32).ravel() for body in self.bodies]
         return np.concatenate(values)

@@ -11,9 +11,9 @@ import numpy.typing as npt
 from warpfea.base.console import quiet_warp
 from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.colormap import to_linear, to_srgb
-from warpfea.outputs.frames import scatter_rows, unit_rows
+from warpfea.outputs.normals import scatter_rows, smooth_corners, unit_rows
 
-__all__ = ["VIEW", "Camera", "Renderer", "check_view", "nice_number"]
+__all__ = ["VIEW", "Camera", "Renderer", "check_view", "nice_number", "turned"]
 
 Floats = npt.NDArray[np.floating[Any]]
 Image = npt.NDArray[np.uint8]
@@ -101,6 +101,12 @@ def _centre(side: Floats, depth: Floats) -> float:
     return 0.5 * (low + high)
 
 
+def turned(points: Floats, up_axis: str) -> npt.NDArray[np.float64]:
+    """Points (P, 3) as float64 in the frame with z up that cameras use."""
+    p = np.asarray(points, dtype=np.float64)
+    return p if up_axis == "Z" else np.stack([p[:, 0], -p[:, 2], p[:, 1]], axis=1)
+
+
 class Renderer:
     """Draws triangles with smooth normals, soft light and a shadow on the ground.
 
@@ -133,8 +139,7 @@ class Renderer:
 
     def turned(self, points: Floats) -> npt.NDArray[np.float64]:
         """Points (P, 3) as float64 in the frame with z up that cameras use."""
-        p = np.asarray(points, dtype=np.float64)
-        return p if self.up_axis == "Z" else np.stack([p[:, 0], -p[:, 2], p[:, 1]], axis=1)
+        return turned(points, self.up_axis)
 
     def render(
         self,
@@ -273,33 +278,3 @@ def nice_number(x: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is at most x > 0."""
     power = 10.0 ** np.floor(np.log10(x))
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step <= x / power * (1 + 1e-12)))
-
-
-def smooth_corners(
-    points: Floats, triangles: npt.NDArray[np.integer[Any]], angle: float = 40.0
-) -> tuple[npt.NDArray[np.int64], int]:
-    """Groups of triangle corners that share a normal: (3 T,) group of each corner, number of groups.
-
-    Corners at a point share one when their triangles are linked over edges flatter than `angle` (degrees).
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    t = np.asarray(triangles, dtype=np.int64)
-    p = points[t]
-    normal = unit_rows(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]))
-    face = np.tile(np.arange(len(t)), 3)
-    first = np.repeat([0, 1, 2], len(t))
-    ends = np.stack([t[face, first], t[face, (first + 1) % 3]], axis=1)
-    corner = np.stack([3 * face + first, 3 * face + (first + 1) % 3], axis=1)
-    swap = ends[:, 0] > ends[:, 1]
-    ends[swap], corner[swap] = ends[swap][:, ::-1], corner[swap][:, ::-1]
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    ends, corner, face = ends[order], corner[order], face[order]
-    same = (ends[1:] == ends[:-1]).all(axis=1)
-    flat = np.einsum("ij,ij->i", normal[face[1:]], normal[face[:-1]]) > np.cos(np.radians(angle))
-    link = np.nonzero(same & flat)[0]
-    a, b = corner[link].ravel(), corner[link + 1].ravel()
-    graph = coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(3 * len(t), 3 * len(t)))
-    count, group = connected_components(graph, directed=False)
-    return group.astype(np.int64), int(count)

@@ -12,7 +12,9 @@ import numpy.typing as npt
 
 from warpfea.base.writer import progress_bar, write_whole
 from warpfea.outputs.colormap import map_colors
-from warpfea.outputs.raycaster import Camera, Image, Renderer
+from warpfea.outputs.obstacles import GREY as OBSTACLE
+from warpfea.outputs.obstacles import near
+from warpfea.outputs.raycaster import Camera, Image, Renderer, turned
 
 __all__ = ["Frame", "Reel"]
 
@@ -20,13 +22,13 @@ Floats = npt.NDArray[np.floating[Any]]
 _INK = (45, 50, 60)
 _GREY = (0.62, 0.66, 0.72)
 _BAR = 0.17  # share of the width that the colour bar takes
-_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))  # the font has no µ
 _PAUSE = 0.6  # s that an animation rests on its last frame
 
 
 @dataclass
 class Frame:
-    """One state: time (s), points (P, 3) float32 about the reel's origin (m), values (P,) of its field."""
+    """One state: time (s), points (P, 3) float32 about the reel's origin (m), values of its field at the bodies'."""
 
     time: float
     points: Floats
@@ -40,6 +42,8 @@ class Reel:
     Attributes:
         shown: colour range; None: the extremes.
         static: the frames' times are parts of a static load.
+        bodies: how many of the points belong to bodies, which come first; None: all. The others are of obstacles.
+        sheets: first of the four points of each square that stands for a half-space.
     """
 
     triangles: npt.NDArray[np.integer[Any]]
@@ -49,35 +53,75 @@ class Reel:
     units: str = ""
     shown: tuple[float, float] | None = None
     static: bool = False
+    bodies: int | None = None
+    sheets: list[int] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
 
     def draw(
         self, size: tuple[int, int], view: tuple[float, float], chosen: list[int], ground: bool = True
     ) -> Iterator[Image]:
         """Pictures of the chosen frames; camera, ground and colours are those of all frames."""
-        up = 2 if self.up_axis == "Z" else 1
-        stride = max(1, sum(len(frame.points) for frame in self.frames) // 50_000)
-        swept = np.concatenate([frame.points[k % stride :: stride] for k, frame in enumerate(self.frames)])
-        height = min(float(frame.points[:, up].min()) for frame in self.frames) if ground else None
-        renderer = Renderer(self.triangles, reference=self.reference, up_axis=self.up_axis, ground=height)
+        n = self.bodies or len(self.reference)
+        stride = max(1, n * len(self.frames) // 50_000)
+        swept = np.concatenate([frame.points[k % stride : n : stride] for k, frame in enumerate(self.frames)])
+        swept = np.concatenate([swept, *self._obstacles(swept.min(axis=0), swept.max(axis=0))])
         low, high = self.range()
         longest = max(abs(frame.time) for frame in self.frames)
         decimals = int(np.clip(3 - np.floor(np.log10(longest)), 1, 12)) if longest > 0 else 1
         barred = self.frames[0].values is not None
         margins = (0.05, _BAR if barred else 0.05, 0.09, 0.07)
-        camera = Camera.framing(renderer.turned(swept), view=view, aspect=size[0] / size[1], margins=margins)
+        camera = Camera.framing(turned(swept, self.up_axis), view=view, aspect=size[0] / size[1], margins=margins)
+        height, hidden = self._floor(camera)
+        shown = ~np.isin(self.triangles[:, 0], [first + k for first in hidden for k in range(4)])
+        used, triangles = np.unique(self.triangles[shown], return_inverse=True)
+        renderer = Renderer(
+            triangles.reshape(-1, 3),
+            reference=self.reference[used],
+            up_axis=self.up_axis,
+            ground=height if ground else None,
+        )
         for k in chosen:
             frame = self.frames[k]
-            if frame.values is None:
-                colors = np.broadcast_to(np.array(_GREY, dtype=np.float32), frame.points.shape)
-            else:
-                colors = map_colors(frame.values, low, high)
-            image = renderer.render(frame.points, colors, camera, size)
+            colors = np.full(frame.points.shape, OBSTACLE, dtype=np.float32)
+            colors[:n] = _GREY
+            if frame.values is not None:
+                known = np.isfinite(frame.values)
+                colors[:n][known] = map_colors(frame.values[known], low, high)
+            image = renderer.render(frame.points[used], colors[used], camera, size)
             yield label(
                 image,
                 f"load {100.0 * frame.time:.4g} %" if self.static else f"t = {frame.time:.{decimals}f} s",
                 (low, high, self.title, self.units) if barred else None,
             )
+
+    def _obstacles(self, low: Floats, high: Floats) -> list[Floats]:
+        """Points of the obstacles, brought near the box of the bodies: what surrounds these is in the picture."""
+        first = self.bodies or len(self.reference)
+        return [near(frame.points[first:], low, high, 0.15) for frame in self.frames if len(frame.points) > first]
+
+    def _floor(self, camera: Camera) -> tuple[float | None, list[int]]:
+        """Height of the ground, and squares that are not drawn.
+
+        A half-space that stays level is the ground; among others there is none, and without any it is at the lowest
+        point. Squares that the camera sees from behind would hide the bodies.
+        """
+        level: dict[int, float] = {}
+        hidden = []
+        slack = 1e-5 * camera.size
+        for first in self.sheets:
+            squares = [turned(frame.points[first : first + 4], self.up_axis) for frame in self.frames]
+            heights = np.array([square[:, 2] for square in squares])
+            normals = [np.cross(square[1] - square[0], square[2] - square[1]) for square in squares]
+            if np.ptp(heights) <= slack and normals[0][2] > 0.0:
+                level[first] = float(heights.mean())
+            elif any((camera.eye - square[0]) @ normal <= 0.0 for square, normal in zip(squares, normals)):
+                hidden.append(first)
+        if not self.sheets:
+            up = 2 if self.up_axis == "Z" else 1
+            return min(float(frame.points[:, up].min()) for frame in self.frames), hidden
+        if not level or max(level.values()) - min(level.values()) > slack:
+            return None, hidden
+        return max(level.values()), hidden + list(level)
 
     def range(self) -> tuple[float, float]:
         """The colour range: as wanted, or the extremes over all frames."""

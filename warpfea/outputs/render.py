@@ -75,7 +75,8 @@ class _Drawing(Output):
         check_fields(sim, [self.field] if self.field else [])
         self._surface = Surface(sim, self.spacing)
         start = self._surface.points(sim)
-        self._origin = 0.5 * (start.min(axis=0) + start.max(axis=0))
+        bodies = start[: self._surface.body_points]
+        self._origin = 0.5 * (bodies.min(axis=0) + bodies.max(axis=0))
         title, units = field_label(self.field) if self.field else ("", "")
         self._reel = Reel(
             self._surface.triangles(),
@@ -85,6 +86,8 @@ class _Drawing(Output):
             units,
             self.color_range,
             is_static(sim),
+            self._surface.body_points,
+            self._surface.sheets(),
         )
 
     def _frame(self, sim: Any) -> Frame:
@@ -291,7 +294,9 @@ class _Source:
             self.stage = Usd.Stage.Open(str(path))
         except Tf.ErrorException as error:
             raise ModelError(f"{path}: can't be read as USD ({in_words(error)})") from error
-        self.meshes = [UsdGeom.Mesh(prim) for prim in self.stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+        meshes = [UsdGeom.Mesh(prim) for prim in self.stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+        self.obstacles = [mesh for mesh in meshes if mesh.GetPrim().GetCustomDataByKey("warpfea:collider")]
+        self.meshes = [mesh for mesh in meshes if not mesh.GetPrim().GetCustomDataByKey("warpfea:collider")]
         if not self.meshes:
             raise ModelError(f"{path}: holds no mesh")
         root = self.stage.GetDefaultPrim()
@@ -313,18 +318,22 @@ class _Source:
             have = ", ".join(self.about["fields"]) or "none"
             hint = did_you_mean(name, self.about["fields"])
             raise ModelError(f"{self.path}: has no field {name!r}; fields: {have}{hint}")
-        triangles, first = [], 0
-        for mesh in self.meshes:
+        triangles, first, bodies, sheets = [], 0, 0, []
+        for k, mesh in enumerate(self.meshes + self.obstacles):
             counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
             if (counts != 3).any():
                 raise ModelError(f"{self.path}: {mesh.GetPath()} has faces that are not triangles")
             triangles.append(np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) + first)
+            if mesh.GetPrim().GetCustomDataByKey("warpfea:collider") == "HalfSpace":
+                sheets.append(first)
             first += len(mesh.GetPointsAttr().Get(self.start * self.rate))
+            if k < len(self.meshes):
+                bodies = first
         start = self._points(self.start)
-        self.origin = 0.5 * (start.min(axis=0) + start.max(axis=0))
+        self.origin = 0.5 * (start[:bodies].min(axis=0) + start[:bodies].max(axis=0))
         reference = np.asarray(start - self.origin, dtype=np.float32)
         reel = Reel(np.concatenate(triangles), str(UsdGeom.GetStageUpAxis(self.stage)), reference)
-        reel.static = bool(self.about.get("static", False))
+        reel.static, reel.bodies, reel.sheets = bool(self.about.get("static", False)), bodies, sheets
         if name is not None:
             about = self.about["fields"][name]
             pair = self.about["colorRange"] if name == self.about["color"] else about["range"]
@@ -335,13 +344,13 @@ class _Source:
         return reel
 
     def _points(self, time: float) -> npt.NDArray[np.float64]:
-        """(P, 3) points of all meshes in the world (m)."""
+        """(P, 3) points of all meshes in the world (m), of the bodies first."""
         from pxr import UsdGeom
 
         code = time * self.rate
         cache = UsdGeom.XformCache(code)
         blocks = []
-        for mesh in self.meshes:
+        for mesh in self.meshes + self.obstacles:
             matrix = np.array(cache.GetLocalToWorldTransform(mesh.GetPrim()))
             local = np.asarray(mesh.GetPointsAttr().Get(code), dtype=np.float64)
             blocks.append(local @ matrix[:3, :3] + matrix[3, :3])

@@ -6,6 +6,9 @@ Layout of a stage (metres, kilograms):
     /World/world_0000               Xform; its translate lays the worlds out on a grid
     /World/world_0000/<body>        Xform; a double-precision translate per frame, the centre of the body
     /World/world_0000/<body>/skin   Mesh; points, normals, extent and fields per frame, about that centre
+    /World/world_0000/<collider>        Xform; translate and orient, per frame of one that moves
+    /World/world_0000/<collider>/shape  Mesh in the shape's own axes; customData["warpfea:collider"] says its kind;
+                                        of a half-space a square
     /World/Camera /World/Sky /World/Sun
 
 Points are float32 about the body's own centre, so nothing is lost far from the origin. The time code of a
@@ -35,10 +38,12 @@ from warpfea.outputs.frames import (
     field_label,
     is_static,
     time_of,
-    vertex_normals,
 )
+from warpfea.outputs.normals import vertex_normals
+from warpfea.outputs.obstacles import names_beside
 from warpfea.outputs.usd_check import in_words, validate_usd
 from warpfea.outputs.usd_extend import read_earlier
+from warpfea.outputs.usd_obstacles import ObstaclePrims
 
 __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
 
@@ -135,13 +140,7 @@ class USDWriter(Output):
         """Names of the bodies' prims."""
         from pxr import Tf
 
-        names: list[str] = []
-        for body in self._surface.bodies:
-            name = Tf.MakeValidIdentifier(body.name)
-            while name in names:
-                name += "_"
-            names.append(name)
-        return names
+        return names_beside((), [Tf.MakeValidIdentifier(body.name) for body in self._surface.bodies])
 
     def _take_up(self, sim: Any, target: pathlib.Path) -> None:
         """Open a copy of the file that is there, to go on with it."""
@@ -162,6 +161,9 @@ class USDWriter(Output):
             meshes = [UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in of_body]
             moves = [UsdGeom.Xformable(m.GetPrim().GetParent()).GetOrderedXformOps()[0] for m in meshes]
             self._meshes.append([_Mesh(mesh, move, self.fields) for mesh, move in zip(meshes, moves)])
+        self._obstacles = ObstaclePrims(stage, self._surface, self._names())
+        if not self._obstacles.take_up():
+            raise OutputError(f"{target}: can't go on with this file: it has other colliders; give another file name")
         for name in ("Camera", "Sky", "Sun"):  # they are made anew, for all frames
             stage.RemovePrim(f"/World/{name}")
 
@@ -187,6 +189,8 @@ class USDWriter(Output):
                 mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
                 mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
                 meshes.append(_Mesh(mesh, xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble), self.fields))
+        self._obstacles = ObstaclePrims(self._stage, self._surface, names)
+        self._obstacles.define()
 
     def write(self, sim: Any) -> None:
         time = time_of(sim)
@@ -212,6 +216,7 @@ class USDWriter(Output):
                         np.maximum(self._box[1], high + offset),
                     )
                 self._unsaved += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
+            self._obstacles.write(code)
             self._codes.append(code)
             if self._unsaved > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
                 self._save()

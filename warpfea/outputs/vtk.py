@@ -17,6 +17,7 @@ from warpfea.base.errors import OutputError
 from warpfea.base.writer import Output, check_folder, write_whole
 from warpfea.model.surfaces import reference_points
 from warpfea.outputs.frames import FrameClock, check_fields, time_of
+from warpfea.outputs.obstacles import Obstacles
 
 __all__ = ["VTUWriter"]
 
@@ -36,6 +37,9 @@ class VTUWriter(Output):
     Element groups are 0/1 cell data named `set:<group>`. In the .pvd, `part` counts bodies and within them
     worlds. Every file is written whole and renamed, so the series is valid at any time; the .pvd lags by at
     most a tenth of the frames until `close`, which also writes the last state.
+
+    Colliders are a series of their own, <folder name>_colliders.pvd, of files collider_<name>_<world>_<frame>.vtu:
+    triangles where they are, of a half-space a square. While a collider rests, its frames share a file.
 
     OutputError: a folder that can't be made or written (at `open`), a file that can't (at `write`).
     """
@@ -65,6 +69,11 @@ class VTUWriter(Output):
         """The .pvd file."""
         return self.folder / f"{self.folder.resolve().name}.pvd"
 
+    @property
+    def collider_series(self) -> pathlib.Path:
+        """The .pvd file of the colliders; there is none without them."""
+        return self.folder / f"{self.folder.resolve().name}_colliders.pvd"
+
     def open(self, sim: Any) -> None:
         check_fields(sim, self.fields)
         if self.folder.exists() and not self.folder.is_dir():
@@ -80,38 +89,59 @@ class VTUWriter(Output):
         self._calls = 0
         self._last = -np.inf
         self._frames: list[tuple[float, list[str]]] = []
+        self._colliders: list[tuple[float, list[str]]] = []
         self._listed = 0
-        self._names = self._file_names(sim.model.bodies)
+        self._names = self._names_of([body.name for body in sim.model.bodies])
+        self._obstacles = self._obstacles_of(sim)
+        named = [f"collider_{obstacle.name}" for obstacle in self._obstacles.all]
+        self._collider_names = self._names_of([*self._names, *named])[len(self._names) :]
+        self._placed: dict[tuple[int, int], tuple[np.ndarray, str]] = {}
         self._kept = 0
         if self.extend and self.series.is_file():
             self._take_up(time_of(sim))
 
     def _take_up(self, now: float) -> None:
         """Go on with the frames of the series up to the time `now`, s."""
-        try:
-            entries = ElementTree.parse(self.series).getroot().iter("DataSet")
-            for entry in entries:
-                time, file = float(entry.attrib["timestep"]), entry.attrib["file"]
-                if time > now + 1e-9 * max(1.0, abs(now)):
-                    continue
-                if not self._frames or time != self._frames[-1][0]:
-                    self._frames.append((time, []))
-                self._frames[-1][1].append(file)
-        except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
-            self._open = False
-            raise OutputError(f"{self.series}: can't go on with this series ({error}); give another folder") from error
+        self._frames = self._read_series(self.series, now)
+        if self.collider_series.is_file():
+            self._colliders = self._read_series(self.collider_series, now)
         self._kept = self._listed = len(self._frames)
         if self._frames:
             self._last = self._frames[-1][0]
             if self._clock:
                 self._clock.due(self._last)
 
+    def _read_series(self, path: pathlib.Path, now: float) -> list[tuple[float, list[str]]]:
+        """Times up to `now`, s, and files of a .pvd."""
+        frames: list[tuple[float, list[str]]] = []
+        try:
+            for entry in ElementTree.parse(path).getroot().iter("DataSet"):
+                time, file = float(entry.attrib["timestep"]), entry.attrib["file"]
+                if time > now + 1e-9 * max(1.0, abs(now)):
+                    continue
+                if not frames or time != frames[-1][0]:
+                    frames.append((time, []))
+                frames[-1][1].append(file)
+        except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
+            self._open = False
+            raise OutputError(f"{path}: can't go on with this series ({error}); give another folder") from error
+        return frames
+
     @staticmethod
-    def _file_names(bodies: Sequence[Any]) -> list[str]:
-        """Bodies' names made fit for file names, still unique."""
+    def _obstacles_of(sim: Any) -> Obstacles:
+        """The colliders, with half-spaces drawn around the bodies."""
+        bodies = [body for body in sim.model.bodies if getattr(body, "mesh", None) is not None]
+        points = np.concatenate(
+            [np.asarray(sim.positions(body)).reshape(-1, 3) for body in bodies] or [np.zeros((1, 3))]
+        )
+        return Obstacles(sim, points.min(axis=0), points.max(axis=0))
+
+    @staticmethod
+    def _names_of(given: Sequence[str]) -> list[str]:
+        """Names made fit for file names, still unique."""
         names: list[str] = []
-        for body in bodies:
-            name = re.sub(r"[^A-Za-z0-9.-]", "_", body.name).strip(".") or "body"
+        for text in given:
+            name = re.sub(r"[^A-Za-z0-9.-]", "_", text).strip(".") or "body"
             while name.lower() in (other.lower() for other in names):
                 name += "-"
             names.append(name)
@@ -138,18 +168,30 @@ class VTUWriter(Output):
                 of_world = {key: np.ascontiguousarray(value[world]) for key, value in data.items()}
                 write_whole(self.folder / file, functools.partial(_write_vtu, cells, points[world], of_world))
                 files.append(file)
+        if len(self._obstacles):
+            self._colliders.append((time, self._collider_files(frame)))
         if frame + 1 >= self._listed + max(1, self._listed // 10):
             self._write_series()
 
+    def _collider_files(self, frame: int) -> list[str]:
+        """Files of the colliders in a frame; those that moved since their last are written."""
+        files = []
+        drawn = zip(self._obstacles.all, self._collider_names, self._obstacles.points())
+        for k, (obstacle, name, points) in enumerate(drawn):
+            cells: Cells = ("triangle", obstacle.triangles, {})
+            for world in range(len(points)):
+                before, file = self._placed.get((k, world), (None, ""))
+                if before is None or not np.array_equal(before, points[world]):
+                    file = f"{name}_{world:04d}_{frame:06d}.vtu"
+                    write_whole(self.folder / file, functools.partial(_write_vtu, cells, points[world], {}))
+                    self._placed[k, world] = (points[world], file)
+                files.append(file)
+        return files
+
     def _write_series(self) -> None:
-        lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
-        for time, files in self._frames:
-            lines += [
-                f'<DataSet timestep="{time!r}" group="" part="{part}" file={quoteattr(file)}/>'
-                for part, file in enumerate(files)
-            ]
-        lines += ["</Collection>", "</VTKFile>", ""]
-        write_whole(self.series, lambda path: path.write_text("\n".join(lines), encoding="utf-8"))
+        _write_pvd(self.series, self._frames)
+        if self._colliders:
+            _write_pvd(self.collider_series, self._colliders)
         self._listed = len(self._frames)
 
     def close(self, sim: Any) -> None:
@@ -165,14 +207,17 @@ class VTUWriter(Output):
         """Remove the files that this run wrote, and the folder if it made it and it is empty."""
         if not self._open:
             return
-        for _, files in self._frames[self._kept :]:
+        kept = {file for _, files in self._colliders[: self._kept] for file in files}
+        for _, files in self._frames[self._kept :] + self._colliders[self._kept :]:
             for file in files:
-                (self.folder / file).unlink(missing_ok=True)
+                if file not in kept:
+                    (self.folder / file).unlink(missing_ok=True)
         if self._kept:
-            self._frames = self._frames[: self._kept]
+            self._frames, self._colliders = self._frames[: self._kept], self._colliders[: self._kept]
             self._write_series()
         elif self._listed:
             self.series.unlink(missing_ok=True)
+            self.collider_series.unlink(missing_ok=True)
         if self._made and not any(self.folder.iterdir()):
             self.folder.rmdir()
         self._open = False
@@ -204,6 +249,18 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
     }
     data |= {field: sim.field_on(field, body, drawn) for field in fields}
     return points, data, (drawn.cell_type, drawn.cells, _groups(mesh, drawn.element))
+
+
+def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]]) -> None:
+    """The list of a series: files of each time, s."""
+    lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
+    for time, files in frames:
+        lines += [
+            f'<DataSet timestep="{time!r}" group="" part="{part}" file={quoteattr(file)}/>'
+            for part, file in enumerate(files)
+        ]
+    lines += ["</Collection>", "</VTKFile>", ""]
+    write_whole(target, lambda path: path.write_text("\n".join(lines), encoding="utf-8"))
 
 
 def _groups(mesh: Any, element: np.ndarray) -> dict[str, np.ndarray]:

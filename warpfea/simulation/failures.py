@@ -70,7 +70,12 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
             "; at full load the springs of stabilise= are gone: supports and contact alone do not hold the bodies there"
         )
     jumps = "" if code == FAIL_FLOOR else jumping_drives(sim, world)
-    return ConvergenceError(
+    kind: type[ConvergenceError] = ConvergenceError
+    for term in sim.model.terms:
+        if (found := term.explain(sim.stepper.at, world)) is not None:
+            kind, text = found
+            reason, hint = f"{text}; {reason}", ""
+    return kind(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
         f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}{jumps}",

@@ -1,4 +1,4 @@
-"""What a simulation tells: of a step, and of probes and joints over time."""
+"""What a simulation tells: of a step, and of probes, joints and contacts over time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["JointRecord", "ProbeRecord", "StepReport", "describe", "idle_report"]
+__all__ = ["ContactRecord", "JointRecord", "ProbeRecord", "StepReport", "describe", "idle_report"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +55,37 @@ class JointRecord:
     force: np.ndarray
     moment: np.ndarray
     violation: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ContactRecord:
+    """A contact over time, each (worlds, steps) but time (steps,).
+
+    Attributes:
+        time: s.
+        force, moment: on the body in world axes, moment about the world's origin; (worlds, steps, 3), N and N m.
+        normal_force: sum of the sizes of normal forces, N. It, force and moment are means over the step where the step
+            was halved, so that their impulse is that of the step.
+        penetration: largest depth in the step, m.
+        slip: length of slip in the step, m, and stick: share that sticks at its end; means over the area in contact.
+        area: reference area in contact at the end of the step, m^2; at an edge also points of the faces beside count.
+        stored: elastic energy of the contact at the end of the step, J.
+        loss, friction: energy lost in the step to restitution and to friction, J.
+        collider_work: work of the moving collider on the body in the step, J.
+    """
+
+    time: np.ndarray
+    force: np.ndarray
+    moment: np.ndarray
+    normal_force: np.ndarray
+    penetration: np.ndarray
+    slip: np.ndarray
+    area: np.ndarray
+    stick: np.ndarray
+    stored: np.ndarray
+    loss: np.ndarray
+    friction: np.ndarray
+    collider_work: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

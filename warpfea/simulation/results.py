@@ -11,6 +11,7 @@ from ..base.names import did_you_mean
 from ..model.bodies import Body
 from ..model.state import State
 from ..model.surfaces import reference_points
+from ..terms.contact import Contact
 from ..terms.evaluation import von_mises
 from ..terms.term import FieldSpec
 
@@ -79,6 +80,14 @@ class Results:
         """(B, skin points) scalars of a field at the drawn surface."""
         return self.field_on(name, body, body.skin)
 
+    def collider_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Where the colliders are: places (B, K, 3), m, turns (B, K, 3, 3), whose columns are a shape's axes in the
+        world, and by how much surfaces lie further out (B, K), m; None of a model without contact."""
+        for term in self.model.terms.all:
+            if isinstance(term, Contact):
+                return term.poses(self.state)
+        return None
+
     @property
     def fields(self) -> dict[str, FieldSpec]:
         """Scalar fields there are, by name."""
@@ -97,13 +106,17 @@ class Results:
             moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
             return np.linalg.norm(moved, axis=2)
         if name != "von_mises":
-            samples = body.family.node_samples.shape[1]
-            return np.stack([drawn.node_weights @ np.repeat(row, samples) for row in self.field(name, body)])
+            term, _ = self.model.terms.fields[name]
+            values = term.samples(name, body, self.state)
+            if values is None:
+                values = np.repeat(self.field(name, body), body.family.node_samples.shape[1], axis=1)
+            return np.stack([drawn.node_weights @ row for row in values])
         stress = self._stress(name, body)  # the tensor is interpolated: a bent section shows its neutral axis
         return von_mises(np.stack([drawn.node_weights @ row for row in stress]))
 
     def field(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), or one of a term.
+        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), or one of a term:
+        with contact "contact_pressure" (Pa, elastic, 0 away from contact) and "gap" (m, NaN off surfaces in contact).
 
         The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
         """

@@ -13,30 +13,27 @@ from .. import solvers
 from ..base.console import compile_bar, quiet_warp
 from ..base.errors import ConstraintError, ConvergenceError, ModelError
 from ..base.memory import enough_memory
-from ..base.names import did_you_mean, listing
 from ..kernels.step.control import REPORT, STATUS
-from ..kernels.terms.constraints import JOINT_COLUMNS
 from ..model.assembly import require_density
 from ..model.handles import NodeSet
-from ..model.joints import Joint
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
 from .checks import check_choice, check_constraint_tol, check_dt, check_model, check_state, check_steps
 from .controls import Controls
 from .failures import check_closed, step_error
-from .reports import JointRecord, ProbeRecord, StepReport, describe, idle_report
-from .results import Results
+from .records import Records
+from .reports import ContactRecord, JointRecord, ProbeRecord, StepReport, describe, idle_report
 from .run_loop import run_steps
 from .stepper import Stepper
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["JointRecord", "ProbeRecord", "Simulation", "StepReport"]
+__all__ = ["ContactRecord", "JointRecord", "ProbeRecord", "Simulation", "StepReport"]
 
 
-class Simulation(Results):
+class Simulation(Records):
     """Steps a model through time.
 
     Args:
@@ -166,6 +163,7 @@ class Simulation(Results):
         Raises:
             ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
             ConstraintError: the same, and it is the constraints that can't be satisfied; it names them.
+            PenetrationError: a ConvergenceError where a body went through an obstacle; it names contact and point.
             ModelError: `count` is not a positive whole number.
         """
         check_steps(count)
@@ -223,7 +221,7 @@ class Simulation(Results):
                 raise self._failure(int(np.flatnonzero(fresh)[0]))
 
     def _row(self, rows: np.ndarray) -> np.ndarray:
-        """What is kept of a report: time, probes, and joints, which a world that did not step does not tell."""
+        """What is kept of a report: time, probes, and what of terms a world that did not step does not tell."""
         row = rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy()
         row[~self._stepped, 1 + 6 * len(self.model.probes) :] = np.nan
         return row
@@ -308,23 +306,7 @@ class Simulation(Results):
         if self.stepper.ledger:
             self.stepper.begin_ledger(mask)
 
-    # results of the whole run; those of the present state are in Results
-
-    def probe(self, name: str) -> ProbeRecord:
-        """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""
-        names = [p.name for p in self.model.probes]
-        if name not in names:
-            raise ModelError(f"probe {name!r} is unknown; there are: {listing(names)}{did_you_mean(name, names)}")
-        k = names.index(name)
-        table = self._table([0, *range(1 + 6 * k, 7 + 6 * k)])
-        d, v = table[:, :, 1:4], table[:, :, 4:7]
-        return ProbeRecord(table[:, :, 0].max(axis=0), self.model.probes[k].X + d, d, v)
-
-    def _table(self, columns: list[int]) -> np.ndarray:
-        """(B, steps, columns) of what was recorded: time, then the columns of the report from the probes on."""
-        if self._history:
-            return np.stack([rows[:, columns] for rows in self._history], axis=1)
-        return np.zeros((self.model.worlds, 0, len(columns)))
+    # results of the whole run; more in Records, those of the present state in Results
 
     def energies(self) -> dict[str, np.ndarray]:
         """Energy ledger, each (B,), J.
@@ -355,70 +337,6 @@ class Simulation(Results):
         total = g[:, rows].sum(axis=1).astype(float)
         total[~self._stepped] = np.nan
         return total
-
-    def joint_record(self, joint: Joint | str) -> JointRecord:
-        """What has been recorded of a joint (handle or name), one entry per step."""
-        first = 1 + self._joint_column(joint) - len(REPORT)
-        columns = [0, *range(first, first + JOINT_COLUMNS)]
-        table = self._table(columns)
-        return JointRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
-
-    def joint_force(self, joint: Joint | str) -> np.ndarray:
-        """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
-
-        (B, 6) in world axes; `joint_record` has them over time. NaN as for `reaction`.
-        """
-        first = self._joint_column(joint)
-        out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
-        out[~self._stepped] = np.nan
-        return out
-
-    def violation(self, joint: Joint | str) -> np.ndarray:
-        """Largest violation of a joint's rows in the present state, (B,), m; angles count times the model's size."""
-        k = self._joint(joint).index
-        constraints = self.model.constraints
-        assert constraints is not None
-        values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
-        # where the last step has brought it, the right sides are that step's: statics runs in a time of its own
-        column = self._joint_column(joint) + 6
-        return np.where(self._stepped, self.stepper.work.report.numpy()[:, column], values)
-
-    def joint_value(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
-        """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
-
-        (B,), in the present state; a driven angle counts its full turns, another lies between -pi and pi. `what`:
-        "angle", "travel" or "length", where a joint has several. Travel is along the parent's axis, per unit of its
-        reference.
-        """
-        known = self._joint(joint)
-        constraints = self.model.constraints
-        assert constraints is not None
-        return constraints.measure(known, what, self.state)
-
-    def _joint_column(self, joint: Joint | str) -> int:
-        """First column of a joint in the report of a step."""
-        known = self._joint(joint)
-        return self.model.terms.constraints.report_offset + JOINT_COLUMNS * known.index
-
-    def _joint(self, joint: Joint | str) -> Joint:
-        """A joint of this model, by handle or name."""
-        known = self.model.constraints.joints if self.model.constraints else []
-        for other in known:
-            if other is joint or other.name == joint:
-                return other
-        names = [j.name for j in known]
-        raise ModelError(
-            f"expected a joint of this model (a handle from add_joint, add_constraint or weld, or a name), "
-            f"got {joint!r}; it has: {listing(names)}{did_you_mean(joint, names) if isinstance(joint, str) else ''}"
-        )
-
-    def contact_record(self, contact: Any) -> Any:
-        """Contact is not part of this version."""
-        raise NotImplementedError("contact_record: contact is not part of this version")
-
-    def contact_force(self, contact: Any) -> Any:
-        """Contact is not part of this version."""
-        raise NotImplementedError("contact_force: contact is not part of this version")
 
     def resume(self, path: Any) -> None:
         """Continue from a checkpoint, bit for bit. Raises CheckpointError if it is of another model."""

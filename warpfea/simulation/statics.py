@@ -68,6 +68,10 @@ class StaticResult:
         """Force and moment of a joint on its child, (B, 6), N and N m."""
         return self.simulation.joint_force(joint)
 
+    def contact_force(self, contact: Any) -> np.ndarray:
+        """Force and moment about the origin of a contact on its body, (B, 6), N and N m."""
+        return self.simulation.contact_force(contact)
+
     def violation(self, joint: Any) -> np.ndarray:
         """Largest violation of a joint, (B,), m."""
         return self.simulation.violation(joint)

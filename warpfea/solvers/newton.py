@@ -189,6 +189,7 @@ class NewtonLoop:
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
+        ctl.equilibrium = int(not inertia)
         ctl.max_iterations = options.max_newton
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
@@ -252,6 +253,8 @@ class NewtonLoop:
         choose = bool(self.candidates) and first
         self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
         self._rarely(self._choose if choose else self._look_for_inversion)
+        if self.terms.traits.walls:  # the first iterate may be the solution, as of a body that falls freely
+            self._refresh()
         self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
 

@@ -254,10 +254,13 @@ class TwoLevel:
         flat_r, flat_x = (_flat(a, self.model.types.T, (B, 3 * n)) for a in (r, x))
         lanes = self.launch.lanes(3 * n)
         arrays = self.arrays[depth]
-        parts = [(1, flat_r, self.half), (2, self.half, flat_x)] if self.follows else [(0, flat_r, flat_x)]
-        for part, given, out in parts:
-            args = [arrays.stored, arrays.root, part, lanes, given, active, out]
-            self.launch(self.kernels.apply_dense, (B, self.launch.padded(3 * n * lanes)), args)
+        dim = (B, self.launch.padded(3 * n * lanes))
+        if self.follows:  # z = L^-T (L^-1 r)
+            for upper, given, out in ((0, flat_r, self.half), (1, self.half, flat_x)):
+                args = [arrays.stored, arrays.root, upper, lanes, given, active, out]
+                self.launch(self.kernels.apply_triangle, dim, args)
+            return
+        self.launch(self.kernels.apply_dense, dim, [arrays.stored, arrays.root, lanes, flat_r, active, flat_x])
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = T r on a level; returns the coarse correction C P^T r, which is still to be interpolated by P."""

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, PenetrationError
 from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
 from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
+from .contact_fields import contact_field
+from .contact_parameters import contact_parameters
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
 from .time_laws import TimeLaws
@@ -27,7 +29,6 @@ __all__ = ["Contact"]
 
 TOUCHING = 1e-9
 """Depth at the start, over the model's size, that counts as touch."""
-PARAMETERS = ("mu", "mu_static", "restitution", "stiffness")
 
 
 class Contact(Term):
@@ -83,7 +84,8 @@ class Contact(Term):
         lumped, explicit = (B, P) if t.lumped else (1, 1), (B, P) if t.explicit else (1, 1)
         shapes: dict[str, tuple[int, ...]] = {
             "place": (B, K), "turn": (B, K), "level": lumped, "dead": explicit, "dead_spring": explicit,
-            "pick": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R), "rows": (len(RECORD), B, R),
+            "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R),
+            "rows": (len(RECORD), B, R),
             "total": (B, C, len(RECORD)),
         }  # fmt: skip
         attempt = attempt_struct(self.model.dtype)()
@@ -188,21 +190,29 @@ class Contact(Term):
     @part("contact")
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        if self.tables.lumped:
-            for group in self.tables.groups:
-                args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
-                at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
-            args = [self.tables.data, active, s["attempt"]]
-            at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+        if fresh:
+            self._pick(at, active, fresh=1)
         rows = w.rows_of(self)
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], w.u, active, fresh]
             at.launch(k.forces, (m.worlds, group.count), [*args, s["attempt"], w.pool_force, rows])
 
+    def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
+        """Choose the point of each lumped contact, at work.u."""
+        if not self.tables.lumped:
+            return
+        s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
+        for group in self.tables.groups:
+            args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
+            at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
+        args = [self.tables.data, active, fresh, s["attempt"]]
+        at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+
     @part("contact")
     def refresh(self, at: At, flags: wp.array) -> None:
         dim = (self.model.worlds, self.tables.points)
         at.launch(self.kernels.refresh, dim, [flags, at.scratch[self.name]["attempt"]])
+        self._pick(at, flags, fresh=0)
 
     @part("contact")
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
@@ -299,7 +309,62 @@ class Contact(Term):
     def block_modules(self) -> set[wp.Module]:
         return {contact_block_kernels(self.model.dtype).module}
 
+    def explain(self, at: At, world: int) -> tuple[type[PenetrationError], str] | None:
+        number = int(at.scratch[self.name]["attempt"].through.numpy()[world]) - 1
+        if number < 0:
+            return None
+        t = self.tables
+        k = int(np.searchsorted(t.first, number, side="right")) - 1
+        contact = t.contacts[k]
+        return PenetrationError, (
+            f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
+            f"{self._where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
+            "smaller dt, a larger stiffness= of the contact, or a thicker shape"
+        )
+
+    def parameters(self) -> dict[str, Callable[[Any], None]]:
+        return contact_parameters(self.tables)
+
+    def facts(self) -> list[dict[str, Any]]:
+        """Of each contact, in the order they were added, what `Model.info` tells: with the points that count, and those
+        left out, which clamped slots hold."""
+        t, out = self.tables, []
+        for contact in self.model.description.contacts:
+            k = t.number[contact.index]
+            facts = {"name": contact.name, "body": contact.body.name, "collider": contact.collider.name}
+            numbers = {"points": int((t.shares[k] > 0.0).sum()), "left_out": t.left_out[k]}
+            out.append(facts | {"law": contact.law, "model": contact.model} | numbers)
+        return out
+
     # at a state
+
+    def nodal_force(self, state: State) -> np.ndarray:
+        """Elastic forces of all contacts on slots, (worlds, slots, 3), N, at a state."""
+        _, force = self.at_points(state)
+        t, out = self.tables, np.zeros((state.worlds, self.model.slots, 3))
+        for k, (contact, p) in enumerate(zip(t.contacts, t.host)):
+            at_point = force[:, t.first[k] : t.first[k + 1]].reshape(-1, *p.area.shape, 3)
+            at_slot = np.einsum("bfpk,fpl->bflk", at_point, p.shape)
+            slots = p.conn + contact.body.slot_offset
+            for world in range(state.worlds):
+                np.add.at(out[world], slots, at_slot[world])
+        return out
+
+    def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Places (worlds, colliders, 3), m, and turns (..., 3, 3) of the colliders at a state, and by how much their
+        surfaces lie further out (worlds, colliders), m; None of a state without history."""
+        if "contact_place" not in state.specs:
+            return None
+        return state.contact_place.numpy(), state.contact_turn.numpy(), self.tables.data.grow.numpy()  # type: ignore[attr-defined]
+
+    def sample(self, field: str, body: Any, state: State) -> np.ndarray:
+        """Of a node of a beam the values at the corner of its section with most contact, of a shell at that face."""
+        values = self.samples(field, body, state).reshape(state.worlds, len(body.mesh.points), -1)
+        # least of the gaps; fmin passes over NaN
+        return values.max(axis=2) if field == "contact_pressure" else np.fmin.reduce(values, axis=2)
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        return contact_field(self.tables, field, body, state.worlds, lambda: self.at_points(state))
 
     def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""
@@ -313,7 +378,13 @@ class Contact(Term):
         every = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
         laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
-        shapes: dict[str, tuple[int, ...]] = {"born": (B,), "place": (B, K), "turn": (B, K), "pick": (B, C)}
+        shapes: dict[str, tuple[int, ...]] = {
+            "born": (B,),
+            "place": (B, K),
+            "turn": (B, K),
+            "pick": (B, C),
+            "picks": (B, C),
+        }
         if history is None:
             history = history_struct()()
             for name, var in history_struct().vars.items():
@@ -321,18 +392,21 @@ class Contact(Term):
                 array = getattr(state, f"contact_{name}") if known else zeros(shapes.get(name, (B, P)), var.type.dtype)
                 setattr(history, name, array)
         attempt = attempt_struct(m.dtype)()
-        for name in ("place", "turn", "pick", "start", "depth", "speed", "level"):
+        for name in ("place", "turn", "pick", "picks", "start", "depth", "speed", "level"):
             dtype = attempt_struct(m.dtype).vars[name].type.dtype
             setattr(attempt, name, zeros(shapes.get(name, (B, P)), dtype))
         attempt.speed.fill_(1.0)
-        launch(self.kernels.poses, (B, K), [t.data, value, every, attempt])
+        if "contact_place" in state.specs:  # statics puts its time back to 0
+            attempt.place, attempt.turn = history.place, history.turn
+        else:
+            launch(self.kernels.poses, (B, K), [t.data, value, every, attempt])
         gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             launch(self.kernels.settle, dim, [t.data, group.data, state.displacement, attempt])
             args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
             launch(self.kernels.levels, dim, args)
-        launch(self.kernels.pick_deepest, (B, C), [t.data, every, attempt])
+        launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt])
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             args = [t.data, group.data, history, state.displacement, state.time, attempt, gap, force]

@@ -21,11 +21,13 @@ from .time_laws import TimeLaws
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["ContactTables", "FacetGroup", "beta_of", "hunt_crossley_damping"]
+__all__ = ["PER_WORLD", "ContactTables", "FacetGroup", "beta_of", "hunt_crossley_damping"]
 
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
 SMOOTHING = (1e-3, 1e-4)
 """Of the smooth law where none is given: eps, N, and v_eps, m/s."""
+PER_WORLD = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
+"""What Model.set_parameter sets of a contact, and the arrays with it; the restitution is in `beta` too."""
 CONSTANT = 2.0 * math.sqrt(5.0 / 6.0)
 
 
@@ -125,7 +127,7 @@ class ContactTables:
         for support in self.model.description.supports:
             if support.law is None and support.node_laws is None and support.rotation is None:
                 held[support.body.slot_offset + support.slots] += support.components
-        return (held > 0).all(axis=1)
+        return np.asarray((held > 0).all(axis=1))
 
     def _share(self, contact: Contact, p: ContactPoints) -> np.ndarray:
         """(F, P) area of each point over that of the region; 0 where it only moves with clamped slots."""
@@ -231,9 +233,12 @@ class ContactTables:
             h.update(f"{collider.name} {collider.shape.kind}".encode())
             h.update(np.concatenate([collider.shape.sizes, center, axes.ravel()]).tobytes())
         for contact, p in zip(self.contacts, self.host):
-            values = {k: v for k, v in vars(contact).items() if k not in ("surface", "collider")}
+            fixed = ("surface", "collider", *PER_WORLD)
+            values = {k: v for k, v in vars(contact).items() if k not in fixed}
             h.update(f"{contact.collider.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes())
+        for name in (*PER_WORLD.values(), "beta", "grow"):
+            h.update(getattr(self.data, name).numpy().tobytes())
 
 
 def _kind(p: ContactPoints) -> tuple[int, int]:

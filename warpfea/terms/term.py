@@ -19,6 +19,7 @@ from ..kernels.common.traits import Traits
 from ..kernels.step.ledger import HELD_VISCOUS, LOSS, NUMERICAL, STORED, WORK
 
 if TYPE_CHECKING:
+    from ..base.errors import ConvergenceError
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..model.state import State
@@ -320,6 +321,18 @@ class Term:
 
     # results
 
+    def explain(self, at: At, world: int) -> tuple[type[ConvergenceError], str] | None:
+        """Why the last attempt at a step of a world was refused, where the term knows, with the error that says so."""
+        return None
+
+    def parameters(self) -> Mapping[str, Callable[[Any], None]]:
+        """What `Model.set_parameter` may set, by name, with what sets it: a scalar or (worlds,), checked there."""
+        return {}
+
     def sample(self, field: str, body: Any, state: State) -> np.ndarray:
         """(worlds, nodes of the body's mesh) values of one of `fields`."""
         raise NotImplementedError
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray | None:
+        """(worlds, nodes x samples of a node) values for drawing, on sections and faces; None: those of `sample`."""
+        return None

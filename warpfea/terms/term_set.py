@@ -10,6 +10,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import PARTS
+from ..base.names import did_you_mean, listing
 from ..kernels.common.traits import Traits
 from ..kernels.step.control import REPORT
 from ..kernels.step.ledger import LEDGER, booked_struct
@@ -35,7 +36,7 @@ __all__ = ["KINDS", "TermSet", "all_parts"]
 
 KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Constraints)
 """The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
-LATER = ("per-world parameters",)
+LATER = ("materials per world",)
 """Features of later versions, which `info` lists as left out."""
 STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end")  # fmt: skip
@@ -207,6 +208,24 @@ class TermSet:
     def fields(self) -> dict[str, tuple[Term, FieldSpec]]:
         """Fields that users may ask for beside those of the elements."""
         return {name: (term, spec) for term in self.all for name, spec in term.fields.items()}
+
+    # what users set and ask for
+
+    @property
+    def contact(self) -> Contact | None:
+        """The term of contact with obstacles, or None."""
+        return self.find(Contact)
+
+    def set_parameter(self, name: Any, values: Any) -> None:
+        """See Model.set_parameter."""
+        known = {key: put for term in self.all for key, put in term.parameters().items()}
+        if name in known:
+            known[name](values)
+            return
+        if isinstance(name, str) and any(name.startswith(f"{body.name}.") for body in self.model.bodies):
+            raise NotImplementedError(f"set_parameter({name!r}): materials per world are not part of this version")
+        hint = did_you_mean(name, known)
+        raise ModelError(f"set_parameter: parameter {name!r} is unknown; there are: {listing(known)}{hint}")
 
     # for one simulation
 

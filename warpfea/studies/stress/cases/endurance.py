@@ -18,7 +18,7 @@ SOFT = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
 
 @case("rest-1e6", "Endurance", values=("T4", "3243"))
 def rest(setting: Setting, element: str) -> Answer:
-    """A body that hangs at rest stays where it is over 1e6 steps, 1e5 on a GPU, whose steps of one small world are slow.
+    """A body that hangs at rest stays where it is over 1e6 steps, 1e5 on a GPU, where a small world is slow.
 
     In float32 the first 1000 steps settle what the tolerance of statics, 1e-4, has left.
     """

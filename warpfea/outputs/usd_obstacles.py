@@ -1,0 +1,102 @@
+"""Colliders in a USD stage: meshes that do not change, moved by the transform above them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warpfea.outputs.colormap import to_linear
+from warpfea.outputs.normals import vertex_normals
+from warpfea.outputs.obstacles import GREY, names_beside
+
+if TYPE_CHECKING:
+    from warpfea.outputs.frames import Surface
+
+__all__ = ["ObstaclePrims"]
+
+KEY = "warpfea:collider"
+
+
+class ObstaclePrims:
+    """The prims of the obstacles of a simulation.
+
+    Args:
+        stage: the stage that is written.
+        surface: what is drawn of the simulation.
+        bodies: names of the bodies' prims.
+    """
+
+    def __init__(self, stage: Any, surface: Surface, bodies: Sequence[str]) -> None:
+        from pxr import Tf
+
+        self.stage, self.surface, self.obstacles = stage, surface, surface.obstacles
+        self.names = names_beside(bodies, [Tf.MakeValidIdentifier(obstacle.name) for obstacle in self.obstacles.all])
+        self._ops: list[list[tuple[Any, Any]]] = []
+
+    def _path(self, world: int, name: str) -> str:
+        return f"/World/world_{world:04d}/{name}"
+
+    def define(self) -> None:
+        """Author meshes, and the transforms of obstacles that stay where they are."""
+        from pxr import UsdGeom
+
+        for obstacle, name in zip(self.obstacles.all, self.names):
+            ops = []
+            for world in range(self.surface.worlds):
+                xform = UsdGeom.Xform.Define(self.stage, self._path(world, name))
+                xform.GetPrim().SetDisplayName(obstacle.name)
+                double = UsdGeom.XformOp.PrecisionDouble
+                ops.append((xform.AddTranslateOp(double), xform.AddOrientOp(double)))
+                self._mesh(obstacle, world, self._path(world, name) + "/shape")
+            self._ops.append(ops)
+        self._place(lambda obstacle: not obstacle.moves)
+
+    def _mesh(self, obstacle: Any, world: int, path: str) -> None:
+        from pxr import Gf, UsdGeom, Vt
+
+        points = np.asarray(obstacle.points[world], dtype=np.float32)
+        mesh = UsdGeom.Mesh.Define(self.stage, path)
+        mesh.GetPrim().SetCustomDataByKey(KEY, obstacle.kind)
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(obstacle.triangles), 3))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(obstacle.triangles.ravel())))
+        mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(vertex_normals(points.astype(float), obstacle.triangles)))
+        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+        grey = Gf.Vec3f(*map(float, to_linear(GREY)))
+        mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([grey]))
+
+    def take_up(self) -> bool:
+        """Find the prims in a stage that is continued; False if it has others."""
+        from pxr import UsdGeom
+
+        there = {str(prim.GetParent().GetPath()) for prim in self.stage.Traverse() if prim.GetCustomDataByKey(KEY)}
+        worlds = range(self.surface.worlds)
+        if there != {self._path(world, name) for name in self.names for world in worlds}:
+            return False
+        for name in self.names:
+            prims = [self.stage.GetPrimAtPath(self._path(world, name)) for world in worlds]
+            ops = [UsdGeom.Xformable(prim).GetOrderedXformOps() for prim in prims]
+            self._ops.append([(pair[0], pair[1]) for pair in ops])
+        return True
+
+    def write(self, code: float) -> None:
+        """Where the obstacles that move are now."""
+        self._place(lambda obstacle: obstacle.moves, code)
+
+    def _place(self, chosen: Any, *code: float) -> None:
+        from pxr import Gf
+
+        if not any(map(chosen, self.obstacles.all)):
+            return
+        place, turn = self.obstacles.poses()
+        for k, obstacle in enumerate(self.obstacles.all):
+            for world, (translate, orient) in enumerate(self._ops[k] if chosen(obstacle) else ()):
+                translate.Set(Gf.Vec3d(*map(float, place[world, k])), *code)
+                # rows are the images of the axes
+                rotation = Gf.Matrix3d(*map(float, turn[world, k].T.ravel())).ExtractRotation()
+                orient.Set(Gf.Quatd(rotation.GetQuat()), *code)

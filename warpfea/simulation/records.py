@@ -1,0 +1,134 @@
+"""What a simulation has recorded of probes, joints and contacts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..base.names import did_you_mean, listing
+from ..kernels.step.control import REPORT
+from ..kernels.terms.constraints import JOINT_COLUMNS
+from ..kernels.terms.contact_data import RECORD
+from ..model.contacts import Contact
+from ..model.joints import Joint
+from .reports import ContactRecord, JointRecord, ProbeRecord
+from .results import Results
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
+
+__all__ = ["Records"]
+
+
+class Records(Results):
+    """Results over time of probes, joints and contacts, and those of the last step."""
+
+    stepper: Stepper
+    _history: list[np.ndarray]
+    _stepped: np.ndarray
+
+    def probe(self, name: str) -> ProbeRecord:
+        """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""
+        names = [p.name for p in self.model.probes]
+        if name not in names:
+            raise ModelError(f"probe {name!r} is unknown; there are: {listing(names)}{did_you_mean(name, names)}")
+        k = names.index(name)
+        table = self._table([0, *range(1 + 6 * k, 7 + 6 * k)])
+        d, v = table[:, :, 1:4], table[:, :, 4:7]
+        return ProbeRecord(table[:, :, 0].max(axis=0), self.model.probes[k].X + d, d, v)
+
+    def _table(self, columns: list[int]) -> np.ndarray:
+        """(B, steps, columns) of what was recorded: time, then the columns of the report from the probes on."""
+        if self._history:
+            return np.stack([rows[:, columns] for rows in self._history], axis=1)
+        return np.zeros((self.model.worlds, 0, len(columns)))
+
+    def joint_record(self, joint: Joint | str) -> JointRecord:
+        """What has been recorded of a joint (handle or name), one entry per step."""
+        first = 1 + self._joint_column(joint) - len(REPORT)
+        columns = [0, *range(first, first + JOINT_COLUMNS)]
+        table = self._table(columns)
+        return JointRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
+
+    def joint_force(self, joint: Joint | str) -> np.ndarray:
+        """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
+
+        (B, 6) in world axes; `joint_record` has them over time. NaN as for `reaction`.
+        """
+        first = self._joint_column(joint)
+        out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
+        out[~self._stepped] = np.nan
+        return out
+
+    def violation(self, joint: Joint | str) -> np.ndarray:
+        """Largest violation of a joint's rows in the present state, (B,), m; angles count times the model's size."""
+        k = self._joint(joint).index
+        constraints = self.model.constraints
+        assert constraints is not None
+        values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
+        # where the last step has brought it, the right sides are that step's: statics runs in a time of its own
+        column = self._joint_column(joint) + 6
+        return np.where(self._stepped, self.stepper.work.report.numpy()[:, column], values)
+
+    def joint_value(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
+        """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
+
+        (B,), in the present state; a driven angle counts its full turns, another lies between -pi and pi. `what`:
+        "angle", "travel" or "length", where a joint has several. Travel is along the parent's axis, per unit of its
+        reference.
+        """
+        known = self._joint(joint)
+        constraints = self.model.constraints
+        assert constraints is not None
+        return constraints.measure(known, what, self.state)
+
+    def _joint_column(self, joint: Joint | str) -> int:
+        """First column of a joint in the report of a step."""
+        known = self._joint(joint)
+        return self.model.terms.constraints.report_offset + JOINT_COLUMNS * known.index
+
+    def _joint(self, joint: Joint | str) -> Joint:
+        """A joint of this model, by handle or name."""
+        known = self.model.constraints.joints if self.model.constraints else []
+        for other in known:
+            if other is joint or other.name == joint:
+                return other
+        names = [j.name for j in known]
+        raise ModelError(
+            f"expected a joint of this model (a handle from add_joint, add_constraint or weld, or a name), "
+            f"got {joint!r}; it has: {listing(names)}{did_you_mean(joint, names) if isinstance(joint, str) else ''}"
+        )
+
+    def contact_record(self, contact: Contact | str) -> ContactRecord:
+        """What has been recorded of a contact (handle or name), one entry per step."""
+        first = 1 + self._contact_column(contact) - len(REPORT)
+        table = self._table([0, *range(first, first + len(RECORD))])
+        names = ("normal_force", "penetration", "slip", "area", "stick", "stored", "loss", "friction", "collider_work")
+        scalars = {name: table[:, :, 1 + RECORD.index(name)] for name in names}
+        return ContactRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], **scalars)
+
+    def contact_force(self, contact: Contact | str) -> np.ndarray:
+        """Force (N) and moment about the origin (N m) of a contact on its body over the last accepted step.
+
+        (B, 6) in world axes; `contact_record` has them over time. NaN as for `reaction`.
+        """
+        first = self._contact_column(contact)
+        out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
+        out[~self._stepped] = np.nan
+        return out
+
+    def _contact_column(self, contact: Contact | str) -> int:
+        """First column of a contact in the report of a step."""
+        contacts = self.model.description.contacts
+        for other in contacts:
+            if other is contact or other.name == contact:
+                term = self.model.terms.contact
+                assert term is not None
+                return term.report_offset + len(RECORD) * term.tables.number[other.index]
+        names = [c.name for c in contacts]
+        raise ModelError(
+            f"expected a contact of this model (a handle from add_contact, or a name), got {contact!r}; it has: "
+            f"{listing(names)}{did_you_mean(contact, names) if isinstance(contact, str) else ''}"
+        )
