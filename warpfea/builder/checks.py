@@ -74,7 +74,7 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
 
 def gravity_of(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
     """A constant gravity (3,), m/s^2, and its law over time, of which the constant is zero; None: constant."""
-    samples = isinstance(value, tuple) and len(value) == 2
+    samples = isinstance(value, tuple) and len(value) == 2 and np.ndim(value[0]) == 1
     if samples or isinstance(value, (wp.Function, Control)) or callable(value):
         return np.zeros(3), time_law(value, "gravity")
     return vector(value, "gravity"), None
