@@ -106,6 +106,8 @@ def control_struct():
         restoring: wp.array(dtype=wp.int32)  # the trial is the best iterate
         best_phi: wp.array(dtype=wp.float64)
         best_norm: wp.array(dtype=wp.float64)
+        refreshed: wp.array(dtype=wp.int32)  # terms have taken anew what they hold; with walls
+        new_walls: wp.array(dtype=wp.int32)  # what they hold now may set in suddenly again
         # where rounding stops the residual
         strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left; 2: it has been done
         rounds: wp.array(dtype=wp.int32)  # linear solves of this attempt

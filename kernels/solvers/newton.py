@@ -94,6 +94,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.rounds[world] = 0
         ctl.eta[world] = f64(1.0e30)
         ctl.slope[world] = f64(0.0)
+        if wp.static(walls):
+            ctl.refreshed[world] = 0
+            ctl.new_walls[world] = 0
         if ctl.domain_J[world] <= f64(0.0):
             give_up(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
@@ -395,6 +398,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         wishes = finite and not (good or stands or reused) and ctl.searches[world] == 0
         wishes = wishes and ctl.wish[world] == 0 and ctl.negative[world] == 0
         wishes = wishes and (ctl.tame[world] == 0 or ctl.mixed[world] == 2)
+        if wp.static(walls):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
+            wishes = wishes and ctl.refreshed[world] == 0 and ctl.mixed[world] != 2
         leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or leap:
             take(ctl, world, stands, leap)

@@ -45,6 +45,8 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
             ctl.phi_magnitude[world] = magnitude(ctl, world)
             ctl.leaps[world] = 0
+            ctl.refreshed[world] = 1 - ctl.new_walls[world]
+            ctl.new_walls[world] = 0
             settle(ctl, world)
         else:
             record(ctl, world)

@@ -178,10 +178,14 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
             d = distance(con.kind[k], con.size[k], y, -1)
             depth = reach(con, his, world, c, point, time[world]) - d[3]
+            if con.dead[c] != 0:  # its force is that of the last state
+                depth = at.depth[world, point]
         at.level[world, point] = depth
 
     @wp.kernel(module=module)
-    def pick_deepest(con: Contacts, active: wp.array(dtype=wp.int32), fresh: int, at: Attempt):
+    def pick_deepest(
+        con: Contacts, active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, changed: wp.array(dtype=wp.int32)
+    ):  # fmt: skip
         """The deepest point of each lumped contact, of equals the first; it may change a few times per attempt.
 
         Where two points are as deep there is no equilibrium with either alone: the last choice stays.
@@ -201,6 +205,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                 best = point
         if fresh != 0 or best != at.pick[world, c]:
             at.picks[world, c] = at.picks[world, c] + 1
+            changed[world] = 1
         at.pick[world, c] = best
 
     @wp.kernel(module=module)
@@ -261,7 +266,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                         psi = t.law[2]
                         rub = friction_potential(con, world, c, t, held, inv_h)
                         held_sum += share * (psi + rub)
-                        size_sum += share * (wp.abs(psi) + wp.abs(rub))
+                        size_sum += share * (t.law[3] + wp.abs(rub))
                         force = friction_force(con, world, c, t, held, inv_h) - t.law[0] * t.n
                         K = point_stiffness(con, world, c, t, held, inv_h)
                         at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),

@@ -18,7 +18,7 @@ DEFAULT, PAPER, SMOOTH = range(3)
 def law_functions() -> _types.SimpleNamespace:
     """Device functions `normal_law`, `elastic`, `friction` and `smooth_friction`."""
     f64 = wp.float64
-    vec3d = wp.vec3d
+    vec3d, vec4d = wp.vec3d, wp.vec4d
 
     @wp.func
     def elastic(lumped: int, k: f64, delta: f64) -> wp.vec2d:
@@ -31,31 +31,34 @@ def law_functions() -> _types.SimpleNamespace:
         return wp.vec2d(k * delta, f64(0.5) * k * delta * delta)
 
     @wp.func
-    def hunt_crossley(lumped: int, k: f64, rate: f64, delta: f64, delta_n: f64) -> vec3d:
+    def hunt_crossley(lumped: int, k: f64, rate: f64, delta: f64, delta_n: f64) -> vec4d:
         """F = F_el (1 + rate (delta - delta_n)), not below 0 (Hunt and Crossley 1975), its derivative, its integral.
+
+        Last the size of what the integral is the difference of, whose rounding it has.
 
         rate = chi / h, 1/m. F grows with delta wherever it is not 0, so its integral is convex.
         """
         if delta <= f64(0.0):
-            return vec3d()
+            return vec4d()
         factor = f64(1.0) + rate * (delta - delta_n)
         if factor <= f64(0.0):
-            return vec3d()
+            return vec4d()
         m = wp.where(lumped != 0, f64(1.5), f64(1.0))
         c0 = f64(1.0) - rate * delta_n
         power = elastic(lumped, k, delta)[0]
         force = power * factor
         slope = m * force / delta + power * rate
         psi = power * delta * (c0 / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
+        size = power * delta * ((f64(1.0) + rate * wp.abs(delta_n)) / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
         if c0 < f64(0.0):  # the force begins at delta_a > 0
             begin = -c0 / rate
             low = elastic(lumped, k, begin)[0] * begin
             psi -= low * (c0 / (m + f64(1.0)) + rate * begin / (m + f64(2.0)))
-        return vec3d(force, slope, psi)
+        return vec4d(force, slope, psi, size)
 
     @wp.func
     def damped(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
-        """k_n delta - gamma_n v_n of Eq. (77), not cut, its derivative where both parts count, and its integral.
+        """k_n delta - gamma_n v_n of Eq. (77), not cut, its derivative and its integral.
 
         g = gamma_n / h (of spheres gamma_n is g h delta^(1/4)); the damping grows linearly over the depth `ramp`.
         """
@@ -63,27 +66,28 @@ def law_functions() -> _types.SimpleNamespace:
         if lumped != 0:
             root = wp.sqrt(wp.sqrt(delta))
             force = spring[0] + g * root * (delta - delta_n)
-            slope = f64(1.5) * spring[0] / wp.max(delta, f64(1.0e-300)) + g * root
+            slope = f64(0.25) * force / wp.max(delta, f64(1.0e-300)) + root * (f64(1.25) * k * root + g)
             psi = spring[1] + g * root * delta * (delta / f64(2.25) - delta_n / f64(1.25))
             return vec3d(force, slope, psi)
         if delta < ramp:
             part = delta / ramp
             force = spring[0] + g * part * (delta - delta_n)
             psi = spring[1] + g * part * delta * (delta / f64(3.0) - f64(0.5) * delta_n)
-            return vec3d(force, k + g * part, psi)
+            return vec3d(force, k + g * part + g / ramp * (delta - delta_n), psi)
         psi = spring[1] + g * (f64(0.5) * delta * delta - delta_n * delta)
         # what the ramp leaves out below its depth
         psi += g * ramp * (f64(0.5) * delta_n - ramp / f64(6.0))
         return vec3d(spring[0] + g * (delta - delta_n), k + g, psi)
 
     @wp.func
-    def paper_law(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
-        """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative and integral."""
+    def paper_law(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec4d:
+        """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative and integral; last its size."""
         if delta <= f64(0.0):
-            return vec3d()
+            return vec4d()
         out = damped(lumped, k, g, ramp, delta, delta_n)
         if out[0] <= f64(0.0):
-            return vec3d()
+            return vec4d()
+        size = elastic(lumped, k, delta)[1] + g * delta * (delta + wp.abs(delta_n))
         if delta_n > f64(0.0) and g > f64(0.0):
             low = f64(0.0)  # where the force begins: it is negative below, and positive at delta_n
             high = wp.min(delta, delta_n)
@@ -94,10 +98,10 @@ def law_functions() -> _types.SimpleNamespace:
                 else:
                     low = middle
             out[2] = out[2] - damped(lumped, k, g, ramp, low, delta_n)[2]
-        return out
+        return vec4d(out[0], out[1], out[2], size)
 
     @wp.func
-    def smooth_law(k: f64, g: f64, eps: f64, delta: f64, delta_n: f64) -> vec3d:
+    def smooth_law(k: f64, g: f64, eps: f64, delta: f64, delta_n: f64) -> vec4d:
         """(y + sqrt(y^2 + eps^2)) / 2 in place of max(0, y) (Paper I, 6.2), y = k delta - gamma v, at any gap."""
         y = k * delta + g * (delta - delta_n)
         root = wp.sqrt(y * y + eps * eps)
@@ -107,13 +111,14 @@ def law_functions() -> _types.SimpleNamespace:
         bend = k + g
         logarithm = wp.log((wp.abs(y) + root) / eps) * wp.sign(y)
         psi = f64(0.25) * (y * total + eps * eps * logarithm) / bend
-        return vec3d(f64(0.5) * total, f64(0.5) * total / root * bend, psi)
+        return vec4d(f64(0.5) * total, f64(0.5) * total / root * bend, psi, wp.abs(psi) + k * delta * delta)
 
     @wp.func
     def normal_law(
         law: int, lumped: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
-    ) -> vec3d:  # fmt: skip
-        """Normal force, N, its derivative by the depth, N/m, and its integral, J; g = chi/h or gamma_n/h."""
+    ) -> vec4d:  # fmt: skip
+        """Normal force, N, its derivative by the depth, N/m, its integral, J, and the size of the integral's parts; g is
+        chi/h or gamma_n/h."""
         if law == DEFAULT:
             return hunt_crossley(lumped, k, g, delta, delta_n)
         if law == PAPER:

@@ -34,7 +34,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         n: vec3d  # outward normal of the shape
         depth: f64
         side: wp.int32
-        law: vec3d  # normal force, its derivative, its potential
+        law: wp.vec4d  # normal force, its derivative, its potential, the size of the potential's parts
         slip: vec3d  # tangential motion in the step
         q: vec3d  # spring: tangential slip since it was anchored
         y: vec3d  # place in the collider's frame

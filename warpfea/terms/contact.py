@@ -205,7 +205,7 @@ class Contact(Term):
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
             at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
-        args = [self.tables.data, active, fresh, s["attempt"]]
+        args = [self.tables.data, active, fresh, s["attempt"], w.newton.new_walls]
         at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
 
     @part("contact")
@@ -406,7 +406,7 @@ class Contact(Term):
             launch(self.kernels.settle, dim, [t.data, group.data, state.displacement, attempt])
             args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
             launch(self.kernels.levels, dim, args)
-        launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt])
+        launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt, zeros((B,), wp.int32)])
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             args = [t.data, group.data, history, state.displacement, state.time, attempt, gap, force]
