@@ -182,6 +182,21 @@ def test_rows_of_the_cpu_are_as_large_as_they_say():
     assert elements == expected
 
 
+def test_contact_stands_beside_a_step_without(bench):
+    code, text, content = bench("--contact", "--unknowns", "300", "--steps", "2", "--repeat", "1")
+    assert code == 0, text
+    rows = {row["scene"]: row for row in content["rows"]}
+    assert set(rows) == {"none", "clamped", "apart", "resting", "sliding"}
+    assert rows["apart"]["points"] == rows["resting"]["points"] > 0
+    assert rows["none"]["points"] == rows["clamped"]["points"] == 0
+    assert rows["apart"]["launches"] > rows["none"]["launches"]
+    assert rows["apart"]["newton_per_step"] == rows["none"]["newton_per_step"]
+    assert rows["apart"]["carried"] == 0.0
+    assert rows["resting"]["carried"] > 0.1
+    assert [rows[s]["bar"] for s in ("apart", "resting", "sliding")] == [1.3, 2.0, 3.0]
+    assert {"schema", "command", "commit", "machine", "versions"} <= set(content)
+
+
 BAD = {
     "unknown row": (["--peer", "--rows", "bar-1"], ["'bar-1'", "bar-3x2x1"]),
     "no such folder": (["--peer", "--meshes", "nowhere"], ["nowhere"]),
@@ -190,6 +205,7 @@ BAD = {
     "sizes of the peer": (["--peer", "--unknowns", "1000"], ["--unknowns", "--peer"]),
     "steps of growth": (["--growth", "--steps", "3"], ["--steps", "--growth"]),
     "steps of the product": (["--product", "--steps", "3"], ["--steps", "--product"]),
+    "limit of contact": (["--contact", "--limit", "3"], ["--limit", "--contact"]),
     "limit of the peer": (["--peer", "--limit", "3"], ["--limit", "--peer"]),
     "precision on the CPU": (["--cpu", "--dtype", "float32"], ["--dtype", "--cpu"]),
     "unknown row of the CPU": (["--cpu", "--rows", "bar"], ["'bar'", "brick-1080"]),

@@ -36,6 +36,9 @@ def cost(feature=None, **simulation):
         b.drive(body.nodes("x+"), rotation=wf.Rotation((0, 0, 0), (1, 0, 0), 0.0))
     if feature == "joint":
         b.add_joint("distance", parent=wf.GROUND, child=body.at((1, 0.1, 0.1)), anchor=(1, 0.1, 2))
+    if feature in ("contact", "friction"):
+        floor = b.add_collider(wf.HalfSpace((0, 0, 1), -1.0))
+        b.add_contact(body, floor, mu=0.5 if feature == "friction" else 0.0)
     if feature == "probe":
         b.add_probe("p", body.surface("x+"))
     if feature == "second body":
@@ -53,7 +56,7 @@ def cost(feature=None, **simulation):
 
 
 FEATURES = ["gravity", "incremental", "explicit", "rate", "free group", "traction", "pressure", "field", "drive"]
-FEATURES += ["joint", "rotation", "probe", "second body", "second law"]
+FEATURES += ["joint", "contact", "friction", "rotation", "probe", "second body", "second law"]
 
 
 @pytest.mark.parametrize("feature", FEATURES)
@@ -89,10 +92,28 @@ def test_bare_step_uses_few_modules():
     _, kernels, modules, _, model = cost(ledger=False)
     assert len(modules) <= 13
     assert not any("follower" in k or "drive" in k or "evaluate_laws" in k or "dead_load" in k for k in kernels)
-    assert not any("constraint" in name for name in modules)
+    assert not any("constraint" in name or "contact" in name for name in modules)
     assert {"constraints", "gravity", "body forces", "follower pressure", "driven nodes"} <= set(
         model.info()["left_out"]
     )
+
+
+def test_a_scene_without_contact_has_nothing_of_it():
+    launches, kernels, modules, _, model = cost()
+    more, with_kernels, with_modules, _, touching = cost("contact")
+    assert not any("contact" in name for name in modules)
+    assert any("contact" in name for name in with_modules)
+    assert not {name for name in model.bytes if "contact" in name}
+    assert "contact" in touching.bytes
+    assert {"contact", "friction"} <= set(model.info()["left_out"])
+    assert "contact" not in touching.info()["left_out"]
+    assert more > launches
+    assert len(with_kernels - kernels) >= 10
+
+
+def test_gravity_without_a_law_launches_no_law():
+    _, kernels, modules, _, _ = cost("gravity")
+    assert not any("gravity" in name for name in (*modules, *kernels))
 
 
 def test_table_path_only_where_elements_are_curved():

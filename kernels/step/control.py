@@ -51,11 +51,12 @@ def step_struct():
         a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1}
         a1: wp.array(dtype=wp.float64)
         dq_dv: wp.array(dtype=wp.float64)  # beta h
-        mass_factor: wp.array(dtype=wp.float64)  # 1/(beta h), 0 in statics
+        mass_factor: wp.array(dtype=wp.float64)  # 1/(beta h); in statics that of springs, `stabilise`
         ramp: wp.array(dtype=wp.float64)  # factor of constant loads
         gravity: wp.array(dtype=wp.vec3d)
         any_running: wp.array(dtype=wp.int32)
         max_halvings: wp.int32
+        stabilise: wp.float64  # N/m per kg, of statics: springs from the last equilibrium, none at full load
         total_J: wp.array(dtype=wp.float64)
         ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
 

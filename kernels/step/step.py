@@ -18,6 +18,9 @@ from .ledger import ledger_kernels
 
 __all__ = ["step_kernels"]
 
+FULL = 1e-9
+"""Part of the load that may lack where all of it counts as acting."""
+
 
 @functools.cache
 def step_kernels(
@@ -97,8 +100,9 @@ def step_kernels(
         step.a1[world] = c[1]
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
-            step.mass_factor[world] = f64(0.0)
             step.ramp[world] = step.new_time[world]
+            short = f64(1.0) - step.new_time[world]
+            step.mass_factor[world] = wp.where(short > f64(FULL), step.stabilise * short, f64(0.0))
         else:
             step.dq_dv[world] = c[2] * h
             step.mass_factor[world] = f64(1.0) / (c[2] * h)
@@ -127,6 +131,8 @@ def step_kernels(
             return
         q = u_n[world, slot]
         w = v_n[world, slot]
+        if wp.static(static):
+            w = vec3()
         if wp.static(multistep):
             a0 = T(step.a0[world])
             a1 = T(step.a1[world])

@@ -35,6 +35,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     laws_module = kernel_module(f"laws_{dtype}")
     controls_module = kernel_module(f"controls_{dtype}")
     dead_module = kernel_module(f"dead_load_{dtype}")
+    gravity_module = kernel_module("gravity_law")
     explicit_module = kernel_module(f"explicit_{dtype}")
     drive_module = kernel_module(f"drive_{dtype}")
     turn_module = kernel_module(f"drive_rotation_{dtype}")
@@ -111,6 +112,18 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
             m += wp.cw_mul(x, wp.sign(x))
         force[world, slot] = f
         magnitude[world, slot] = m
+
+    @wp.kernel(module=gravity_module)
+    def take_gravity(
+        value: wp.array2d(dtype=wp.vec3d),
+        law: int,
+        active: wp.array(dtype=wp.int32),
+        gravity: wp.array(dtype=wp.vec3d),
+    ):
+        """Gravity of a time law."""
+        world = wp.tid()
+        if active[world] != 0:
+            gravity[world] = value[world, law]
 
     @wp.kernel(module=explicit_module)
     def work_rows(
@@ -191,6 +204,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         evaluate_laws=evaluate_laws,
         evaluate_control=evaluate_control,
         dead_load=dead_load,
+        take_gravity=take_gravity,
         work_rows=work_rows,
         add_explicit=add_explicit,
         drive_displacement=drive_displacement,

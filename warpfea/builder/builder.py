@@ -22,7 +22,7 @@ from . import loads
 from .attachments import Ground
 from .beams import beam_geometry
 from .bodies import MeshLike, as_mesh, make_solid, make_structure, unused_name
-from .checks import check_densities, owner_of, vector, warn_implausible
+from .checks import check_densities, gravity_of, owner_of, warn_implausible
 from .contacts import make_collider, make_contact
 from .joints import make_constraint, make_joint
 from .shells import shell_geometry
@@ -36,7 +36,7 @@ class ModelBuilder:
     """Collects bodies, supports and loads; `finalize` makes a Model of them.
 
     Args:
-        gravity: (3,) m/s^2.
+        gravity: (3,) m/s^2, or a time law of it; in statics a law is taken at the part of the load, 0 to 1.
         up_axis: "Z" or "Y", for outputs.
 
     Raises:
@@ -44,11 +44,11 @@ class ModelBuilder:
     """
 
     def __init__(self, gravity: Any = (0.0, 0.0, -9.81), up_axis: str = "Z") -> None:
-        self.gravity = vector(gravity, "gravity")
+        self.gravity, law = gravity_of(gravity)
         if up_axis not in ("Z", "Y"):
             raise ModelError(f"up_axis = {up_axis!r} is neither 'Z' nor 'Y'")
         self.up_axis = up_axis
-        self.description = Description()
+        self.description = Description(gravity=law)
         self._terms: list[Callable[[Model], Term | None]] = []
 
     def __repr__(self) -> str:
@@ -424,7 +424,7 @@ class ModelBuilder:
         Warns:
             MeshWarning: a size, mass or density that a wrong unit is likely to have made.
         """
-        check_densities(self.bodies, self.gravity, self.description.body_forces)
+        check_densities(self.gravity, self.description)
         with quiet_warp():
             model = Model(self, device=device, dtype=dtype, worlds=worlds)
         warn_implausible(model)

@@ -7,14 +7,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from ..base.errors import MeshWarning, ModelError
 from ..base.names import did_you_mean, listing
+from ..laws import Control, TimeLaw, time_law
 from ..materials import Material
 from ..mesh import Mesh
 from ..model.assembly import require_density
 from ..model.bodies import Body
-from ..model.description import BodyForce
+from ..model.description import Description
 from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
 
 __all__ = [
@@ -22,6 +24,7 @@ __all__ = [
     "assign_materials",
     "check_densities",
     "component_mask",
+    "gravity_of",
     "nodal",
     "owner_of",
     "slot_field",
@@ -69,9 +72,18 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
     return body
 
 
-def check_densities(bodies: list[Body], gravity: np.ndarray, forces: list[BodyForce]) -> None:
+def gravity_of(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
+    """A constant gravity (3,), m/s^2, and its law over time, of which the constant is zero; None: constant."""
+    samples = isinstance(value, tuple) and len(value) == 2 and np.ndim(value[0]) == 1
+    if samples or isinstance(value, (wp.Function, Control)) or callable(value):
+        return np.zeros(3), time_law(value, "gravity")
+    return vector(value, "gravity"), None
+
+
+def check_densities(gravity: np.ndarray, d: Description) -> None:
     """Raise ModelError where gravity or a body force acts on a material without density."""
-    if np.any(gravity):
+    bodies, forces = d.bodies, d.body_forces
+    if np.any(gravity) or d.gravity is not None:
         require_density(bodies, "gravity needs, and any motion")  # no "or gravity=(0, 0, 0)": motion is next
     for force in forces:
         require_density(force.bodies, "add_body_force")

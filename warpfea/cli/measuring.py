@@ -74,7 +74,7 @@ def add_bench(commands: Any) -> None:
         epilog="examples:\n  warpfea bench --problem plate --unknowns 1e4,1e5\n"
         "  warpfea bench --peer --large --out peer.json\n  warpfea bench --peer --rows 'beam-*,bar-3x2x1'\n"
         "  warpfea bench --growth --out growth.json\n  warpfea bench --product --out product.json\n"
-        "  warpfea bench --cpu --out cpu.json\n"
+        "  warpfea bench --cpu --out cpu.json\n  warpfea bench --contact --out contact.json\n"
         "  warpfea bench --scenes --device cpu --before old.json --out scenes.json",
     )
     kind = to.add_mutually_exclusive_group()
@@ -83,6 +83,7 @@ def add_bench(commands: Any) -> None:
     kind.add_argument("--product", action="store_true", help="unknowns per second of the operator H v, its limits")
     kind.add_argument("--cpu", action="store_true", help="ms per step of three linear solvers on this CPU, to 5e-4 N")
     kind.add_argument("--scenes", action="store_true", help="launches, modules, bytes and iterations of every scene")
+    kind.add_argument("--contact", action="store_true", help="a step with contact beside one without")
     to.add_argument(
         "--problem",
         action="append",

@@ -123,6 +123,7 @@ class Description:
     joints: list[Joint] = field(default_factory=list)
     colliders: list[Collider] = field(default_factory=list)
     contacts: list[Contact] = field(default_factory=list)
+    gravity: TimeLaw | None = None
 
     def summary(self) -> str:
         """What there is, in one line; "" of an empty description."""

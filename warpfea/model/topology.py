@@ -76,6 +76,7 @@ def free_groups(model: Any) -> tuple[Any, int]:
 def check_static_supports(model: Any) -> None:
     """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
     state = model.state()
+    held_by = "hold what rests on contact with solve_static(stabilise=True), " if model.description.contacts else ""
     for label in range(model.component_count):
         slots = np.flatnonzero(model.component == label)
         parts, part = np.unique(model.part[slots], return_inverse=True)
@@ -103,5 +104,5 @@ def check_static_supports(model: Any) -> None:
             raise ModelError(
                 f"body {body.name!r} is not supported: supports, joints and terms leave {free} rigid "
                 f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "
-                "not counted): clamp or drive more nodes, or let a damped dynamic run come to rest"
+                f"not counted): clamp or drive more nodes, {held_by}or let a damped dynamic run come to rest"
             )

@@ -65,6 +65,10 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
     reason, hint = _why(sim, code, world)
+    if sim.integrator.stabilise and work.step.mass_factor.numpy()[world] == 0.0:
+        hint += (
+            "; at full load the springs of stabilise= are gone: supports and contact alone do not hold the bodies there"
+        )
     jumps = "" if code == FAIL_FLOOR else jumping_drives(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
     for term in sim.model.terms:

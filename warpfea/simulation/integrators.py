@@ -47,6 +47,7 @@ class Integrator:
         multistep: keeps the state before the last.
         static: no inertia; v is the displacement increment of a load step.
         order: order of convergence in h.
+        stabilise: N/m per kg, of statics: springs from the last equilibrium to the next, fading with the load.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Integrator:
     multistep: bool
     static: bool
     order: int
+    stabilise: float = 0.0
 
 
 INTEGRATORS = {

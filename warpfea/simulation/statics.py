@@ -17,6 +17,7 @@ from ..solvers import NewtonPCG
 from .checks import check_model
 from .integrators import INTEGRATORS
 from .simulation import Simulation, StepReport
+from .stabilise import Springs, spring_stiffness
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -33,6 +34,7 @@ class StaticResult:
         report: StepReport of the last load step.
         simulation: the loop that found it: positions, displacements, field, reaction, ...
         newton, pcg: iterations of all load steps, [world].
+        stabilise: what the springs of `stabilise=` carried at the end of each load step; None without.
     """
 
     state: State
@@ -40,6 +42,7 @@ class StaticResult:
     simulation: Simulation
     newton: np.ndarray
     pcg: np.ndarray
+    stabilise: Springs | None = None
 
     def __repr__(self) -> str:
         count = f"{self.simulation.steps} load step{'s' * (self.simulation.steps != 1)}"
@@ -91,6 +94,7 @@ def solve_static(
     state: State | None = None,
     constraint_tol: float | None = None,
     inversion: str = "refuse",
+    stabilise: bool | float = False,
     outputs: Sequence[Any] = (),
     progress: bool | None = False,
 ) -> StaticResult:
@@ -106,12 +110,18 @@ def solve_static(
         solver: NewtonPCG options; by default with room for slender bodies, max_pcg = 20000.
         constraint_tol, inversion: as of Simulation.
         state: start; by default model.state(). It is copied.
+        stabilise: hold bodies that only contact, or nothing yet, holds: each part of them by a spring per mass of
+            (1 - load) times this many N/m per kg, from the last equilibrium to the next, and none at full load. True:
+            1e-3 E / (density size^2) of the stiffest body and the model's size. A smaller value moves a body further in
+            a load step and closes wider gaps, a larger one lets it lag. `StaticResult.stabilise` tells what the
+            springs carried.
         outputs: writers (PNGWriter, USDWriter, VTUWriter, ...), which get each load step as a state; what they say of
             time is the part of the load, 0 to 1, and pictures are labelled "load 100 %".
         progress: show a bar on stderr; None: when stderr is a terminal.
 
     Raises:
-        ModelError: a body is not supported, gravity acts on a material without a density, or an option is out of range.
+        ModelError: a body is not supported, gravity or `stabilise` meets a material without a density, or an option is
+            out of range.
         ConvergenceError: a load step was not accepted after all halvings.
         ConstraintError: the same, and it is the constraints that can't be satisfied.
         CapacityError: the device has too little memory.
@@ -119,7 +129,8 @@ def solve_static(
         KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """
     options: dict[str, Any] = {"load_steps": load_steps, "tol": tol, "solver": solver, "state": state}
-    sim = begin_static(model, constraint_tol=constraint_tol, inversion=inversion, **options)
+    options |= {"constraint_tol": constraint_tol, "inversion": inversion, "stabilise": stabilise}
+    sim = begin_static(model, **options)
     return run_static(sim, outputs=outputs, progress=progress)
 
 
@@ -132,6 +143,7 @@ def begin_static(
     state: State | None = None,
     constraint_tol: float | None = None,
     inversion: str = "refuse",
+    stabilise: bool | float = False,
     on_compile: Callable[[int, int, str], None] | None = None,
 ) -> Simulation:
     """The loop of `solve_static` before its first load step; ModelError as there. `on_compile` as of Simulation."""
@@ -139,9 +151,11 @@ def begin_static(
     if isinstance(count, (bool, str)) or not (isinstance(count, (int, np.integer)) and count >= 1):
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number, or 'auto'")
     check_model(model)
-    if np.any(model.terms.dead.gravity_host):
+    if model.terms.dead.pulls:
         require_density(model.bodies, "gravity")
-    check_static_supports(model)
+    springs = spring_stiffness(model, stabilise)
+    if not springs:
+        check_static_supports(model)
     if not isinstance(solver, (NewtonPCG, type(None))):
         raise ModelError(f"solve_static: solver = {solver!r} must be wf.NewtonPCG(...): an equilibrium is to be found")
     options = solver or NewtonPCG(max_pcg=20000, max_newton=50)
@@ -151,16 +165,18 @@ def begin_static(
         options = replace(options, tol=tol)
     start = model.state() if state is None else state.like()
     start.time.zero_()
+    scheme = replace(INTEGRATORS["static"], stabilise=springs)
     return Simulation(
-        model, start, dt=1.0 / count, integrator=INTEGRATORS["static"], solver=options, ledger=False,
+        model, start, dt=1.0 / count, integrator=scheme, solver=options, ledger=False,
         on_failure="raise", constraint_tol=constraint_tol, inversion=inversion, on_compile=on_compile,
     )  # fmt: skip
 
 
 def run_static(sim: Simulation, *, outputs: Sequence[Any] = (), progress: bool | None = False) -> StaticResult:
     """Do the load steps of a simulation made by `begin_static`; see `solve_static`."""
-    sim.run(1.0, outputs=outputs, progress=progress)
+    springs = Springs(sim.integrator.stabilise) if sim.integrator.stabilise else None
+    sim.run(1.0, outputs=[*outputs, *([springs] if springs else [])], progress=progress)
     assert sim.last is not None
     sim._load = sim.time  # what is drawn of it later is at this load
     sim.state.time.zero_()  # what starts from the equilibrium starts at t = 0
-    return StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"])
+    return StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"], springs)

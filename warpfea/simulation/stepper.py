@@ -110,6 +110,7 @@ class Stepper:
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running = self.running
         w.step.max_halvings = self.solver.max_halvings
+        w.step.stabilise = self.integrator.stabilise
         if self.integrator.multistep:
             w.step.previous_h = state.previous_step
             w.step.previous_end = state.previous_end
@@ -120,7 +121,7 @@ class Stepper:
     def start_terms(self, mask: np.ndarray | None = None) -> None:
         """The state of the chosen worlds was set: the terms follow it."""
         following = [term for term in self.terms if type(term).start is not Term.start]
-        if not following:
+        if not following and self.terms.dead.gravity_law is None:
             return
         m, w, state = self.model, self.work, self.state
         flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
@@ -143,7 +144,7 @@ class Stepper:
         fresh = np.zeros((m.worlds, len(columns)))
         fresh[:, 0] = rows.numpy()[0].sum(axis=1)
         fresh[:, 1] = m.strain_energy(self.state)
-        fresh[:, 2] = -np.einsum("bc,s,bsc->b", m.terms.dead.gravity_host, m.lumped_host, u)
+        fresh[:, 2] = -np.einsum("bc,s,bsc->b", m.terms.dead.gravity.numpy(), m.lumped_host, u)
         ledger = self.state.ledger.numpy()
         ledger[mask, :3] = fresh[mask, :3]
         for term in self.terms:
@@ -264,6 +265,7 @@ class Stepper:
         m, w, launch, state = self.model, self.work, self.launch, self.state
         launch(self.kernels.begin_attempt, m.worlds, [w.step, w.newton])
         running = w.step.running
+        self._laws(running)
         args = [
             w.step,
             m.is_position,
@@ -276,7 +278,6 @@ class Stepper:
         launch(self.kernels.predict, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
         if self.predictor:
             self.predictor.begin()
-        self._laws(running)
         self.terms.supports.drive(self.at, running)
         for term in self.terms:
             term.begin(self.at, running)
@@ -312,11 +313,12 @@ class Stepper:
         """Values of the time laws at the end of the attempt."""
         w = self.work
         self.terms.laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
+        self.terms.dead.take_gravity(self.launch, w.law_value, active)
 
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or part of the load (B, laws, 3); the step's own stay."""
         m, w = self.model, self.work
-        kept = [(array, array.numpy().copy()) for array in (w.step.new_time, w.step.ramp, w.law_value)]
+        kept = [(array, array.numpy().copy()) for array in (w.step.new_time, w.step.ramp, w.law_value, w.step.gravity)]
         w.step.new_time.fill_(time)
         w.step.ramp.fill_(time if self.integrator.static else 1.0)
         self._laws(wp.ones(m.worlds, dtype=wp.int32, device=m.device))

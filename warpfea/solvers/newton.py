@@ -321,6 +321,7 @@ class NewtonLoop:
         self._each("refresh", flags)
         self.residual.evaluate(flags, hold=True)
         self.launch(self.kernels.end_refresh, self.model.worlds, [w.newton, flags])
+        self._rarely(self._look_for_inversion)
 
     @labelled("control")
     def _search_on(self) -> None:

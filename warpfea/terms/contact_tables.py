@@ -54,7 +54,10 @@ def hunt_crossley_damping(restitution: float) -> float:
     while excess(low) <= 0.0 and low < 0.5 * top:  # rounding, for e close to 1
         low *= 2.0
     high = top * (1.0 - 1e-15)
-    return float(brentq(excess, low, high, xtol=1e-15)) if excess(low) > 0.0 > excess(high) else 0.0
+    if excess(low) <= 0.0:
+        return 0.0
+    # below e of about 0.02 the root is nearer to 1/e than numbers can be
+    return float(brentq(excess, low, high, xtol=1e-15)) if excess(high) < 0.0 else high
 
 
 @dataclass(eq=False)

@@ -14,6 +14,7 @@ from .term import At, Term, part
 from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
+    from ..base.launch import Launcher
     from ..model.model import Model
 
 __all__ = ["DeadLoads"]
@@ -22,7 +23,8 @@ __all__ = ["DeadLoads"]
 class DeadLoads(Term):
     """Fills work.dead once per attempt.
 
-    Gravity, [world] on the device, belongs to every model; without any load nothing is launched.
+    Gravity, [world] on the device, belongs to every model; without any load nothing is launched. Of gravity with a time
+    law `gravity` follows the law, and `constant`, which the load of a static path scales, is zero.
     """
 
     name = "dead loads"
@@ -32,6 +34,8 @@ class DeadLoads(Term):
         self.kernels = load_kernels(model.dtype)
         self.gravity_host = np.tile(model.gravity, (model.worlds, 1))
         self.gravity = model.array("loads", self.gravity_host, wp.vec3d)
+        self.gravity_law = model.description.gravity
+        self.constant = self.gravity
 
     @classmethod
     def of(cls, model: Model) -> DeadLoads:
@@ -41,7 +45,7 @@ class DeadLoads(Term):
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         return {
-            "gravity": bool(np.any(model.terms.dead.gravity_host)),
+            "gravity": model.terms.dead.pulls,
             "dead loads": bool(model.description.dead_loads),
         }
 
@@ -53,21 +57,38 @@ class DeadLoads(Term):
             slots.append(load.body.slot_offset + load.slots)
             numbers.append(np.full(len(load.slots), index))
             weights.append(load.weights)
+        if self.gravity_law is not None:
+            self.constant = m.array("loads", self.gravity_host, wp.vec3d)
+            self.number = laws.add(self.gravity_law)
+            slots.append(np.arange(m.slots))
+            numbers.append(np.full(m.slots, self.number))
+            weights.append(m.lumped_host)
         slot = np.concatenate(slots) if slots else np.zeros(0, dtype=np.int64)
         order = np.argsort(slot, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
         law = np.concatenate(numbers) if numbers else np.zeros(0)
         weight = np.concatenate(weights) if weights else np.zeros(0)
         explicit = any(b.key.damping == "explicit" for b in m.blocks)  # its force is added to those here
-        self.present = bool(len(slots)) or bool(np.any(self.gravity_host)) or explicit
+        self.present = bool(len(slots)) or self.pulls or explicit
         self.start_of_slot = m.array("loads", start, wp.int32)
         self.law = m.array("loads", law[order] if len(order) else np.zeros(1), wp.int32)
         table = np.repeat(weight[order][:, None], 3, axis=1) if len(order) else np.zeros((1, 3))
         self.weight = m.array("loads", table, m.types.vec3)
         self._defined_by = (slot, law, weight)
 
+    @property
+    def pulls(self) -> bool:
+        """Whether there is gravity, or a law of it."""
+        return self.gravity_law is not None or bool(np.any(self.gravity_host))
+
     def modules(self, at: At) -> Iterable[wp.Module]:
-        return [self.kernels.dead_load.module] * self.present
+        law = [self.kernels.take_gravity.module] * (self.gravity_law is not None)
+        return law + [self.kernels.dead_load.module] * self.present
+
+    def take_gravity(self, launch: Launcher, value: wp.array, active: wp.array) -> None:
+        """Gravity at the end of the attempt, of the values of the time laws."""
+        if self.gravity_law is not None:
+            launch(self.kernels.take_gravity, self.model.worlds, [value, self.number, active, self.gravity])
 
     @part("loads")
     def begin(self, at: At, active: wp.array) -> None:
@@ -75,15 +96,17 @@ class DeadLoads(Term):
         if not self.present:
             return
         m, w = self.model, at.work
-        args = [self.start_of_slot, self.law, self.weight, w.law_value, m.lumped, self.gravity, w.step.ramp, active]
+        args = [self.start_of_slot, self.law, self.weight, w.law_value, m.lumped, self.constant, w.step.ramp, active]
         at.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])
 
     def set_gravity(self, gravity: Any) -> None:
         """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2.
 
         Raises:
-            ModelError: wrong shape, a value that is not finite, or a model built without gravity.
+            ModelError: wrong shape, a value that is not finite, or a model built without gravity or with a law of it.
         """
+        if self.gravity_law is not None:
+            raise ModelError("the model was built with a time law of gravity, which set_gravity can't replace")
         values = np.asarray(gravity, dtype=float)
         shape = (self.model.worlds, 3)
         if values.shape == (3,):

@@ -2,7 +2,8 @@
 
 Sizes are numbers of unknowns, met as closely as the problem allows. The error of the tip is measured against the same
 mesh and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
-The other kinds of measurement are in files of their own: peer.py, growth.py, product.py, cpu.py, scenes.py.
+The other kinds of measurement are in files of their own: peer.py, growth.py, product.py, cpu.py, scenes.py,
+contact.py.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 from ...base.console import quiet_warp
 from ...base.errors import UsageError
 from ...base.writer import check_target
+from .contact import contact
 from .cpu import cpu
 from .growth import growth
 from .measure import TIGHTER, WARM_UP, Row, check_sizes, measure, write
@@ -31,6 +33,7 @@ OPTIONS = {
     "product": {"problem", "unknowns", "dtype", "repeat"},
     "cpu": {"rows", "steps", "limit"},
     "scenes": {"rows", "before"},
+    "contact": {"unknowns", "dtype", "steps", "repeat", "tol"},
 }
 """Options of each kind of measurement, besides those of all."""
 
@@ -47,9 +50,12 @@ def bench(options: argparse.Namespace) -> None:
         if pathlib.Path(options.out).suffix != ".json":
             raise UsageError(f"--out {options.out}: the file name must end in .json")
         check_target(options.out, (".json",))
-    do = {"table": table, "peer": peer, "growth": growth, "product": product, "cpu": cpu, "scenes": scenes}[kind]
+    do = {
+        "table": table, "peer": peer, "growth": growth, "product": product, "cpu": cpu, "scenes": scenes,
+        "contact": contact,
+    }  # fmt: skip
     with quiet_warp():
-        do(options)
+        do[kind](options)
 
 
 def table(options: argparse.Namespace) -> None:
