@@ -36,6 +36,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     f = touch_functions(dtype)
     along, plane, record_of, reach, acts = f.along, f.plane, f.record_of, f.reach, f.acts
     tangent_damping, touch, hold = f.tangent_damping, f.touch, f.hold
+    coefficient = f.coefficient
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
     distance, elastic = shape_functions().distance, law_functions().elastic
@@ -101,13 +102,19 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.speed[world, point] = speed
 
     @wp.kernel(module=module)
-    def settle(con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), at: Attempt):
+    def settle(
+        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3), at: Attempt
+    ):  # fmt: skip
         """Points begin where they are: what follows is at a state, without motion."""
         world, item, q = wp.tid()
-        k = con.collider[facets.contact[item]]
+        c = facets.contact[item]
+        k = con.collider[c]
         x = facets.X[q, item] + along(facets, u, world, q, item)
         point = facets.point + item * facets.points + q
-        at.start[world, point] = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
+        y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
+        at.start[world, point] = y
+        d = distance(con.kind[k], con.size[k], y, -1)
+        at.depth[world, point] = reach(con, his, world, c, point, time[world]) - d[3]
 
     @wp.kernel(module=module)
     def explicit_forces(
@@ -152,7 +159,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         s = plane(n, his.spring[world, rec] + h * v_t)
         gamma_t = tangent_damping(con, world, c, k_t)
         pulled = -k_t * s - gamma_t * v_t
-        cap = con.mu[world, c] * force
+        cap = coefficient(con, his, world, c, rec) * force
         size = wp.length(pulled)
         if size > cap:
             pulled = (cap / size) * pulled
@@ -240,30 +247,32 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.state[world, point] = IDLE
         if share == f64(0.0):
             return
-        if con.dead[c] != 0:
-            if wp.length_sq(at.dead[world, point]) > f64(0.0):
-                work = share * dead_work(con, facets, his, at, world, c, q, item, point, u)
-                at.state[world, point] = PUSHED
-                at.force[world, point] = -share * at.dead[world, point]
-                at.energy[world, point] = wp.vec2d(work, wp.abs(work))
-            return
         inv_h = f64(0.0)
         if clock.still == 0:
             inv_h = f64(1.0) / clock.h[world]
         rec = record_of(con, c, point)
         held = at.held[world, rec]
+        if fresh != 0:
+            held[2] = f64(1.0)
         t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
-        new = hold(con, his, at, world, c, point, t)
-        if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
-            held = new
-            held[0] = wp.min(new[0], his.cap[world, rec])
-            at.held[world, rec] = held
-        at.next[world, rec] = new
+        if con.dead[c] == 0:
+            new = hold(con, his, at, world, c, point, t)
+            if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
+                held = new
+                held[0] = wp.min(new[0], his.cap[world, rec])
+                at.held[world, rec] = held
+            at.next[world, rec] = new
         if t.side == -2:
             at.through[world] = point + 1
             at.state[world, point] = PUSHED
             at.force[world, point] = vec3d()
             at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
+        elif con.dead[c] != 0:
+            if wp.length_sq(at.dead[world, point]) > f64(0.0):
+                work = share * dead_work(con, facets, his, at, world, c, q, item, point, u)
+                at.state[world, point] = PUSHED
+                at.force[world, point] = -share * at.dead[world, point]
+                at.energy[world, point] = wp.vec2d(work, wp.abs(work))
         elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
             rub = friction_potential(con, world, c, t, held, inv_h)
             K = point_stiffness(con, world, c, t, held, inv_h)

@@ -32,6 +32,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     k = touch_functions(dtype)
     touch, hold, pull, acts, Touch = k.touch, k.hold, k.pull, k.acts, k.Touch
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
+    coefficient = k.coefficient
     elastic = law_functions().elastic
     module = kernel_module(f"contact_{dtype}", max_unroll=SMALL)
 
@@ -99,7 +100,8 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             normal = wp.dot(at.dead[world, point], t.n)
             pulled = normal * t.n - at.dead[world, point]
             out.kept = at.dead_spring[world, point]
-            out.slips = wp.where(wp.length(pulled) >= f64(0.999999) * con.mu[world, c] * normal, 1, 0)
+            held[0] = coefficient(con, his, world, c, rec) * normal
+            out.slips = wp.where(wp.length(pulled) >= f64(0.999999) * held[0], 1, 0)
         elif normal > f64(0.0) and law != SMOOTH and held[1] > f64(0.0):
             out.kept = spring_after(con, world, c, t, held, inv_h, pulled)
         out.touch = t
@@ -253,6 +255,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         his.place[world, k] = at.place[world, k]
         his.turn[world, k] = at.turn[world, k]
         if k == 0:
+            his.posed[world] = clock.new_time[world]
             at.elapsed[world] = at.elapsed[world] + clock.h[world]
             potential[world] = potential[world] + term_sums[1, world]
 

@@ -86,6 +86,7 @@ def history_struct():
         cap: wp.array2d(dtype=wp.float64)  # mu F_n of the last step, N over the point's share
         stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's share
         born: wp.array(dtype=wp.float64)  # [world] time that overlaps were stored at
+        posed: wp.array(dtype=wp.float64)  # [world] time that the colliders are at
         place: wp.array2d(dtype=wp.vec3d)  # of colliders
         turn: wp.array2d(dtype=wp.mat33d)
 

@@ -118,13 +118,19 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return out
 
     @wp.func
+    def coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
+        """mu of a contact that slipped in the last step, else mu_static."""
+        live = his.speed[world, rec] > f64(0.0)
+        if live and his.mark[world, rec] >= SLIPS:
+            return con.mu[world, c]
+        return con.mu_static[world, c]
+
+    @wp.func
     def hold(con: Contacts, his: History, at: Attempt, world: int, c: int, point: int, t: Touch) -> vec3d:
         """Cap, k_t and shrinkage of the spring at an iterate."""
         rec = record_of(con, c, point)
-        mu = con.mu_static[world, c]
+        mu = coefficient(con, his, world, c, rec)
         live = his.speed[world, rec] > f64(0.0)
-        if live and his.mark[world, rec] >= SLIPS:
-            mu = con.mu[world, c]
         stiffness = con.scale[world, c] * con.tangent[c]
         shrink = f64(1.0)
         if con.lumped[c] != 0:
@@ -197,6 +203,6 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, tangent_damping=tangent_damping,
-        touch=touch, hold=hold, pull=pull, friction_potential=friction_potential, friction_force=friction_force,
-        point_stiffness=point_stiffness, acts=acts,
+        touch=touch, coefficient=coefficient, hold=hold, pull=pull, friction_potential=friction_potential,
+        friction_force=friction_force, point_stiffness=point_stiffness, acts=acts,
     )  # fmt: skip

@@ -164,7 +164,7 @@ def begin_static(
             raise ModelError(f"solve_static: tol = {tol!r} must lie between 0 and 1")
         options = replace(options, tol=tol)
     start = model.state() if state is None else state.like()
-    start.time.zero_()
+    model.terms.rewind(start)
     scheme = replace(INTEGRATORS["static"], stabilise=springs)
     return Simulation(
         model, start, dt=1.0 / count, integrator=scheme, solver=options, ledger=False,
@@ -178,5 +178,5 @@ def run_static(sim: Simulation, *, outputs: Sequence[Any] = (), progress: bool |
     sim.run(1.0, outputs=[*outputs, *([springs] if springs else [])], progress=progress)
     assert sim.last is not None
     sim._load = sim.time  # what is drawn of it later is at this load
-    sim.state.time.zero_()  # what starts from the equilibrium starts at t = 0
+    sim.model.terms.rewind(sim.state)  # what starts from the equilibrium starts at t = 0
     return StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"], springs)

@@ -109,7 +109,7 @@ class Contact(Term):
         history = history_struct()()
         one = {"place": K, "turn": K}
         for name, var in history_struct().vars.items():
-            shape = () if name == "born" else (one.get(name, P),)
+            shape = () if name in ("born", "posed") else (one.get(name, P),)
             setattr(history, name, at.state.register(f"contact_{name}", var.type.dtype, shape))
         at.scratch[self.name] = {"history": history}
 
@@ -124,23 +124,28 @@ class Contact(Term):
         """
         s, state = at.scratch[self.name], at.state
         history = s["history"]
-        fresh = active.numpy() != 0
+        time = state.time.numpy()
+        # of a state with the history of its time colliders go on from there: a control may have been written since
+        known = history.turn.numpy().any(axis=(1, 2, 3)) & (history.posed.numpy() == time)
+        fresh = (active.numpy() != 0) & ~known
         self._poses(at, active)
         for mine, other in ((history.place, s["attempt"].place), (history.turn, s["attempt"].turn)):
             values = mine.numpy()
             values[fresh] = other.numpy()[fresh]
             mine.assign(values)
         overlap, born = history.overlap.numpy(), history.born.numpy()
-        live = history.speed.numpy() > 0.0
-        new = fresh & ~live.any(axis=1)
+        new = fresh & ~(history.speed.numpy() > 0.0).any(axis=1)
         overlap[new] = 0.0
-        born[new] = state.time.numpy()[new]
+        born[new] = time[new]
+        posed = history.posed.numpy()
+        posed[fresh] = time[fresh]
+        history.posed.assign(posed)
         history.overlap.assign(overlap)
         history.born.assign(born)
         gap, _ = self.at_points(state, history)
         for k, contact in enumerate(self.tables.contacts):
             first, last = self.tables.first[k], self.tables.first[k + 1]
-            depth = np.where(live[:, first:last] | ~new[:, None], 0.0, -gap[:, first:last])
+            depth = np.where(new[:, None], -gap[:, first:last], 0.0)
             worst = float(depth.max())
             if worst <= TOUCHING * self.model.size:
                 continue
@@ -152,8 +157,13 @@ class Contact(Term):
                     f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
                     "overlap='offset', which stores the overlap and lets it decay"
                 )
-            overlap[:, first:last] = np.maximum(depth, 0.0)
+            overlap[new, first:last] = np.maximum(depth[new], 0.0)
         history.overlap.assign(overlap)
+
+    def rewind(self, state: State) -> None:
+        """Stored overlaps keep their age."""
+        if "contact_born" in state.specs:
+            state.contact_born.assign(state.contact_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
     def _where(self, k: int, point: int) -> str:
         """Reference place of a point of a contact."""
@@ -382,6 +392,7 @@ class Contact(Term):
         laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
         shapes: dict[str, tuple[int, ...]] = {
             "born": (B,),
+            "posed": (B,),
             "place": (B, K),
             "turn": (B, K),
             "pick": (B, C),
@@ -405,7 +416,7 @@ class Contact(Term):
         gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
         for group in t.groups:
             dim = (B, group.count, group.data.points)
-            launch(self.kernels.settle, dim, [t.data, group.data, state.displacement, attempt])
+            launch(self.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
             args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
             launch(self.kernels.levels, dim, args)
         launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt, zeros((B,), wp.int32)])

@@ -219,6 +219,9 @@ class Term:
     def start(self, at: At, active: wp.array) -> None:
         """The state of active worlds was set: bring up to it what follows it. Time laws and work.u are at the state."""
 
+    def rewind(self, state: State) -> None:
+        """The time of a state is about to be put to 0: shift what the term has stored of times."""
+
     # in a step, in this order
 
     def begin(self, at: At, active: wp.array) -> None:
