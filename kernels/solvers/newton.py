@@ -44,6 +44,8 @@ RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1
 """Tolerance of the first solve of a step that begins far from its end: what it is solved to is lost."""
+EXCURSIONS = 3
+"""Times in an attempt that full steps may lead deep into an obstacle: the way back may end where it began."""
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
 
@@ -97,6 +99,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if wp.static(walls):
             ctl.refreshed[world] = 0
             ctl.new_walls[world] = 0
+            ctl.excursions[world] = 0
         if ctl.domain_J[world] <= f64(0.0):
             give_up(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
@@ -281,6 +284,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if ctl.leaps[world] == 0:
             ctl.mark[world] = 1
             ctl.best_phi[world] = old_phi
+            if wp.static(walls):
+                ctl.excursions[world] = ctl.excursions[world] + 1
             ctl.best_norm[world] = old_norm
         ctl.mixed[world] = 1
         counts = True
@@ -399,7 +404,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         wishes = wishes and ctl.wish[world] == 0 and ctl.negative[world] == 0
         wishes = wishes and (ctl.tame[world] == 0 or ctl.mixed[world] == 2)
         if wp.static(walls):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
-            wishes = wishes and ctl.refreshed[world] == 0 and ctl.mixed[world] != 2
+            wishes = wishes and ctl.refreshed[world] == 0 and ctl.excursions[world] < EXCURSIONS
         leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or leap:
             take(ctl, world, stands, leap)

@@ -19,6 +19,8 @@ __all__ = ["SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
 """Least approach speed that the default law's damping is made for, m/s."""
+IDLE, LOADED, STIFF = 0, 1, 2
+"""A point has no force; one without a derivative; one with."""
 PICKS = 4
 """Choices of the deepest point in an attempt."""
 
@@ -208,76 +210,100 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             changed[world] = 1
         at.pick[world, c] = best
 
+    @wp.func
+    def dead_work(
+        con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
+        u: wp.array2d(dtype=vec3),
+    ) -> f64:  # fmt: skip
+        """Minus the work of an explicit force on the step so far."""
+        k = con.collider[c]
+        x_n = his.turn[world, k] * at.start[world, point] + his.place[world, k]
+        x = facets.X[q, item] + along(facets, u, world, q, item)
+        return -wp.dot(at.dead[world, point], x - x_n)
+
     @wp.kernel(module=module)
     def forces(
         con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, pool: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        active: wp.array(dtype=wp.int32), fresh: int, at: Attempt,
     ):  # fmt: skip
-        """Forces of facets, stiffness of their points, and rows of the potential.
+        """Forces of points, their stiffness and potential.
 
         `fresh`: an attempt begins. Caps are held while Newton's method solves for them: with held caps the problem has
         a potential, which with those of each iterate is lost where an iterate lies deep in an obstacle.
         """
-        world, item = wp.tid()
+        world, item, q = wp.tid()
         if active[world] == 0:
             return
-        for i in range(facets.conn.shape[0]):
-            pool[world, facets.pool + i * facets.count + item] = vec3()
         c = facets.contact[item]
-        row = facets.row + item
+        point = facets.point + item * facets.points + q
+        share = facets.share[q, item] * acts(con, at, world, c, point)
+        at.state[world, point] = IDLE
+        if share == f64(0.0):
+            return
+        if con.dead[c] != 0:
+            if wp.length_sq(at.dead[world, point]) > f64(0.0):
+                work = share * dead_work(con, facets, his, at, world, c, q, item, point, u)
+                at.state[world, point] = LOADED
+                at.force[world, point] = -share * at.dead[world, point]
+                at.energy[world, point] = wp.vec2d(work, wp.abs(work))
+            return
         inv_h = f64(0.0)
         if clock.still == 0:
             inv_h = f64(1.0) / clock.h[world]
-        held_sum, size_sum = f64(0.0), f64(0.0)
-        touched = wp.int32(0)
+        rec = record_of(con, c, point)
+        held = at.held[world, rec]
+        t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
+        new = hold(con, his, at, world, c, point, t)
+        if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
+            held = new
+            held[0] = wp.min(new[0], his.cap[world, rec])
+            at.held[world, rec] = held
+        at.next[world, rec] = new
+        if t.side == -2:
+            at.through[world] = point + 1
+            at.state[world, point] = LOADED
+            at.force[world, point] = vec3d()
+            at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
+        elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
+            rub = friction_potential(con, world, c, t, held, inv_h)
+            K = point_stiffness(con, world, c, t, held, inv_h)
+            at.state[world, point] = STIFF
+            at.force[world, point] = share * (friction_force(con, world, c, t, held, inv_h) - t.law[0] * t.n)
+            at.energy[world, point] = wp.vec2d(share * (t.law[2] + rub), share * (t.law[3] + wp.abs(rub)))
+            at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),
+                T(share * K[1, 2]), T(share * K[0, 2]), T(share * K[0, 1]))  # fmt: skip
+
+    @wp.kernel(module=module)
+    def gather_points(
+        facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):  # fmt: skip
+        """Forces of facets, and rows of the potential."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        row = facets.row + item
+        first = facets.point + item * facets.points
+        energy = wp.vec2d()
+        touched = wp.int32(IDLE)
         for q in range(facets.points):
-            point = facets.point + item * facets.points + q
-            share = facets.share[q, item] * acts(con, at, world, c, point)
-            at.stiffness[world, point] = sym()
-            if share > f64(0.0):
-                force = vec3d()
-                if con.dead[c] != 0:
-                    k = con.collider[c]
-                    x_n = his.turn[world, k] * at.start[world, point] + his.place[world, k]
-                    x = facets.X[q, item] + along(facets, u, world, q, item)
-                    force = -at.dead[world, point]
-                    work = share * wp.dot(force, x - x_n)
-                    held_sum += work
-                    size_sum += wp.abs(work)
-                    if wp.length_sq(force) > f64(0.0):
-                        touched = wp.int32(1)
-                else:
-                    rec = record_of(con, c, point)
-                    held = at.held[world, rec]
-                    time = clock.new_time[world]
-                    t = touch(con, facets, his, at, world, c, q, item, point, u, time, inv_h, held[2])
-                    new = hold(con, his, at, world, c, point, t)
-                    if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
-                        held = new
-                        held[0] = wp.min(new[0], his.cap[world, rec])
-                        at.held[world, rec] = held
-                    at.next[world, rec] = new
-                    if t.side == -2:
-                        at.through[world] = point + 1
-                        held_sum += f64(wp.inf)
-                    elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
-                        touched = wp.int32(1)
-                        psi = t.law[2]
-                        rub = friction_potential(con, world, c, t, held, inv_h)
-                        held_sum += share * (psi + rub)
-                        size_sum += share * (t.law[3] + wp.abs(rub))
-                        force = friction_force(con, world, c, t, held, inv_h) - t.law[0] * t.n
-                        K = point_stiffness(con, world, c, t, held, inv_h)
-                        at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),
-                            T(share * K[1, 2]), T(share * K[0, 2]), T(share * K[0, 1]))  # fmt: skip
-                for i in range(facets.conn.shape[0]):
-                    e = facets.pool + i * facets.count + item
-                    pool[world, e] = pool[world, e] + facets.shape[q, i, item] * vec3(share * force)
+            state = at.state[world, first + q]
+            touched = wp.max(touched, state)
+            if state != IDLE:
+                energy += at.energy[world, first + q]
+            if state != STIFF:
+                at.stiffness[world, first + q] = sym()
+        for i in range(facets.conn.shape[0]):
+            f = vec3()
+            if touched != IDLE:
+                for q in range(facets.points):
+                    if at.state[world, first + q] != IDLE:
+                        f += facets.shape[q, i, item] * vec3(at.force[world, first + q])
+            pool[world, facets.pool + i * facets.count + item] = f
         at.touched[world, row] = touched
-        rows[0, world, row] = held_sum
-        rows[1, world, row] = held_sum
-        rows[2, world, row] = size_sum
+        rows[0, world, row] = energy[0]
+        rows[1, world, row] = energy[0]
+        rows[2, world, row] = energy[1]
 
     @wp.kernel(module=module)
     def refresh(flags: wp.array(dtype=wp.int32), at: Attempt):
@@ -303,11 +329,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         for i in range(facets.conn.shape[0]):
             pool[world, facets.pool + i * facets.count + item] = vec3()
-        if at.touched[world, facets.row + item] == 0:
+        if at.touched[world, facets.row + item] != STIFF:
             return
         for q in range(facets.points):
-            stiff = at.stiffness[world, facets.point + item * facets.points + q]
-            if stiff[0] + stiff[1] + stiff[2] > T(0.0):
+            point = facets.point + item * facets.points + q
+            if at.state[world, point] == STIFF:
+                stiff = at.stiffness[world, point]
                 d = vec3()
                 for i in range(facets.conn.shape[0]):
                     d += facets.shape[q, i, item] * p[world, facets.conn[i, item]]
@@ -323,7 +350,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         out = sym()
-        if at.touched[world, facets.row + item] != 0:
+        if at.touched[world, facets.row + item] == STIFF:
             for q in range(facets.points):
                 s = facets.shape[q, i, item]
                 out += s * s * at.stiffness[world, facets.point + item * facets.points + q]
@@ -331,5 +358,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module, poses=poses, begin_points=begin_points, settle=settle, explicit_forces=explicit_forces,
-        levels=levels, pick_deepest=pick_deepest, forces=forces, refresh=refresh, product=product, diagonal=diagonal,
+        levels=levels, pick_deepest=pick_deepest, forces=forces,
+        gather_points=gather_points, refresh=refresh, product=product, diagonal=diagonal,
     )  # fmt: skip

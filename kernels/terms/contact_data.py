@@ -106,8 +106,11 @@ def attempt_struct(dtype: str):
         speed: wp.array2d(dtype=wp.float64)  # that the damping takes
         held: wp.array2d(dtype=wp.vec3d)  # cap, k_t, shrinkage of the spring that a line search holds
         next: wp.array2d(dtype=wp.vec3d)  # those of the iterate
-        stiffness: wp.array2d(dtype=sym)  # [world, point] of the point's force
-        touched: wp.array2d(dtype=wp.int32)  # [world, facet row]
+        state: wp.array2d(dtype=wp.int32)  # [world, point] whether it has a force
+        force: wp.array2d(dtype=wp.vec3d)  # that the point adds to the residual, N, where it has one
+        energy: wp.array2d(dtype=wp.vec2d)  # its potential, and the size of what that is made of, J
+        stiffness: wp.array2d(dtype=sym)  # derivative of the force, N/m; 0 without
+        touched: wp.array2d(dtype=wp.int32)  # [world, facet row] largest state of its points
         dead: wp.array2d(dtype=wp.vec3d)  # [world, point] explicit force
         dead_spring: wp.array2d(dtype=wp.vec3d)
         level: wp.array2d(dtype=wp.float64)  # [world, point] depth; with lumped contacts

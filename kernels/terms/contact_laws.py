@@ -117,7 +117,7 @@ def law_functions() -> _types.SimpleNamespace:
     def normal_law(
         law: int, lumped: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
     ) -> vec4d:  # fmt: skip
-        """Normal force, N, its derivative by the depth, N/m, its integral, J, and the size of the integral's parts; g is
+        """Normal force, N, its derivative by the depth, N/m, its integral, J, and the size of its parts; g is
         chi/h or gamma_n/h."""
         if law == DEFAULT:
             return hunt_crossley(lumped, k, g, delta, delta_n)

@@ -195,7 +195,9 @@ class Contact(Term):
         rows = w.rows_of(self)
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], w.u, active, fresh]
-            at.launch(k.forces, (m.worlds, group.count), [*args, s["attempt"], w.pool_force, rows])
+            at.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
+            args = [group.data, active, s["attempt"], w.pool_force, rows]
+            at.launch(k.gather_points, (m.worlds, group.count), args)
 
     def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
         """Choose the point of each lumped contact, at work.u."""
