@@ -19,7 +19,7 @@ __all__ = ["SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
 """Least approach speed that the default law's damping is made for, m/s."""
-IDLE, PUSHED, STIFF = 0, 1, 2
+IDLE, LOADED, STIFF = 0, 1, 2
 """A point has no force; one without a derivative; one with."""
 PICKS = 4
 """Choices of the deepest point in an attempt."""
@@ -264,13 +264,13 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             at.next[world, rec] = new
         if t.side == -2:
             at.through[world] = point + 1
-            at.state[world, point] = PUSHED
+            at.state[world, point] = LOADED
             at.force[world, point] = vec3d()
             at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
         elif con.dead[c] != 0:
             if wp.length_sq(at.dead[world, point]) > f64(0.0):
                 work = share * dead_work(con, facets, his, at, world, c, q, item, point, u)
-                at.state[world, point] = PUSHED
+                at.state[world, point] = LOADED
                 at.force[world, point] = -share * at.dead[world, point]
                 at.energy[world, point] = wp.vec2d(work, wp.abs(work))
         elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
