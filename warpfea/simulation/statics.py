@@ -120,7 +120,7 @@ def solve_static(
         progress: show a bar on stderr; None: when stderr is a terminal.
 
     Raises:
-        ModelError: a body is not supported, gravity or `stabilise` meets a material without a density, or an option is
+        ModelError: a body is not supported, gravity or `stabilise` meets a material without a density, a contact is explicit, or an option is
             out of range.
         ConvergenceError: a load step was not accepted after all halvings.
         ConstraintError: the same, and it is the constraints that can't be satisfied.
@@ -153,6 +153,12 @@ def begin_static(
     check_model(model)
     if model.terms.dead.pulls:
         require_density(model.bodies, "gravity")
+    for contact in model.description.contacts:
+        if contact.treatment == "explicit":
+            raise ModelError(
+                f"contact {contact.name!r}: treatment = 'explicit' takes the force of the last state, which is no "
+                "equilibrium; take 'implicit' for statics"
+            )
     springs = spring_stiffness(model, stabilise)
     if not springs:
         check_static_supports(model)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Contact"]
 
 TOUCHING = 1e-9
-"""Depth at the start, over the model's size, that counts as touch."""
+"""Depth at the start, over the model's size, that counts as touch; roundings of displacements come on top."""
 
 
 class Contact(Term):
@@ -143,21 +143,23 @@ class Contact(Term):
         history.overlap.assign(overlap)
         history.born.assign(born)
         gap, _ = self.at_points(state, history)
+        u = state.displacement.numpy()
+        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
         for k, contact in enumerate(self.tables.contacts):
             first, last = self.tables.first[k], self.tables.first[k + 1]
             depth = np.where(new[:, None], -gap[:, first:last], 0.0)
-            worst = float(depth.max())
-            if worst <= TOUCHING * self.model.size:
+            deep = depth.max(axis=1) > touching
+            if not deep.any():
                 continue
             if contact.overlap == "refuse":
                 world, point = np.unravel_index(int(depth.argmax()), depth.shape)
                 where = self._where(k, int(point))
                 raise ModelError(
-                    f"contact {contact.name!r}: body {contact.body.name!r} begins {worst:.3g} m inside collider "
+                    f"contact {contact.name!r}: body {contact.body.name!r} begins {depth.max():.3g} m inside collider "
                     f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
                     "overlap='offset', which stores the overlap and lets it decay"
                 )
-            overlap[new, first:last] = np.maximum(depth[new], 0.0)
+            overlap[deep, first:last] = np.maximum(depth[deep], 0.0)
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
