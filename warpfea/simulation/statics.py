@@ -120,8 +120,8 @@ def solve_static(
         progress: show a bar on stderr; None: when stderr is a terminal.
 
     Raises:
-        ModelError: a body is not supported, gravity or `stabilise` meets a material without a density, a contact is explicit, or an option is
-            out of range.
+        ModelError: a body is not supported, gravity or `stabilise` meets a material without a density, a contact is
+            explicit, or an option is out of range.
         ConvergenceError: a load step was not accepted after all halvings.
         ConstraintError: the same, and it is the constraints that can't be satisfied.
         CapacityError: the device has too little memory.
