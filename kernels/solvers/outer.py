@@ -54,6 +54,9 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             ctl.leaps[world] = 0
             ctl.refreshed[world] = 1 - ctl.new_walls[world]
             ctl.new_walls[world] = 0
+            if ctl.unsettled[world] != 0:
+                ctl.excess[world] = wp.max(ctl.excess[world], f64(2.0))
+                ctl.unsettled[world] = 0
             settle(ctl, world)
         else:
             record(ctl, world)
