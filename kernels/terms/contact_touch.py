@@ -32,6 +32,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         """A point at an iterate; forces are of the whole region."""
 
         n: vec3d  # outward normal of the shape
+        m: vec3d  # normal of the plane that friction acts in
         depth: f64
         side: wp.int32
         law: wp.vec4d  # normal force, its derivative, its potential, the size of the potential's parts
@@ -86,9 +87,13 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def touch(
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
-        u: wp.array2d(dtype=vec3), time: f64, inv_h: f64, shrink: f64,
+        u: wp.array2d(dtype=vec3), time: f64, inv_h: f64, shrink: f64, normal: vec3d,
     ) -> Touch:  # fmt: skip
-        """A point at displacements u."""
+        """A point at displacements u.
+
+        `normal`: that friction holds, or zero. With one that turned as the point moves over a curved shape friction
+        would not be the derivative of its potential.
+        """
         out = Touch()
         k = con.collider[c]
         rec = record_of(con, c, point)
@@ -108,13 +113,16 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         out.law = normal_law(con.law[c], con.lumped[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
                              at.depth[world, point])  # fmt: skip
         motion = turn * (out.y - at.start[world, point])
-        out.slip = plane(out.n, motion)
+        out.m = normal
+        if wp.length_sq(normal) == f64(0.0):
+            out.m = out.n
+        out.slip = plane(out.m, motion)
         spring = vec3d()
         if live:
             spring = his.spring[world, rec]
             if con.law[c] != PAPER:
                 spring = shrink * (turn * spring)
-        out.q = plane(out.n, spring + motion)
+        out.q = plane(out.m, spring + motion)
         return out
 
     @wp.func
@@ -178,7 +186,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         """Derivative of the force that a point adds to the residual, positive: without that of the normal."""
         K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
         if held[0] > f64(0.0):
-            P = wp.identity(n=3, dtype=f64) - wp.outer(t.n, t.n)
+            P = wp.identity(n=3, dtype=f64) - wp.outer(t.m, t.m)
             if con.law[c] == SMOOTH:
                 part = smooth_friction(t.slip, inv_h, con.speed_eps[c], held[0])[1]
                 v = inv_h * t.slip
