@@ -257,20 +257,16 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             inv_h = f64(1.0) / clock.h[world]
         rec = record_of(con, c, point)
         held = at.held[world, rec]
-        normal = at.normal[world, rec]
         if fresh != 0:
             held[2] = f64(1.0)
-            normal = vec3d()
-        t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2], normal)
+        t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
         if con.dead[c] == 0:
             new = hold(con, his, at, world, c, point, t)
             if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
                 held = new
                 held[0] = wp.min(new[0], his.cap[world, rec])
                 at.held[world, rec] = held
-                at.normal[world, rec] = t.n
             at.next[world, rec] = new
-            at.next_normal[world, rec] = t.n
         if t.side == -2:
             at.through[world] = point + 1
             at.state[world, point] = LOADED
@@ -355,7 +351,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def refresh(flags: wp.array(dtype=wp.int32), at: Attempt):
-        """Take the planes of friction and the caps of the iterate, or a part of the way to these."""
+        """Take the caps of the iterate, or a part of the way to them."""
         world, point = wp.tid()
         if flags[world] != 0:
             new = at.next[world, point]
@@ -364,7 +360,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                 new[0] = wp.max(at.held[world, point][0] + at.omega[world] * r, f64(0.0))
             at.lag[world, point] = r
             at.held[world, point] = new
-            at.normal[world, point] = at.next_normal[world, point]
 
     @wp.func
     def times(k: sym, p: vec3) -> vec3:

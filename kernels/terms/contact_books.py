@@ -87,8 +87,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         if clock.still == 0:
             inv_h = f64(1.0) / clock.h[world]
         held = at.held[world, rec]
-        normal_held = at.normal[world, rec]
-        t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2], normal_held)
+        t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
         change = t.depth - at.depth[world, point]
         spring = elastic(con.lumped[c], con.scale[world, c] * con.normal[c], t.depth)
         normal = t.law[0]
@@ -100,7 +99,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             base = his.spring[world, rec]
             if law != PAPER:
                 base = at.turn[world, kc] * base
-            base = plane(t.m, base)
+            base = plane(t.n, base)
         if con.dead[c] != 0:
             normal = wp.dot(at.dead[world, point], t.n)
             pulled = normal * t.n - at.dead[world, point]
@@ -287,7 +286,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             gap[world, point] = f64(1.0e30)
             return
         c = facets.contact[item]
-        t = touch(con, facets, his, at, world, c, q, item, point, u, time[world], f64(0.0), f64(1.0), vec3d())
+        t = touch(con, facets, his, at, world, c, q, item, point, u, time[world], f64(0.0), f64(1.0))
         held = hold(con, his, at, world, c, point, t)
         gap[world, point] = -t.depth
         share = facets.share[q, item] * acts(con, at, world, c, point)

@@ -32,7 +32,6 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         """A point at an iterate; forces are of the whole region."""
 
         n: vec3d  # outward normal of the shape
-        m: vec3d  # normal of the plane that friction acts in
         depth: f64
         side: wp.int32
         law: wp.vec4d  # normal force, its derivative, its potential, the size of the potential's parts
@@ -87,13 +86,9 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def touch(
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
-        u: wp.array2d(dtype=vec3), time: f64, inv_h: f64, shrink: f64, normal: vec3d,
+        u: wp.array2d(dtype=vec3), time: f64, inv_h: f64, shrink: f64,
     ) -> Touch:  # fmt: skip
-        """A point at displacements u.
-
-        `normal`: that friction holds, or zero. With one that turned as the point moves over a curved shape friction
-        would not be the derivative of its potential.
-        """
+        """A point at displacements u."""
         out = Touch()
         k = con.collider[c]
         rec = record_of(con, c, point)
@@ -113,16 +108,13 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         out.law = normal_law(con.law[c], con.lumped[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
                              at.depth[world, point])  # fmt: skip
         motion = turn * (out.y - at.start[world, point])
-        out.m = normal
-        if wp.length_sq(normal) == f64(0.0):
-            out.m = out.n
-        out.slip = plane(out.m, motion)
+        out.slip = plane(out.n, motion)
         spring = vec3d()
         if live:
             spring = his.spring[world, rec]
             if con.law[c] != PAPER:
                 spring = shrink * (turn * spring)
-        out.q = plane(out.m, spring + motion)
+        out.q = plane(out.n, spring + motion)
         return out
 
     @wp.func
@@ -186,7 +178,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         """Derivative of the force that a point adds to the residual, positive: without that of the normal."""
         K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
         if held[0] > f64(0.0):
-            P = wp.identity(n=3, dtype=f64) - wp.outer(t.m, t.m)
+            P = wp.identity(n=3, dtype=f64) - wp.outer(t.n, t.n)
             if con.law[c] == SMOOTH:
                 part = smooth_friction(t.slip, inv_h, con.speed_eps[c], held[0])[1]
                 v = inv_h * t.slip
