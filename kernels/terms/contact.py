@@ -38,7 +38,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
     f = touch_functions(dtype)
     along, plane, record_of, reach, acts = f.along, f.plane, f.record_of, f.reach, f.acts
-    tangent_damping, touch, hold = f.tangent_damping, f.touch, f.hold
+    tangent_damping, touch, in_plane, hold = f.tangent_damping, f.touch, f.in_plane, f.hold
     coefficient = f.coefficient
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
@@ -263,9 +263,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         if con.dead[c] == 0:
             new = hold(con, his, at, world, c, point, t)
             if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
+                at.plane[world, rec] = t.n
                 held = new
                 held[0] = wp.min(new[0], his.cap[world, rec])
                 at.held[world, rec] = held
+            at.next_plane[world, rec] = t.n
+            t = in_plane(t, at.plane[world, rec])
             at.next[world, rec] = new
         if t.side == -2:
             at.through[world] = point + 1
@@ -360,6 +363,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                 new[0] = wp.max(at.held[world, point][0] + at.omega[world] * r, f64(0.0))
             at.lag[world, point] = r
             at.held[world, point] = new
+            at.plane[world, point] = at.next_plane[world, point]
 
     @wp.func
     def times(k: sym, p: vec3) -> vec3:

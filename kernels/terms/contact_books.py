@@ -30,7 +30,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     Contacts, Facets = contact_struct(), facet_struct(dtype)
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
     k = touch_functions(dtype)
-    touch, hold, pull, acts, Touch = k.touch, k.hold, k.pull, k.acts, k.Touch
+    touch, in_plane, hold, pull, acts, Touch = k.touch, k.in_plane, k.hold, k.pull, k.acts, k.Touch
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
     coefficient = k.coefficient
     elastic = law_functions().elastic
@@ -88,6 +88,8 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             inv_h = f64(1.0) / clock.h[world]
         held = at.held[world, rec]
         t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
+        if con.dead[c] == 0:
+            t = in_plane(t, at.plane[world, rec])
         change = t.depth - at.depth[world, point]
         spring = elastic(con.lumped[c], con.scale[world, c] * con.normal[c], t.depth)
         normal = t.law[0]
@@ -99,7 +101,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             base = his.spring[world, rec]
             if law != PAPER:
                 base = at.turn[world, kc] * base
-            base = plane(t.n, base)
+            base = plane(t.m, base)
         if con.dead[c] != 0:
             normal = wp.dot(at.dead[world, point], t.n)
             pulled = normal * t.n - at.dead[world, point]

@@ -107,6 +107,8 @@ def attempt_struct(dtype: str):
         speed: wp.array2d(dtype=wp.float64)  # that the damping takes
         held: wp.array2d(dtype=wp.vec3d)  # cap, k_t, shrinkage of the spring that a line search holds
         next: wp.array2d(dtype=wp.vec3d)  # those of the iterate
+        plane: wp.array2d(dtype=wp.vec3d)  # normal of the plane of friction that is held
+        next_plane: wp.array2d(dtype=wp.vec3d)  # that of the iterate
         lag: wp.array2d(dtype=wp.float64)  # change of the cap that the iterate asked for when it was last taken anew
         lag_sums: wp.array2d(dtype=wp.vec4d)  # [world, lane]
         omega: wp.array(dtype=wp.float64)  # [world] part of that change that was made

@@ -35,7 +35,10 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         depth: f64
         side: wp.int32
         law: wp.vec4d  # normal force, its derivative, its potential, the size of the potential's parts
-        slip: vec3d  # tangential motion in the step
+        m: vec3d  # normal of the plane of friction
+        motion: vec3d  # in the step, relative to the collider
+        whole: vec3d  # motion and spring
+        slip: vec3d  # motion in that plane
         q: vec3d  # spring: tangential slip since it was anchored
         y: vec3d  # place in the collider's frame
 
@@ -84,6 +87,16 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(con.mass[c] * stiffness)
 
     @wp.func
+    def in_plane(t: Touch, m: vec3d) -> Touch:
+        """The point with friction in the plane of a normal m, which is held with the caps: on a curved shape the force
+        would not be the derivative of its potential if the plane turned with the iterate."""
+        out = t
+        out.m = m
+        out.slip = plane(m, t.motion)
+        out.q = plane(m, t.whole)
+        return out
+
+    @wp.func
     def touch(
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
         u: wp.array2d(dtype=vec3), time: f64, inv_h: f64, shrink: f64,
@@ -108,14 +121,14 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         out.law = normal_law(con.law[c], con.lumped[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
                              at.depth[world, point])  # fmt: skip
         motion = turn * (out.y - at.start[world, point])
-        out.slip = plane(out.n, motion)
+        out.motion = motion
         spring = vec3d()
         if live:
             spring = his.spring[world, rec]
             if con.law[c] != PAPER:
                 spring = shrink * (turn * spring)
-        out.q = plane(out.n, spring + motion)
-        return out
+        out.whole = spring + motion
+        return in_plane(out, out.n)
 
     @wp.func
     def coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
@@ -178,7 +191,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         """Derivative of the force that a point adds to the residual, positive: without that of the normal."""
         K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
         if held[0] > f64(0.0):
-            P = wp.identity(n=3, dtype=f64) - wp.outer(t.n, t.n)
+            P = wp.identity(n=3, dtype=f64) - wp.outer(t.m, t.m)
             if con.law[c] == SMOOTH:
                 part = smooth_friction(t.slip, inv_h, con.speed_eps[c], held[0])[1]
                 v = inv_h * t.slip
@@ -203,6 +216,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, tangent_damping=tangent_damping,
-        touch=touch, coefficient=coefficient, hold=hold, pull=pull, friction_potential=friction_potential,
-        friction_force=friction_force, point_stiffness=point_stiffness, acts=acts,
+        touch=touch, in_plane=in_plane, coefficient=coefficient, hold=hold, pull=pull,
+        friction_potential=friction_potential, friction_force=friction_force, point_stiffness=point_stiffness,
+        acts=acts,
     )  # fmt: skip

@@ -339,6 +339,17 @@ class Contact(Term):
             "smaller dt, a larger stiffness= of the contact, or a thicker shape"
         )
 
+    def remark(self, at: At, world: int) -> str:
+        touched = at.scratch[self.name]["attempt"].touched.numpy()[world] > 0
+        t = self.tables
+        pairs = [
+            f"{contact.name!r} with collider {contact.collider.name!r}"
+            for k, contact in enumerate(t.contacts)
+            if touched[t.row_start[k] : t.row_start[k + 1]].any()
+        ]
+        more = f" and {len(pairs) - 3} more" if len(pairs) > 3 else ""
+        return f"; in touch: contact {', '.join(pairs[:3])}{more}" if pairs else ""
+
     def parameters(self) -> dict[str, Callable[[Any], None]]:
         return contact_parameters(self.tables)
 

@@ -328,6 +328,10 @@ class Term:
         """Why the last attempt at a step of a world was refused, where the term knows, with the error that says so."""
         return None
 
+    def remark(self, at: At, world: int) -> str:
+        """What else is to be told of the last attempt at a refused step of a world; "" for nothing."""
+        return ""
+
     def parameters(self) -> Mapping[str, Callable[[Any], None]]:
         """What `Model.set_parameter` may set, by name, with what sets it: a scalar or (worlds,), checked there."""
         return {}
