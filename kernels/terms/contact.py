@@ -333,11 +333,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             if at.state[world, point] == STIFF:
                 r = at.next[world, point][0] - at.held[world, point][0]
                 old = at.lag[world, point]
-                out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, old * old)
+                new = at.next[world, point][0]
+                out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, new * new)
         at.lag_sums[world, lane] = out
 
     @wp.kernel(module=module)
-    def relax(flags: wp.array(dtype=wp.int32), at: Attempt, unsettled: wp.array(dtype=wp.int32)):
+    def relax(flags: wp.array(dtype=wp.int32), tol: f64, at: Attempt, unsettled: wp.array(dtype=wp.int32)):
         """Part of r that caps change by: all of it, unless it does not shrink; then Aitken's (Irons and Tuck 1969)."""
         world = wp.tid()
         if flags[world] == 0:
@@ -346,10 +347,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         for lane in range(LAG_LANES):
             total += at.lag_sums[world, lane]
         omega = f64(1.0)
-        if at.lags[world] > 0 and total[2] > f64(SHRINKS) * f64(SHRINKS) * total[3] and total[1] > f64(0.0):
+        slow = total[2] > f64(SHRINKS) * f64(SHRINKS) * at.lag_size[world] and total[1] > f64(0.0)
+        if at.lags[world] > 0 and slow and total[2] > tol * tol * total[3]:
             omega = wp.clamp(-at.omega[world] * total[0] / total[1], f64(0.05), f64(2.0))
             unsettled[world] = 1
         at.omega[world] = omega
+        at.lag_size[world] = total[2]
         at.lags[world] = at.lags[world] + 1
 
     @wp.kernel(module=module)

@@ -85,7 +85,7 @@ class Contact(Term):
         shapes: dict[str, tuple[int, ...]] = {
             "place": (B, K), "turn": (B, K), "level": lumped, "dead": explicit, "dead_spring": explicit,
             "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "omega": (B,), "lags": (B,),
-            "lag_sums": (B, LAG_LANES), "touched": (B, R),
+            "lag_size": (B,), "lag_sums": (B, LAG_LANES), "touched": (B, R),
             "rows": (len(RECORD), B, R),
             "total": (B, C, len(RECORD)),
         }  # fmt: skip
@@ -227,7 +227,7 @@ class Contact(Term):
     def refresh(self, at: At, flags: wp.array) -> None:
         k, m, attempt = self.kernels, self.model, at.scratch[self.name]["attempt"]
         at.launch(k.partial_lag, (m.worlds, LAG_LANES), [flags, attempt])
-        at.launch(k.relax, m.worlds, [flags, attempt, at.work.newton.unsettled])
+        at.launch(k.relax, m.worlds, [flags, at.work.newton.tol, attempt, at.work.newton.unsettled])
         at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
         self._pick(at, flags, fresh=0)
 
