@@ -15,12 +15,14 @@ from .contact_laws import SMOOTH, law_functions
 from .contact_shapes import shape_functions
 from .contact_touch import SLIPS, touch_functions
 
-__all__ = ["SPEED_FLOOR", "contact_kernels"]
+__all__ = ["LAG_LANES", "MOST_TURN", "SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
 """Least approach speed that the default law's damping is made for, m/s."""
 IDLE, LOADED, STIFF = 0, 1, 2
 """A point has no force; one without a derivative; one with."""
+MOST_TURN = 1.0
+"""Angle by which a collider in touch may turn in a step, rad: of one that turns further a step knows nothing."""
 LAG_LANES = 128
 SHRINKS = 0.35
 """Caps that come closer by less than this per change are relaxed."""
@@ -47,9 +49,9 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def poses(
-        con: Contacts, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), at: Attempt
+        con: Contacts, his: History, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), at: Attempt
     ):  # fmt: skip
-        """Places of the colliders at the end of the attempt."""
+        """Places of the colliders at the end of the attempt, and their motion in it."""
         world, k = wp.tid()
         if active[world] == 0:
             return
@@ -69,6 +71,10 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             at.lags[world] = 0
         at.place[world, k] = place
         at.turn[world, k] = turn
+        at.shift[world, k] = place - his.place[world, k]
+        if con.spin[k] >= 0:
+            at.angle[world, k] = value[world, con.spin[k]][0]
+            at.spin[world, k] = turn * wp.transpose(his.turn[world, k]) - wp.identity(n=3, dtype=f64)
 
     @wp.kernel(module=module)
     def begin_points(
@@ -98,7 +104,10 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             side = his.mark[world, rec] % SLIPS - 1
         d = distance(con.kind[k], con.size[k], y, side)
         at.start[world, point] = y
-        at.depth[world, point] = reach(con, his, world, c, point, clock.time[world]) - d[3]
+        begins = reach(con, his, world, c, point, clock.time[world], his.grown[world, k])
+        at.origin[world, point] = along(facets, u_n, world, q, item)
+        at.reach[world, point] = begins
+        at.depth[world, point] = begins - d[3]
         speed = wp.max(his.speed[world, rec], f64(SPEED_FLOOR))
         if clock.still == 0:
             moved = (at.turn[world, k] * y + at.place[world, k] - x) / clock.h[world]
@@ -118,8 +127,10 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         point = facets.point + item * facets.points + q
         y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
         at.start[world, point] = y
+        at.origin[world, point] = along(facets, u, world, q, item)
         d = distance(con.kind[k], con.size[k], y, -1)
-        at.depth[world, point] = reach(con, his, world, c, point, time[world]) - d[3]
+        at.reach[world, point] = reach(con, his, world, c, point, time[world], con.grow[world, k])
+        at.depth[world, point] = at.reach[world, point] - d[3]
 
     @wp.kernel(module=module)
     def explicit_forces(
@@ -191,7 +202,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             x = facets.X[q, item] + along(facets, u, world, q, item)
             y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
             d = distance(con.kind[k], con.size[k], y, -1)
-            depth = reach(con, his, world, c, point, time[world]) - d[3]
+            depth = reach(con, his, world, c, point, time[world], con.grow[world, k]) - d[3]
             if con.dead[c] != 0:  # its force is that of the last state
                 depth = at.depth[world, point]
         at.level[world, point] = depth
@@ -270,8 +281,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             at.next_plane[world, rec] = t.n
             t = in_plane(t, at.plane[world, rec])
             at.next[world, rec] = new
-        if t.side == -2:
-            at.through[world] = point + 1
+        turned = f64(0.0)
+        if con.spin[con.collider[c]] >= 0:
+            turned = wp.abs(at.angle[world, con.collider[c]] - his.angle[world, con.collider[c]])
+        near = t.depth > f64(0.0) or at.depth[world, point] > f64(0.0)
+        if t.side == -2 or (near and turned > f64(MOST_TURN)):
+            at.through[world] = wp.where(t.side == -2, point + 1, -point - 1)
             at.state[world, point] = LOADED
             at.force[world, point] = vec3d()
             at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))

@@ -119,13 +119,16 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         out.loss = (normal - spring[0]) * change
         out.slid = t.slip - (out.kept - base)
         out.rubbed = wp.dot(pulled - held[1] * out.kept, out.kept - base) + wp.dot(pulled, out.slid)
-        back = his.turn[world, kc] * (t.y - at.start[world, point])  # relative motion, in the old frame
         chord = spring[0] * change + held[1] * wp.dot(out.kept, out.kept - base) - gain
-        turned = -wp.dot(out.force, back) - (normal * change + wp.dot(pulled, t.slip))
         x = at.turn[world, kc] * t.y + at.place[world, kc]
-        out.given = wp.dot(out.force, x - (his.turn[world, kc] * t.y + his.place[world, kc]))
+        carried = at.shift[world, kc]  # of the collider's material at the point, by its last velocity
+        if con.spin[kc] >= 0:
+            angle = at.angle[world, kc] - his.angle[world, kc]
+            carried = angle * wp.cross(con.axis[kc], x - con.anchor[kc])
+        out.given = wp.dot(out.force, carried)
         # the ledger takes for the integrator what the work of the force leaves; it is to find these formulas
         x_n = his.turn[world, kc] * at.start[world, point] + his.place[world, kc]
+        turned = -wp.dot(out.force, x - x_n - carried) - (normal * change + wp.dot(pulled, t.slip))
         out.left = chord + turned + wp.dot(out.force, x - x_n) + gain + out.loss + out.rubbed
         return out
 
@@ -251,7 +254,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def keep_poses(
-        clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
+        con: Contacts, clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32), his: History, at: Attempt,
     ):  # fmt: skip
         """Keep the places of the colliders; the energy of contact counts in the bound of the next first iterate."""
@@ -260,6 +263,8 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         his.place[world, k] = at.place[world, k]
         his.turn[world, k] = at.turn[world, k]
+        his.angle[world, k] = at.angle[world, k]
+        his.grown[world, k] = con.grow[world, k]
         if k == 0:
             his.posed[world] = clock.new_time[world]
             at.elapsed[world] = at.elapsed[world] + clock.h[world]

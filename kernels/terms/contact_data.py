@@ -79,6 +79,8 @@ def history_struct():
 
     @wp.struct
     class History:
+        angle: wp.array2d(dtype=wp.float64)  # [world, collider] of its rotation, rad
+        grown: wp.array2d(dtype=wp.float64)  # `Contacts.grow` of the last step
         spring: wp.array2d(dtype=wp.vec3d)  # stretch of the friction spring, in the collider's frame (paper: world), m
         speed: wp.array2d(dtype=wp.float64)  # largest approach speed since birth, m/s; 0: not in contact
         mark: wp.array2d(dtype=wp.int32)  # side of the shape + 1, and 16 where it slips
@@ -102,6 +104,11 @@ def attempt_struct(dtype: str):
     class Attempt:
         place: wp.array2d(dtype=wp.vec3d)  # [world, collider] at the end of the step
         turn: wp.array2d(dtype=wp.mat33d)
+        shift: wp.array2d(dtype=wp.vec3d)  # [world, collider] by which they move in the attempt
+        spin: wp.array2d(dtype=wp.mat33d)  # R - 1, R by which they turn
+        angle: wp.array2d(dtype=wp.float64)  # of their rotation, rad
+        origin: wp.array2d(dtype=wp.vec3d)  # [world, point] displacement as the attempt began
+        reach: wp.array2d(dtype=wp.float64)  # gap at which contact begins, then
         start: wp.array2d(dtype=wp.vec3d)  # [world, point] where it was as the step began, in the collider's frame
         depth: wp.array2d(dtype=wp.float64)  # then
         speed: wp.array2d(dtype=wp.float64)  # that the damping takes

@@ -8,7 +8,7 @@ import warp as wp
 from ..common.types import precision
 from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
-from .contact_shapes import shape_functions
+from .contact_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
 
 __all__ = ["SLIPS", "touch_functions"]
 
@@ -69,10 +69,34 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
 
     @wp.func
-    def reach(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
-        """Distance from the shape at which contact begins."""
-        grown = con.offset[c] + con.grow[world, con.collider[c]]
-        return grown - allowance(con, his, world, c, point, time)
+    def reach(con: Contacts, his: History, world: int, c: int, point: int, time: f64, grown: f64) -> f64:
+        """Distance from the shape, which has grown so much, at which contact begins."""
+        return con.offset[c] + grown - allowance(con, his, world, c, point, time)
+
+    @wp.func
+    def deepening(con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, depth: f64) -> wp.vec2d:
+        """Change of the depth by a motion, from the motion itself where that is exact, and 1; else 0.
+
+        As a difference of places it would be rounded as those are, by more than a stiff body at rest moves.
+        """
+        kind = con.kind[k]
+        if kind == HALF_SPACE:
+            return wp.vec2d(-local[2], f64(1.0))
+        if kind == SPHERE:
+            return wp.vec2d(
+                -wp.dot(y + start, local) / wp.max(wp.length(y) + wp.length(start), f64(1.0e-300)), f64(1.0)
+            )
+        if kind == BOX and side >= 0:
+            h = con.size[k]
+            axis = side / 2
+            sign = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
+            flat = wp.abs(h[axis] - sign * start[axis] - depth) <= f64(1.0e-12) * h[axis]
+            for j in range(3):
+                if j != axis and wp.abs(start[j]) > h[j]:
+                    flat = False
+            if flat:
+                return wp.vec2d(-sign * local[axis], f64(1.0))
+        return wp.vec2d()
 
     @wp.func
     def rate_of(con: Contacts, at: Attempt, world: int, c: int, point: int, inv_h: f64) -> f64:
@@ -115,12 +139,20 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         out.side = sweep(con.kind[k], con.size[k], at.start[world, point], out.y, side)
         d = distance(con.kind[k], con.size[k], out.y, out.side)
         out.n = turn * vec3d(d[0], d[1], d[2])
-        out.depth = reach(con, his, world, c, point, time) - d[3]
+        shape = con.grow[world, k]
+        out.depth = reach(con, his, world, c, point, time, shape) - d[3]
+        motion = along(facets, u, world, q, item) - at.origin[world, point] - at.shift[world, k]
+        if con.spin[k] >= 0:
+            motion -= at.spin[world, k] * (his.turn[world, k] * at.start[world, point])
+        before = at.depth[world, point]
+        change = deepening(con, k, out.side, at.start[world, point], out.y, wp.transpose(turn) * motion,
+                           before - at.reach[world, point])  # fmt: skip
+        if change[1] != f64(0.0):
+            out.depth = before + change[0] + (reach(con, his, world, c, point, time, shape) - at.reach[world, point])
         rate = rate_of(con, at, world, c, point, inv_h)
         k_n = con.scale[world, c] * con.normal[c]
         out.law = normal_law(con.law[c], con.lumped[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
-                             at.depth[world, point])  # fmt: skip
-        motion = turn * (out.y - at.start[world, point])
+                             before)  # fmt: skip
         out.motion = motion
         spring = vec3d()
         if live:
