@@ -85,7 +85,8 @@ class Contact(Term):
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
         shapes: dict[str, tuple[int, ...]] = {
             "through": (B,), "elapsed": (B,), "omega": (B,), "lags": (B,), "lag_size": (B,), "lag_sums": (B, LAG_LANES),
-            "pick": (B, C), "picks": (B, C), "total": (B, C, len(RECORD)), "touched": (B, R), "rows": (len(RECORD), B, R),
+            "pick": (B, C), "picks": (B, C), "total": (B, C, len(RECORD)), "touched": (B, R),
+            "rows": (len(RECORD), B, R),
         }  # fmt: skip
         shapes |= dict.fromkeys(("place", "turn", "shift", "spin", "angle"), (B, K))
         shapes |= {} if t.lumped else {"level": (1, 1)}
