@@ -77,6 +77,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if active[world] != 0:
             ctl.min_J[world] = f64(1.0e30)
             ctl.domain_J[world] = f64(1.0e30)
+            if wp.static(walls):
+                ctl.touching[world] = 0
 
     @wp.func
     def start(ctl: Control, world: int):

@@ -30,20 +30,22 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         """Flag the worlds where what terms hold is to be taken anew: Newton's method has solved for it so far."""
         world = wp.tid()
         flags[world] = 0
-        if ctl.active[world] != 0:
+        if ctl.active[world] != 0 and ctl.touching[world] == 0:
+            settle(ctl, world)  # nothing is held
+        elif ctl.active[world] != 0:
             last = ctl.iterations[world] + 1 >= ctl.max_iterations
             # within rounding it may not fall below that
             rounding = ctl.floor_excess[world] <= f64(NEAR)
             if ctl.relative[world] <= f64(REFRESH) or rounding or last:
                 flags[world] = 1
+            else:
+                record(ctl, world)
 
     @wp.kernel(module=module)
     def end_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
         """Judge the iterate, in the flagged worlds with what terms hold now."""
         world = wp.tid()
-        if ctl.active[world] == 0:
-            return
-        if flags[world] != 0:
+        if ctl.active[world] != 0 and flags[world] != 0:
             before = ctl.norm[world]
             measure(ctl, world)
             if ctl.fixed_forcing == 0 and ctl.norm[world] > f64(AHEAD) * before:
@@ -62,8 +64,6 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
                 record(ctl, world)
                 if ctl.iterations[world] >= ctl.max_iterations:
                     give_up(ctl, world, FAIL_ITERATIONS)
-        else:
-            record(ctl, world)
 
     @wp.kernel(module=module)
     def judge_outer(ctl: Control, running: wp.array(dtype=wp.int32), tol: f64, limit: int):

@@ -308,7 +308,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def gather_points(
         facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        rows: wp.array3d(dtype=f64), touching: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """Forces of facets, and rows of the potential."""
         world, item = wp.tid()
@@ -333,6 +333,8 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                         f += facets.shape[q, i, item] * vec3(at.force[world, first + q])
             pool[world, facets.pool + i * facets.count + item] = f
         at.touched[world, row] = touched
+        if touched != IDLE:
+            wp.atomic_max(touching, world, 1)
         rows[0, world, row] = energy[0]
         rows[1, world, row] = energy[0]
         rows[2, world, row] = energy[1]

@@ -319,6 +319,11 @@ class NewtonLoop:
         """Let terms take anew what they hold, where Newton's method has solved for it."""
         w, flags = self.work, self.work.newton.stepped
         self.launch(self.kernels.begin_refresh, self.model.worlds, [w.newton, flags])
+        self._any(flags, self.searching)
+        wp.capture_if(self.searching, self._judge_anew)
+
+    def _judge_anew(self) -> None:
+        w, flags = self.work, self.work.newton.stepped
         self._each("refresh", flags)
         self.residual.evaluate(flags, hold=True)
         self.launch(self.kernels.end_refresh, self.model.worlds, [w.newton, flags])

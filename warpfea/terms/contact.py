@@ -118,6 +118,8 @@ class Contact(Term):
         scratch = {
             "attempt": attempt,
             "clock": clock,
+            # of Newton's method; Jacobi's iteration has no use for it
+            "touching": work.newton.touching,
             "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
@@ -223,7 +225,7 @@ class Contact(Term):
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], w.u, active, fresh]
             at.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
-            args = [group.data, active, s["attempt"], w.pool_force, rows]
+            args = [group.data, active, s["attempt"], w.pool_force, rows, s["touching"]]
             at.launch(k.gather_points, (m.worlds, group.count), args)
 
     def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
