@@ -107,6 +107,7 @@ def control_struct():
         best_phi: wp.array(dtype=wp.float64)
         best_norm: wp.array(dtype=wp.float64)
         refreshed: wp.array(dtype=wp.int32)  # terms have taken anew what they hold; with walls
+        unsettled: wp.array(dtype=wp.int32)  # they have taken but a part of it: the residual is not that of the iterate
         excursions: wp.array(dtype=wp.int32)  # leaps into obstacles of this attempt
         new_walls: wp.array(dtype=wp.int32)  # what they hold now may set in suddenly again
         # where rounding stops the residual

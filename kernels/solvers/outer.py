@@ -10,6 +10,9 @@ from .judging import NEAR, judging_functions
 
 __all__ = ["outer_kernels"]
 
+AHEAD = 3.0
+LOOSE = 0.03
+"""Tolerance of linear solves where the residual grows by more than a factor, AHEAD, once what is held is taken anew."""
 REFRESH = 0.1
 """Relative residual from which on what terms hold (caps of friction) is taken anew at each iterate."""
 
@@ -41,12 +44,19 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         if ctl.active[world] == 0:
             return
         if flags[world] != 0:
+            before = ctl.norm[world]
             measure(ctl, world)
+            if ctl.fixed_forcing == 0 and ctl.norm[world] > f64(AHEAD) * before:
+                # what was held is the larger error: a solve need not go far below what it will leave
+                ctl.forcing[world] = wp.max(ctl.forcing[world], f64(LOOSE))
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
             ctl.phi_magnitude[world] = magnitude(ctl, world)
             ctl.leaps[world] = 0
             ctl.refreshed[world] = 1 - ctl.new_walls[world]
             ctl.new_walls[world] = 0
+            if ctl.unsettled[world] != 0:
+                ctl.excess[world] = wp.max(ctl.excess[world], f64(2.0))
+                ctl.unsettled[world] = 0
             settle(ctl, world)
         else:
             record(ctl, world)

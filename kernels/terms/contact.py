@@ -19,8 +19,11 @@ __all__ = ["SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
 """Least approach speed that the default law's damping is made for, m/s."""
-IDLE, PUSHED, STIFF = 0, 1, 2
+IDLE, LOADED, STIFF = 0, 1, 2
 """A point has no force; one without a derivative; one with."""
+LAG_LANES = 128
+SHRINKS = 0.35
+"""Caps that come closer by less than this per change are relaxed."""
 PICKS = 4
 """Choices of the deepest point in an attempt."""
 
@@ -61,6 +64,8 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             turn = R * turn
         if con.path[k] >= 0:
             place += value[world, con.path[k]]
+        if k == 0:
+            at.lags[world] = 0
         at.place[world, k] = place
         at.turn[world, k] = turn
 
@@ -243,7 +248,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         if con.dead[c] != 0:
             if wp.length_sq(at.dead[world, point]) > f64(0.0):
                 work = share * dead_work(con, facets, his, at, world, c, q, item, point, u)
-                at.state[world, point] = PUSHED
+                at.state[world, point] = LOADED
                 at.force[world, point] = -share * at.dead[world, point]
                 at.energy[world, point] = wp.vec2d(work, wp.abs(work))
             return
@@ -261,7 +266,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.next[world, rec] = new
         if t.side == -2:
             at.through[world] = point + 1
-            at.state[world, point] = PUSHED
+            at.state[world, point] = LOADED
             at.force[world, point] = vec3d()
             at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
         elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
@@ -306,11 +311,46 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         rows[2, world, row] = energy[1]
 
     @wp.kernel(module=module)
+    def partial_lag(flags: wp.array(dtype=wp.int32), at: Attempt):
+        """Sums of what caps of the iterate differ from those held by, r, and of how that has changed, by lanes."""
+        world, lane = wp.tid()
+        if flags[world] == 0:
+            return
+        out = wp.vec4d()
+        for point in range(lane, at.lag.shape[1], LAG_LANES):
+            if at.state[world, point] == STIFF:
+                r = at.next[world, point][0] - at.held[world, point][0]
+                old = at.lag[world, point]
+                out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, old * old)
+        at.lag_sums[world, lane] = out
+
+    @wp.kernel(module=module)
+    def relax(flags: wp.array(dtype=wp.int32), at: Attempt, unsettled: wp.array(dtype=wp.int32)):
+        """Part of r that caps change by: all of it, unless it does not shrink; then Aitken's (Irons and Tuck 1969)."""
+        world = wp.tid()
+        if flags[world] == 0:
+            return
+        total = wp.vec4d()
+        for lane in range(LAG_LANES):
+            total += at.lag_sums[world, lane]
+        omega = f64(1.0)
+        if at.lags[world] > 0 and total[2] > f64(SHRINKS) * f64(SHRINKS) * total[3] and total[1] > f64(0.0):
+            omega = wp.clamp(-at.omega[world] * total[0] / total[1], f64(0.05), f64(2.0))
+            unsettled[world] = 1
+        at.omega[world] = omega
+        at.lags[world] = at.lags[world] + 1
+
+    @wp.kernel(module=module)
     def refresh(flags: wp.array(dtype=wp.int32), at: Attempt):
-        """Take the caps of the iterate."""
+        """Take the caps of the iterate, or a part of the way to them."""
         world, point = wp.tid()
         if flags[world] != 0:
-            at.held[world, point] = at.next[world, point]
+            new = at.next[world, point]
+            r = new[0] - at.held[world, point][0]
+            if at.omega[world] != f64(1.0):
+                new[0] = wp.max(at.held[world, point][0] + at.omega[world] * r, f64(0.0))
+            at.lag[world, point] = r
+            at.held[world, point] = new
 
     @wp.func
     def times(k: sym, p: vec3) -> vec3:
@@ -358,6 +398,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module, poses=poses, begin_points=begin_points, settle=settle, explicit_forces=explicit_forces,
-        levels=levels, pick_deepest=pick_deepest, forces=forces,
-        gather_points=gather_points, refresh=refresh, product=product, diagonal=diagonal,
+        levels=levels, pick_deepest=pick_deepest, forces=forces, gather_points=gather_points, partial_lag=partial_lag,
+        relax=relax, refresh=refresh, product=product, diagonal=diagonal,
     )  # fmt: skip

@@ -54,14 +54,18 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def spring_after(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64, pulled: vec3d) -> vec3d:
-        """The friction spring that stays: cut to the force where it slips, Eq. (83) of the paper's law."""
+        """The friction spring that stays where the force is cut to the cap; by Eq. (83) of the paper's law."""
         w = pull(con, world, c, t, held, inv_h)
         if wp.length(vec3d(w[0], w[1], w[2])) <= held[0]:
             return t.q
-        kept = (f64(1.0) / held[1]) * pulled
-        if con.law[c] == PAPER:  # this turns the spring where gamma_t v is above the cap
-            kept -= ((w[3] - held[1]) / held[1]) * t.slip
-        return kept
+        trial = vec3d(w[0], w[1], w[2])
+        if con.law[c] != PAPER:  # spring and damper slip together: it stretches no further than the point has moved
+            if held[0] <= f64(0.0):
+                return vec3d()
+            size = wp.length(trial)
+            return t.q - ((size - held[0]) / (w[3] * size)) * trial
+        # this turns the spring where gamma_t v is above the cap
+        return (f64(1.0) / held[1]) * pulled - ((w[3] - held[1]) / held[1]) * t.slip
 
     @wp.func
     def outcome(

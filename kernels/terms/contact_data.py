@@ -106,6 +106,10 @@ def attempt_struct(dtype: str):
         speed: wp.array2d(dtype=wp.float64)  # that the damping takes
         held: wp.array2d(dtype=wp.vec3d)  # cap, k_t, shrinkage of the spring that a line search holds
         next: wp.array2d(dtype=wp.vec3d)  # those of the iterate
+        lag: wp.array2d(dtype=wp.float64)  # change of the cap that the iterate asked for when it was last taken anew
+        lag_sums: wp.array2d(dtype=wp.vec4d)  # [world, lane]
+        omega: wp.array(dtype=wp.float64)  # [world] part of that change that was made
+        lags: wp.array(dtype=wp.int32)  # [world] changes in this attempt
         state: wp.array2d(dtype=wp.int32)  # [world, point] whether it has a force
         force: wp.array2d(dtype=wp.vec3d)  # that the point adds to the residual, N, where it has one
         energy: wp.array2d(dtype=wp.vec2d)  # its potential, and the size of what that is made of, J

@@ -11,7 +11,7 @@ import warp as wp
 from ..base.errors import ModelError, PenetrationError
 from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
-from ..kernels.terms.contact import contact_kernels
+from ..kernels.terms.contact import LAG_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
@@ -84,7 +84,8 @@ class Contact(Term):
         lumped, explicit = (B, P) if t.lumped else (1, 1), (B, P) if t.explicit else (1, 1)
         shapes: dict[str, tuple[int, ...]] = {
             "place": (B, K), "turn": (B, K), "level": lumped, "dead": explicit, "dead_spring": explicit,
-            "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "touched": (B, R),
+            "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "omega": (B,), "lags": (B,),
+            "lag_sums": (B, LAG_LANES), "touched": (B, R),
             "rows": (len(RECORD), B, R),
             "total": (B, C, len(RECORD)),
         }  # fmt: skip
@@ -212,8 +213,10 @@ class Contact(Term):
 
     @part("contact")
     def refresh(self, at: At, flags: wp.array) -> None:
-        dim = (self.model.worlds, self.tables.points)
-        at.launch(self.kernels.refresh, dim, [flags, at.scratch[self.name]["attempt"]])
+        k, m, attempt = self.kernels, self.model, at.scratch[self.name]["attempt"]
+        at.launch(k.partial_lag, (m.worlds, LAG_LANES), [flags, attempt])
+        at.launch(k.relax, m.worlds, [flags, attempt, at.work.newton.unsettled])
+        at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
         self._pick(at, flags, fresh=0)
 
     @part("contact")
@@ -386,6 +389,7 @@ class Contact(Term):
             "turn": (B, K),
             "pick": (B, C),
             "picks": (B, C),
+            "lags": (B,),
         }
         if history is None:
             history = history_struct()()
@@ -394,7 +398,7 @@ class Contact(Term):
                 array = getattr(state, f"contact_{name}") if known else zeros(shapes.get(name, (B, P)), var.type.dtype)
                 setattr(history, name, array)
         attempt = attempt_struct(m.dtype)()
-        for name in ("place", "turn", "pick", "picks", "start", "depth", "speed", "level"):
+        for name in ("place", "turn", "pick", "picks", "lags", "start", "depth", "speed", "level"):
             dtype = attempt_struct(m.dtype).vars[name].type.dtype
             setattr(attempt, name, zeros(shapes.get(name, (B, P)), dtype))
         attempt.speed.fill_(1.0)

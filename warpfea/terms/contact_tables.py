@@ -116,11 +116,6 @@ class ContactTables:
         """Whether a contact has the force of the last state."""
         return any(contact.treatment == "explicit" for contact in self.contacts)
 
-    @property
-    def friction(self) -> bool:
-        """Whether a contact was described with friction."""
-        return any(contact.mu_static > 0.0 for contact in self.contacts)
-
     def _clamped(self) -> np.ndarray:
         """(slots,) whether a slot is held in all directions by supports that never move."""
         held = np.zeros((self.model.slots, 3))
