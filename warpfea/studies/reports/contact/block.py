@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import warpfea as wf
+
 from ....simulation.statics import begin_static, run_static
 from ....terms.contact import Contact
 
