@@ -39,7 +39,8 @@ def rebound_case(
     model = b.finalize(device=device)
     dt = hertz_time() / steps
     sim = wf.Simulation(model, dt=dt, integrator=integrator)
-    newton, halvings, resting = [], 0, 0
+    newton: list[int] = []
+    halvings = resting = 0
     began = clock.perf_counter()
     while resting < 5 and len(newton) < 3 * steps:
         report = sim.step()
@@ -55,6 +56,7 @@ def rebound_case(
     first, last = over[0], over[-1]
     start = np.interp(low, force[first - 1 : first + 1], time[first - 1 : first + 1])
     end = time[last] + dt * (force[last] - low) / (force[last] - force[last + 1])
+    assert model.mass is not None
     mass = float(model.mass)
     energies = sim.energies()
     return {
