@@ -10,7 +10,7 @@ from warpfea.studies.reports.contact.block import hertz_case
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "contact_hertz_cpu.json"
 MOST_NEWTON = 50
-"""Iterations of a load step; with friction while it is pressed in."""
+"""Iterations of a load step in which points begin to slip."""
 
 
 @pytest.fixture(scope="module")
