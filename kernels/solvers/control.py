@@ -36,7 +36,7 @@ FAIL_INVERTED = 10
 FAIL_WORK = 11
 
 COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
-FLOOR_ROWS = 5  # -g.p, inertia.(v - v~), strain energy, largest |p| and |u|
+FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|
 LANES = 32
 TERM_ROWS = 3
 """Rows summed per world of what terms store: the potential with what is held in a line search (multipliers, caps), the
@@ -135,5 +135,6 @@ def control_struct():
         components: wp.int32
         nonpotential: wp.int32
         equilibrium: wp.int32  # statics
+        length: wp.float64  # of the model, m
 
     return NewtonControl

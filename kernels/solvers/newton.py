@@ -40,6 +40,10 @@ ROUNDS = 3
 """Linear solves of an attempt, over its iterations: those that lead to no step are bounded too."""
 LOST = 10
 """Such solves that may lead to no step before the tangent is followed as it is; with 0 soft solids take longer."""
+SWIFT = 1.0e4
+FINE = 1.0e-10
+"""Roundings of a body's speed below which an error of velocities is none, in double precision: what it vibrates by may
+be nothing beside its flight."""
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1
@@ -213,20 +217,25 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             for lane in range(LANES):
                 whole += ctl.floor_sums[0, world, part, lane]
                 largest = wp.max(largest, ctl.floor_sums[4, world, part, lane])
+        if wp.static(walls):  # a gap is rounded as places are
+            largest = wp.max(largest, ctl.length)
         worst = f64(0.0)
         for part in range(component_of_part.shape[0]):
             if ctl.quiet[world, component_of_part[part]] == 0:
-                work, kinetic, strain, step = f64(0.0), f64(0.0), f64(0.0), f64(0.0)
+                work, kinetic, strain, step, speed = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
                 for lane in range(LANES):
                     work += ctl.floor_sums[0, world, part, lane]
                     kinetic += ctl.floor_sums[1, world, part, lane]
                     strain += ctl.floor_sums[2, world, part, lane]
                     step = wp.max(step, ctl.floor_sums[3, world, part, lane])
+                    speed = wp.max(speed, ctl.floor_sums[5, world, part, lane])
                 eta = f64(1.0e30)
                 if ctl.negative[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
                     eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
                     if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * largest:
                         eta = dq * step / wp.max(largest, f64(1.0e-300))
+                    if eta > ctl.floor_bound and step <= f64(SWIFT) * ctl.eps * speed and ctl.eps < f64(FINE):
+                        eta = step / speed
                 worst = wp.max(worst, eta)
         ctl.eta[world] = worst
         if worst <= ctl.floor_bound:

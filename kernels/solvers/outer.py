@@ -5,7 +5,7 @@ import types as _types
 import warp as wp
 
 from ..common.traits import Traits
-from .control import FAIL_CONSTRAINT, control_struct
+from .control import FAIL_CONSTRAINT, FAIL_ITERATIONS, control_struct
 from .judging import NEAR, judging_functions
 
 __all__ = ["outer_kernels"]
@@ -23,7 +23,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     Control = control_struct()
     judging = judging_functions(traits)
     objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
-    measure, settle, record = judging.measure, judging.settle, judging.record
+    measure, settle, record, give_up = judging.measure, judging.settle, judging.record, judging.give_up
 
     @wp.kernel(module=module)
     def begin_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
@@ -54,10 +54,14 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             ctl.leaps[world] = 0
             ctl.refreshed[world] = 1 - ctl.new_walls[world]
             ctl.new_walls[world] = 0
-            if ctl.unsettled[world] != 0:
-                ctl.excess[world] = wp.max(ctl.excess[world], f64(2.0))
-                ctl.unsettled[world] = 0
-            settle(ctl, world)
+            part = ctl.unsettled[world] != 0
+            ctl.unsettled[world] = 0
+            if not part:
+                settle(ctl, world)
+            else:
+                record(ctl, world)
+                if ctl.iterations[world] >= ctl.max_iterations:
+                    give_up(ctl, world, FAIL_ITERATIONS)
         else:
             record(ctl, world)
 

@@ -112,7 +112,8 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         world, part, lane = wp.tid()
         if ctl.strict[world] != 2:
             return
-        work, kinetic, strain, step, size = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
+        work, kinetic, strain = f64(0.0), f64(0.0), f64(0.0)
+        step, size, speed = f64(0.0), f64(0.0), f64(0.0)
         for k in range(start[part] + lane, start[part + 1], LANES):
             i = k
             if slot.shape[0] > 0:
@@ -122,6 +123,7 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
             kinetic += f64(wp.dot(inertia[world, i], v[world, i] - v_tilde[world, i]))
             step = wp.max(step, f64(wp.max(wp.abs(p))))
             size = wp.max(size, f64(wp.max(wp.abs(u[world, i]))))
+            speed = wp.max(speed, f64(wp.max(wp.abs(v[world, i]))))
         for k in range(element_start[part] + lane, element_start[part + 1], LANES):
             e = k
             if element.shape[0] > 0:
@@ -132,6 +134,7 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         sums[2, world, part, lane] = strain
         sums[3, world, part, lane] = step
         sums[4, world, part, lane] = size
+        sums[5, world, part, lane] = speed
 
     @wp.kernel(module=module)
     def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):

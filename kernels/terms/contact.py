@@ -15,12 +15,14 @@ from .contact_laws import SMOOTH, law_functions
 from .contact_shapes import shape_functions
 from .contact_touch import SLIPS, touch_functions
 
-__all__ = ["SPEED_FLOOR", "contact_kernels"]
+__all__ = ["LAG_LANES", "MOST_TURN", "SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
 """Least approach speed that the default law's damping is made for, m/s."""
 IDLE, LOADED, STIFF = 0, 1, 2
 """A point has no force; one without a derivative; one with."""
+MOST_TURN = 1.0
+"""Angle by which a collider in touch may turn in a step, rad: of one that turns further a step knows nothing."""
 LAG_LANES = 128
 SHRINKS = 0.35
 """Caps that come closer by less than this per change are relaxed."""
@@ -38,7 +40,8 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
     f = touch_functions(dtype)
     along, plane, record_of, reach, acts = f.along, f.plane, f.record_of, f.reach, f.acts
-    tangent_damping, touch, hold = f.tangent_damping, f.touch, f.hold
+    tangent_damping, touch, in_plane, hold = f.tangent_damping, f.touch, f.in_plane, f.hold
+    coefficient = f.coefficient
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
     distance, elastic = shape_functions().distance, law_functions().elastic
@@ -46,9 +49,9 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def poses(
-        con: Contacts, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), at: Attempt
+        con: Contacts, his: History, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), at: Attempt
     ):  # fmt: skip
-        """Places of the colliders at the end of the attempt."""
+        """Places of the colliders at the end of the attempt, and their motion in it."""
         world, k = wp.tid()
         if active[world] == 0:
             return
@@ -68,6 +71,10 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             at.lags[world] = 0
         at.place[world, k] = place
         at.turn[world, k] = turn
+        at.shift[world, k] = place - his.place[world, k]
+        if con.spin[k] >= 0:
+            at.angle[world, k] = value[world, con.spin[k]][0]
+            at.spin[world, k] = turn * wp.transpose(his.turn[world, k]) - wp.identity(n=3, dtype=f64)
 
     @wp.kernel(module=module)
     def begin_points(
@@ -97,7 +104,10 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             side = his.mark[world, rec] % SLIPS - 1
         d = distance(con.kind[k], con.size[k], y, side)
         at.start[world, point] = y
-        at.depth[world, point] = reach(con, his, world, c, point, clock.time[world]) - d[3]
+        begins = reach(con, his, world, c, point, clock.time[world], his.grown[world, k])
+        at.origin[world, point] = along(facets, u_n, world, q, item)
+        at.reach[world, point] = begins
+        at.depth[world, point] = begins - d[3]
         speed = wp.max(his.speed[world, rec], f64(SPEED_FLOOR))
         if clock.still == 0:
             moved = (at.turn[world, k] * y + at.place[world, k] - x) / clock.h[world]
@@ -106,13 +116,21 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.speed[world, point] = speed
 
     @wp.kernel(module=module)
-    def settle(con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), at: Attempt):
+    def settle(
+        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3), at: Attempt
+    ):  # fmt: skip
         """Points begin where they are: what follows is at a state, without motion."""
         world, item, q = wp.tid()
-        k = con.collider[facets.contact[item]]
+        c = facets.contact[item]
+        k = con.collider[c]
         x = facets.X[q, item] + along(facets, u, world, q, item)
         point = facets.point + item * facets.points + q
-        at.start[world, point] = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
+        y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
+        at.start[world, point] = y
+        at.origin[world, point] = along(facets, u, world, q, item)
+        d = distance(con.kind[k], con.size[k], y, -1)
+        at.reach[world, point] = reach(con, his, world, c, point, time[world], con.grow[world, k])
+        at.depth[world, point] = at.reach[world, point] - d[3]
 
     @wp.kernel(module=module)
     def explicit_forces(
@@ -157,7 +175,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         s = plane(n, his.spring[world, rec] + h * v_t)
         gamma_t = tangent_damping(con, world, c, k_t)
         pulled = -k_t * s - gamma_t * v_t
-        cap = con.mu[world, c] * force
+        cap = coefficient(con, his, world, c, rec) * force
         size = wp.length(pulled)
         if size > cap:
             pulled = (cap / size) * pulled
@@ -184,7 +202,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             x = facets.X[q, item] + along(facets, u, world, q, item)
             y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
             d = distance(con.kind[k], con.size[k], y, -1)
-            depth = reach(con, his, world, c, point, time[world]) - d[3]
+            depth = reach(con, his, world, c, point, time[world], con.grow[world, k]) - d[3]
             if con.dead[c] != 0:  # its force is that of the last state
                 depth = at.depth[world, point]
         at.level[world, point] = depth
@@ -245,30 +263,39 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.state[world, point] = IDLE
         if share == f64(0.0):
             return
-        if con.dead[c] != 0:
-            if wp.length_sq(at.dead[world, point]) > f64(0.0):
-                work = share * dead_work(con, facets, his, at, world, c, q, item, point, u)
-                at.state[world, point] = LOADED
-                at.force[world, point] = -share * at.dead[world, point]
-                at.energy[world, point] = wp.vec2d(work, wp.abs(work))
-            return
         inv_h = f64(0.0)
         if clock.still == 0:
             inv_h = f64(1.0) / clock.h[world]
         rec = record_of(con, c, point)
         held = at.held[world, rec]
+        if fresh != 0:
+            held[2] = f64(1.0)
         t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
-        new = hold(con, his, at, world, c, point, t)
-        if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
-            held = new
-            held[0] = wp.min(new[0], his.cap[world, rec])
-            at.held[world, rec] = held
-        at.next[world, rec] = new
-        if t.side == -2:
-            at.through[world] = point + 1
+        if con.dead[c] == 0:
+            new = hold(con, his, at, world, c, point, t)
+            if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
+                at.plane[world, rec] = t.n
+                held = new
+                held[0] = wp.min(new[0], his.cap[world, rec])
+                at.held[world, rec] = held
+            at.next_plane[world, rec] = t.n
+            t = in_plane(t, at.plane[world, rec])
+            at.next[world, rec] = new
+        turned = f64(0.0)
+        if con.spin[con.collider[c]] >= 0:
+            turned = wp.abs(at.angle[world, con.collider[c]] - his.angle[world, con.collider[c]])
+        near = t.depth > f64(0.0) or at.depth[world, point] > f64(0.0)
+        if t.side == -2 or (near and turned > f64(MOST_TURN)):
+            at.through[world] = wp.where(t.side == -2, point + 1, -point - 1)
             at.state[world, point] = LOADED
             at.force[world, point] = vec3d()
             at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
+        elif con.dead[c] != 0:
+            if wp.length_sq(at.dead[world, point]) > f64(0.0):
+                work = share * dead_work(con, facets, his, at, world, c, q, item, point, u)
+                at.state[world, point] = LOADED
+                at.force[world, point] = -share * at.dead[world, point]
+                at.energy[world, point] = wp.vec2d(work, wp.abs(work))
         elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
             rub = friction_potential(con, world, c, t, held, inv_h)
             K = point_stiffness(con, world, c, t, held, inv_h)
@@ -321,11 +348,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             if at.state[world, point] == STIFF:
                 r = at.next[world, point][0] - at.held[world, point][0]
                 old = at.lag[world, point]
-                out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, old * old)
+                new = at.next[world, point][0]
+                out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, new * new)
         at.lag_sums[world, lane] = out
 
     @wp.kernel(module=module)
-    def relax(flags: wp.array(dtype=wp.int32), at: Attempt, unsettled: wp.array(dtype=wp.int32)):
+    def relax(flags: wp.array(dtype=wp.int32), tol: f64, at: Attempt, unsettled: wp.array(dtype=wp.int32)):
         """Part of r that caps change by: all of it, unless it does not shrink; then Aitken's (Irons and Tuck 1969)."""
         world = wp.tid()
         if flags[world] == 0:
@@ -334,10 +362,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         for lane in range(LAG_LANES):
             total += at.lag_sums[world, lane]
         omega = f64(1.0)
-        if at.lags[world] > 0 and total[2] > f64(SHRINKS) * f64(SHRINKS) * total[3] and total[1] > f64(0.0):
+        slow = total[2] > f64(SHRINKS) * f64(SHRINKS) * at.lag_size[world] and total[1] > f64(0.0)
+        if at.lags[world] > 0 and slow and total[2] > tol * tol * total[3]:
             omega = wp.clamp(-at.omega[world] * total[0] / total[1], f64(0.05), f64(2.0))
             unsettled[world] = 1
         at.omega[world] = omega
+        at.lag_size[world] = total[2]
         at.lags[world] = at.lags[world] + 1
 
     @wp.kernel(module=module)
@@ -351,6 +381,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                 new[0] = wp.max(at.held[world, point][0] + at.omega[world] * r, f64(0.0))
             at.lag[world, point] = r
             at.held[world, point] = new
+            at.plane[world, point] = at.next_plane[world, point]
 
     @wp.func
     def times(k: sym, p: vec3) -> vec3:

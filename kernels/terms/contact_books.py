@@ -30,8 +30,9 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     Contacts, Facets = contact_struct(), facet_struct(dtype)
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
     k = touch_functions(dtype)
-    touch, hold, pull, acts, Touch = k.touch, k.hold, k.pull, k.acts, k.Touch
+    touch, in_plane, hold, pull, acts, Touch = k.touch, k.in_plane, k.hold, k.pull, k.acts, k.Touch
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
+    coefficient = k.coefficient
     elastic = law_functions().elastic
     module = kernel_module(f"contact_{dtype}", max_unroll=SMALL)
 
@@ -87,6 +88,8 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             inv_h = f64(1.0) / clock.h[world]
         held = at.held[world, rec]
         t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
+        if con.dead[c] == 0:
+            t = in_plane(t, at.plane[world, rec])
         change = t.depth - at.depth[world, point]
         spring = elastic(con.lumped[c], con.scale[world, c] * con.normal[c], t.depth)
         normal = t.law[0]
@@ -98,12 +101,13 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             base = his.spring[world, rec]
             if law != PAPER:
                 base = at.turn[world, kc] * base
-            base = plane(t.n, base)
+            base = plane(t.m, base)
         if con.dead[c] != 0:
             normal = wp.dot(at.dead[world, point], t.n)
             pulled = normal * t.n - at.dead[world, point]
             out.kept = at.dead_spring[world, point]
-            out.slips = wp.where(wp.length(pulled) >= f64(0.999999) * con.mu[world, c] * normal, 1, 0)
+            held[0] = coefficient(con, his, world, c, rec) * normal
+            out.slips = wp.where(wp.length(pulled) >= f64(0.999999) * held[0], 1, 0)
         elif normal > f64(0.0) and law != SMOOTH and held[1] > f64(0.0):
             out.kept = spring_after(con, world, c, t, held, inv_h, pulled)
         out.touch = t
@@ -115,13 +119,16 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         out.loss = (normal - spring[0]) * change
         out.slid = t.slip - (out.kept - base)
         out.rubbed = wp.dot(pulled - held[1] * out.kept, out.kept - base) + wp.dot(pulled, out.slid)
-        back = his.turn[world, kc] * (t.y - at.start[world, point])  # relative motion, in the old frame
         chord = spring[0] * change + held[1] * wp.dot(out.kept, out.kept - base) - gain
-        turned = -wp.dot(out.force, back) - (normal * change + wp.dot(pulled, t.slip))
         x = at.turn[world, kc] * t.y + at.place[world, kc]
-        out.given = wp.dot(out.force, x - (his.turn[world, kc] * t.y + his.place[world, kc]))
+        carried = at.shift[world, kc]  # of the collider's material at the point, by its last velocity
+        if con.spin[kc] >= 0:
+            angle = at.angle[world, kc] - his.angle[world, kc]
+            carried = angle * wp.cross(con.axis[kc], x - con.anchor[kc])
+        out.given = wp.dot(out.force, carried)
         # the ledger takes for the integrator what the work of the force leaves; it is to find these formulas
         x_n = his.turn[world, kc] * at.start[world, point] + his.place[world, kc]
+        turned = -wp.dot(out.force, x - x_n - carried) - (normal * change + wp.dot(pulled, t.slip))
         out.left = chord + turned + wp.dot(out.force, x - x_n) + gain + out.loss + out.rubbed
         return out
 
@@ -247,7 +254,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def keep_poses(
-        clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
+        con: Contacts, clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32), his: History, at: Attempt,
     ):  # fmt: skip
         """Keep the places of the colliders; the energy of contact counts in the bound of the next first iterate."""
@@ -256,7 +263,10 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         his.place[world, k] = at.place[world, k]
         his.turn[world, k] = at.turn[world, k]
+        his.angle[world, k] = at.angle[world, k]
+        his.grown[world, k] = con.grow[world, k]
         if k == 0:
+            his.posed[world] = clock.new_time[world]
             at.elapsed[world] = at.elapsed[world] + clock.h[world]
             potential[world] = potential[world] + term_sums[1, world]
 

@@ -79,6 +79,8 @@ def history_struct():
 
     @wp.struct
     class History:
+        angle: wp.array2d(dtype=wp.float64)  # [world, collider] of its rotation, rad
+        grown: wp.array2d(dtype=wp.float64)  # `Contacts.grow` of the last step
         spring: wp.array2d(dtype=wp.vec3d)  # stretch of the friction spring, in the collider's frame (paper: world), m
         speed: wp.array2d(dtype=wp.float64)  # largest approach speed since birth, m/s; 0: not in contact
         mark: wp.array2d(dtype=wp.int32)  # side of the shape + 1, and 16 where it slips
@@ -86,6 +88,7 @@ def history_struct():
         cap: wp.array2d(dtype=wp.float64)  # mu F_n of the last step, N over the point's share
         stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's share
         born: wp.array(dtype=wp.float64)  # [world] time that overlaps were stored at
+        posed: wp.array(dtype=wp.float64)  # [world] time that the colliders are at
         place: wp.array2d(dtype=wp.vec3d)  # of colliders
         turn: wp.array2d(dtype=wp.mat33d)
 
@@ -101,14 +104,22 @@ def attempt_struct(dtype: str):
     class Attempt:
         place: wp.array2d(dtype=wp.vec3d)  # [world, collider] at the end of the step
         turn: wp.array2d(dtype=wp.mat33d)
+        shift: wp.array2d(dtype=wp.vec3d)  # [world, collider] by which they move in the attempt
+        spin: wp.array2d(dtype=wp.mat33d)  # R - 1, R by which they turn
+        angle: wp.array2d(dtype=wp.float64)  # of their rotation, rad
+        origin: wp.array2d(dtype=wp.vec3d)  # [world, point] displacement as the attempt began
+        reach: wp.array2d(dtype=wp.float64)  # gap at which contact begins, then
         start: wp.array2d(dtype=wp.vec3d)  # [world, point] where it was as the step began, in the collider's frame
         depth: wp.array2d(dtype=wp.float64)  # then
         speed: wp.array2d(dtype=wp.float64)  # that the damping takes
         held: wp.array2d(dtype=wp.vec3d)  # cap, k_t, shrinkage of the spring that a line search holds
         next: wp.array2d(dtype=wp.vec3d)  # those of the iterate
+        plane: wp.array2d(dtype=wp.vec3d)  # normal of the plane of friction that is held
+        next_plane: wp.array2d(dtype=wp.vec3d)  # that of the iterate
         lag: wp.array2d(dtype=wp.float64)  # change of the cap that the iterate asked for when it was last taken anew
         lag_sums: wp.array2d(dtype=wp.vec4d)  # [world, lane]
         omega: wp.array(dtype=wp.float64)  # [world] part of that change that was made
+        lag_size: wp.array(dtype=wp.float64)  # [world] sum of squares of the last change that was asked for
         lags: wp.array(dtype=wp.int32)  # [world] changes in this attempt
         state: wp.array2d(dtype=wp.int32)  # [world, point] whether it has a force
         force: wp.array2d(dtype=wp.vec3d)  # that the point adds to the residual, N, where it has one

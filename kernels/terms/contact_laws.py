@@ -2,6 +2,18 @@
 
 delta is the depth, m; delta_n that at the start of the step; all in float64. Of a lumped contact ("sphere") the elastic
 force is k delta^1.5, else k delta.
+
+"default": Hunt and Crossley's normal force and an anchored spring of friction. Of patches with mu_static > mu points
+begin to slip one after another, the least loaded first, and those that slip carry mu alone: a stiff body slides before
+mu_static.
+
+"paper": Paper I, Eqs. (73)-(83), as they stand. What is known of them: with max(0, .) rebounds for e = 0.1, 0.3, 0.5,
+0.7, 0.9 are 0.2527, 0.3971, 0.5503, 0.7182, 0.9020 (spheres) and 0.2242, 0.3635, 0.5174, 0.6926, 0.8914 (patches). The
+implicit patch jumps at touch, and some impacts have no solution (`smoothing` ramps it). With k_t ~ sqrt(delta) and a
+spring that stays energy appears when the normal load rises (Elata and Berryman 1996). Eq. (83) turns the spring round
+where gamma_t v exceeds mu F_n. Eq. (78) does not turn it with the bodies: a stuck block walks on a plate that turns.
+
+"smooth": Paper I, 6.2.
 """
 
 import functools

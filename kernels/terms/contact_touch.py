@@ -8,7 +8,7 @@ import warp as wp
 from ..common.types import precision
 from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
-from .contact_shapes import shape_functions
+from .contact_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
 
 __all__ = ["SLIPS", "touch_functions"]
 
@@ -35,7 +35,10 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         depth: f64
         side: wp.int32
         law: wp.vec4d  # normal force, its derivative, its potential, the size of the potential's parts
-        slip: vec3d  # tangential motion in the step
+        m: vec3d  # normal of the plane of friction
+        motion: vec3d  # in the step, relative to the collider
+        whole: vec3d  # motion and spring
+        slip: vec3d  # motion in that plane
         q: vec3d  # spring: tangential slip since it was anchored
         y: vec3d  # place in the collider's frame
 
@@ -66,10 +69,34 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
 
     @wp.func
-    def reach(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
-        """Distance from the shape at which contact begins."""
-        grown = con.offset[c] + con.grow[world, con.collider[c]]
-        return grown - allowance(con, his, world, c, point, time)
+    def reach(con: Contacts, his: History, world: int, c: int, point: int, time: f64, grown: f64) -> f64:
+        """Distance from the shape, which has grown so much, at which contact begins."""
+        return con.offset[c] + grown - allowance(con, his, world, c, point, time)
+
+    @wp.func
+    def deepening(con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, depth: f64) -> wp.vec2d:
+        """Change of the depth by a motion, from the motion itself where that is exact, and 1; else 0.
+
+        As a difference of places it would be rounded as those are, by more than a stiff body at rest moves.
+        """
+        kind = con.kind[k]
+        if kind == HALF_SPACE:
+            return wp.vec2d(-local[2], f64(1.0))
+        if kind == SPHERE:
+            return wp.vec2d(
+                -wp.dot(y + start, local) / wp.max(wp.length(y) + wp.length(start), f64(1.0e-300)), f64(1.0)
+            )
+        if kind == BOX and side >= 0:
+            h = con.size[k]
+            axis = side / 2
+            sign = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
+            flat = wp.abs(h[axis] - sign * start[axis] - depth) <= f64(1.0e-12) * h[axis]
+            for j in range(3):
+                if j != axis and wp.abs(start[j]) > h[j]:
+                    flat = False
+            if flat:
+                return wp.vec2d(-sign * local[axis], f64(1.0))
+        return wp.vec2d()
 
     @wp.func
     def rate_of(con: Contacts, at: Attempt, world: int, c: int, point: int, inv_h: f64) -> f64:
@@ -82,6 +109,16 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
     def tangent_damping(con: Contacts, world: int, c: int, stiffness: f64) -> f64:
         """gamma_t of Eq. (80), N s/m."""
         return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(con.mass[c] * stiffness)
+
+    @wp.func
+    def in_plane(t: Touch, m: vec3d) -> Touch:
+        """The point with friction in the plane of a normal m, which is held with the caps: on a curved shape the force
+        would not be the derivative of its potential if the plane turned with the iterate."""
+        out = t
+        out.m = m
+        out.slip = plane(m, t.motion)
+        out.q = plane(m, t.whole)
+        return out
 
     @wp.func
     def touch(
@@ -102,29 +139,43 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         out.side = sweep(con.kind[k], con.size[k], at.start[world, point], out.y, side)
         d = distance(con.kind[k], con.size[k], out.y, out.side)
         out.n = turn * vec3d(d[0], d[1], d[2])
-        out.depth = reach(con, his, world, c, point, time) - d[3]
+        shape = con.grow[world, k]
+        out.depth = reach(con, his, world, c, point, time, shape) - d[3]
+        motion = along(facets, u, world, q, item) - at.origin[world, point] - at.shift[world, k]
+        if con.spin[k] >= 0:
+            motion -= at.spin[world, k] * (his.turn[world, k] * at.start[world, point])
+        before = at.depth[world, point]
+        change = deepening(con, k, out.side, at.start[world, point], out.y, wp.transpose(turn) * motion,
+                           before - at.reach[world, point])  # fmt: skip
+        if change[1] != f64(0.0):
+            out.depth = before + change[0] + (reach(con, his, world, c, point, time, shape) - at.reach[world, point])
         rate = rate_of(con, at, world, c, point, inv_h)
         k_n = con.scale[world, c] * con.normal[c]
         out.law = normal_law(con.law[c], con.lumped[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
-                             at.depth[world, point])  # fmt: skip
-        motion = turn * (out.y - at.start[world, point])
-        out.slip = plane(out.n, motion)
+                             before)  # fmt: skip
+        out.motion = motion
         spring = vec3d()
         if live:
             spring = his.spring[world, rec]
             if con.law[c] != PAPER:
                 spring = shrink * (turn * spring)
-        out.q = plane(out.n, spring + motion)
-        return out
+        out.whole = spring + motion
+        return in_plane(out, out.n)
+
+    @wp.func
+    def coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
+        """mu of a contact that slipped in the last step, else mu_static."""
+        live = his.speed[world, rec] > f64(0.0)
+        if live and his.mark[world, rec] >= SLIPS:
+            return con.mu[world, c]
+        return con.mu_static[world, c]
 
     @wp.func
     def hold(con: Contacts, his: History, at: Attempt, world: int, c: int, point: int, t: Touch) -> vec3d:
         """Cap, k_t and shrinkage of the spring at an iterate."""
         rec = record_of(con, c, point)
-        mu = con.mu_static[world, c]
+        mu = coefficient(con, his, world, c, rec)
         live = his.speed[world, rec] > f64(0.0)
-        if live and his.mark[world, rec] >= SLIPS:
-            mu = con.mu[world, c]
         stiffness = con.scale[world, c] * con.tangent[c]
         shrink = f64(1.0)
         if con.lumped[c] != 0:
@@ -172,7 +223,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         """Derivative of the force that a point adds to the residual, positive: without that of the normal."""
         K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
         if held[0] > f64(0.0):
-            P = wp.identity(n=3, dtype=f64) - wp.outer(t.n, t.n)
+            P = wp.identity(n=3, dtype=f64) - wp.outer(t.m, t.m)
             if con.law[c] == SMOOTH:
                 part = smooth_friction(t.slip, inv_h, con.speed_eps[c], held[0])[1]
                 v = inv_h * t.slip
@@ -197,6 +248,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, tangent_damping=tangent_damping,
-        touch=touch, hold=hold, pull=pull, friction_potential=friction_potential, friction_force=friction_force,
-        point_stiffness=point_stiffness, acts=acts,
+        touch=touch, in_plane=in_plane, coefficient=coefficient, hold=hold, pull=pull,
+        friction_potential=friction_potential, friction_force=friction_force, point_stiffness=point_stiffness,
+        acts=acts,
     )  # fmt: skip

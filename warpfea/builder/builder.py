@@ -385,7 +385,8 @@ class ModelBuilder:
             offset: gap at which contact begins, m.
             points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4.
             smoothing: "paper": depth over which its damping is ramped in, m; "smooth": (eps in N, v_eps in m/s).
-            overlap: of bodies that overlap at the start: "refuse", or "offset": stored, it decays in `overlap_time`, s.
+            overlap: of bodies that overlap at the start: "refuse", or "offset": stored, it decays in `overlap_time`, s
+                (statics: part of the load).
             name: unique name; by default "BODY on COLLIDER".
 
         Returns:

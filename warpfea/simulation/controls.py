@@ -108,7 +108,7 @@ class ControlValue:
         except (TypeError, ValueError, IndexError) as error:
             raise ModelError(f"{self._what} has values {self.shape}: {error}") from error
         # what is not written may be what it is: a world that went wrong can be mended alone
-        if not np.all(np.isfinite(given)):
+        if not np.all(np.isfinite(given)) and not np.all(np.isfinite(target)):
             world, component = map(int, np.argwhere(~np.isfinite(target))[0])
             where = f"world {world}" + (f", component {component}" if self.shape[1] > 1 else "")
             raise ModelError(f"{self._what}: {target[world, component]} of {where} is not finite")

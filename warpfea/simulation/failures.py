@@ -75,6 +75,8 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         if (found := term.explain(sim.stepper.at, world)) is not None:
             kind, text = found
             reason, hint = f"{text}; {reason}", ""
+        else:
+            hint += term.remark(sim.stepper.at, world)
     return kind(
         f"{_step_from(sim, time)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "

@@ -120,8 +120,8 @@ def solve_static(
         progress: show a bar on stderr; None: when stderr is a terminal.
 
     Raises:
-        ModelError: a body is not supported, gravity or `stabilise` meets a material without a density, or an option is
-            out of range.
+        ModelError: a body is not supported, gravity or `stabilise` meets a material without a density, a contact is
+            explicit, or an option is out of range.
         ConvergenceError: a load step was not accepted after all halvings.
         ConstraintError: the same, and it is the constraints that can't be satisfied.
         CapacityError: the device has too little memory.
@@ -153,6 +153,12 @@ def begin_static(
     check_model(model)
     if model.terms.dead.pulls:
         require_density(model.bodies, "gravity")
+    for contact in model.description.contacts:
+        if contact.treatment == "explicit":
+            raise ModelError(
+                f"contact {contact.name!r}: treatment = 'explicit' takes the force of the last state, which is no "
+                "equilibrium; take 'implicit' for statics"
+            )
     springs = spring_stiffness(model, stabilise)
     if not springs:
         check_static_supports(model)
@@ -164,7 +170,7 @@ def begin_static(
             raise ModelError(f"solve_static: tol = {tol!r} must lie between 0 and 1")
         options = replace(options, tol=tol)
     start = model.state() if state is None else state.like()
-    start.time.zero_()
+    model.terms.rewind(start)
     scheme = replace(INTEGRATORS["static"], stabilise=springs)
     return Simulation(
         model, start, dt=1.0 / count, integrator=scheme, solver=options, ledger=False,
@@ -178,5 +184,5 @@ def run_static(sim: Simulation, *, outputs: Sequence[Any] = (), progress: bool |
     sim.run(1.0, outputs=[*outputs, *([springs] if springs else [])], progress=progress)
     assert sim.last is not None
     sim._load = sim.time  # what is drawn of it later is at this load
-    sim.state.time.zero_()  # what starts from the equilibrium starts at t = 0
+    sim.model.terms.rewind(sim.state)  # what starts from the equilibrium starts at t = 0
     return StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"], springs)

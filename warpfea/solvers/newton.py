@@ -190,6 +190,7 @@ class NewtonLoop:
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
         ctl.equilibrium = int(not inertia)
+        ctl.length = float(model.size)
         ctl.max_iterations = options.max_newton
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")

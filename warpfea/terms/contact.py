@@ -11,7 +11,8 @@ import warp as wp
 from ..base.errors import ModelError, PenetrationError
 from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
-from ..kernels.terms.contact import LAG_LANES, contact_kernels
+from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
+from ..kernels.terms.contact import LAG_LANES, MOST_TURN, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Contact"]
 
 TOUCHING = 1e-9
-"""Depth at the start, over the model's size, that counts as touch."""
+"""Depth at the start, over the model's size, that counts as touch; roundings of displacements come on top."""
 
 
 class Contact(Term):
@@ -78,20 +79,37 @@ class Contact(Term):
 
     # for one simulation
 
+    def _attempt(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
+        """The struct of an attempt, with arrays from make(name, shape, dtype)."""
+        t, B = self.tables, worlds
+        K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
+        shapes: dict[str, tuple[int, ...]] = {
+            "through": (B,), "elapsed": (B,), "omega": (B,), "lags": (B,), "lag_size": (B,), "lag_sums": (B, LAG_LANES),
+            "pick": (B, C), "picks": (B, C), "total": (B, C, len(RECORD)), "touched": (B, R), "rows": (len(RECORD), B, R),
+        }  # fmt: skip
+        shapes |= dict.fromkeys(("place", "turn", "shift", "spin", "angle"), (B, K))
+        shapes |= {} if t.lumped else {"level": (1, 1)}
+        shapes |= {} if t.explicit else dict.fromkeys(("dead", "dead_spring"), (1, 1))
+        out = attempt_struct(self.model.dtype)()
+        for name, var in attempt_struct(self.model.dtype).vars.items():
+            setattr(out, name, make(name, shapes.get(name, (B, P)), var.type.dtype))
+        return out
+
+    def _history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+        """The struct of the history, with arrays from make(name, dtype, shape of a world)."""
+        out = history_struct()()
+        shapes: dict[str, tuple[int, ...]] = {"born": (), "posed": ()}
+        shapes |= dict.fromkeys(("place", "turn", "angle", "grown"), (len(self.tables.colliders),))
+        for name, var in history_struct().vars.items():
+            shape = shapes.get(name, (self.tables.points,))
+            setattr(out, name, make(f"contact_{name}", var.type.dtype, shape))
+        return out
+
     def allocate(self, work: Workspace, at: At) -> None:
         t, B = self.tables, self.model.worlds
-        K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
-        lumped, explicit = (B, P) if t.lumped else (1, 1), (B, P) if t.explicit else (1, 1)
-        shapes: dict[str, tuple[int, ...]] = {
-            "place": (B, K), "turn": (B, K), "level": lumped, "dead": explicit, "dead_spring": explicit,
-            "pick": (B, C), "picks": (B, C), "through": (B,), "elapsed": (B,), "omega": (B,), "lags": (B,),
-            "lag_sums": (B, LAG_LANES), "touched": (B, R),
-            "rows": (len(RECORD), B, R),
-            "total": (B, C, len(RECORD)),
-        }  # fmt: skip
-        attempt = attempt_struct(self.model.dtype)()
-        for name, var in attempt_struct(self.model.dtype).vars.items():
-            setattr(attempt, name, work.array(f"contact {name}", shapes.get(name, (B, P)), var.type.dtype))
+        C, R = len(t.contacts), t.rows
+        attempt = self._attempt(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
+        attempt.omega.fill_(1.0)
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "part"):
             setattr(clock, name, getattr(work.step, name))
@@ -106,13 +124,7 @@ class Contact(Term):
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
     def register(self, at: At) -> None:
-        P, K = self.tables.points, len(self.tables.colliders)
-        history = history_struct()()
-        one = {"place": K, "turn": K}
-        for name, var in history_struct().vars.items():
-            shape = () if name == "born" else (one.get(name, P),)
-            setattr(history, name, at.state.register(f"contact_{name}", var.type.dtype, shape))
-        at.scratch[self.name] = {"history": history}
+        at.scratch[self.name] = {"history": self._history(at.state.register)}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
         return [self.kernels.module]
@@ -125,36 +137,49 @@ class Contact(Term):
         """
         s, state = at.scratch[self.name], at.state
         history = s["history"]
-        fresh = active.numpy() != 0
+        time = state.time.numpy()
+        # of a state with the history of its time colliders go on from there: a control may have been written since
+        known = history.turn.numpy().any(axis=(1, 2, 3)) & (history.posed.numpy() == time)
+        fresh = (active.numpy() != 0) & ~known
         self._poses(at, active)
-        for mine, other in ((history.place, s["attempt"].place), (history.turn, s["attempt"].turn)):
-            values = mine.numpy()
-            values[fresh] = other.numpy()[fresh]
-            mine.assign(values)
+        for name in ("place", "turn", "angle", "grown"):
+            source = self.tables.data.grow if name == "grown" else getattr(s["attempt"], name)
+            values = getattr(history, name).numpy()
+            values[fresh] = source.numpy()[fresh]
+            getattr(history, name).assign(values)
         overlap, born = history.overlap.numpy(), history.born.numpy()
-        live = history.speed.numpy() > 0.0
-        new = fresh & ~live.any(axis=1)
+        new = fresh & ~(history.speed.numpy() > 0.0).any(axis=1)
         overlap[new] = 0.0
-        born[new] = state.time.numpy()[new]
+        born[new] = time[new]
+        posed = history.posed.numpy()
+        posed[fresh] = time[fresh]
+        history.posed.assign(posed)
         history.overlap.assign(overlap)
         history.born.assign(born)
         gap, _ = self.at_points(state, history)
+        u = state.displacement.numpy()
+        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
         for k, contact in enumerate(self.tables.contacts):
             first, last = self.tables.first[k], self.tables.first[k + 1]
-            depth = np.where(live[:, first:last] | ~new[:, None], 0.0, -gap[:, first:last])
-            worst = float(depth.max())
-            if worst <= TOUCHING * self.model.size:
+            depth = np.where(new[:, None], -gap[:, first:last], 0.0)
+            deep = depth.max(axis=1) > touching
+            if not deep.any():
                 continue
             if contact.overlap == "refuse":
                 world, point = np.unravel_index(int(depth.argmax()), depth.shape)
                 where = self._where(k, int(point))
                 raise ModelError(
-                    f"contact {contact.name!r}: body {contact.body.name!r} begins {worst:.3g} m inside collider "
+                    f"contact {contact.name!r}: body {contact.body.name!r} begins {depth.max():.3g} m inside collider "
                     f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
                     "overlap='offset', which stores the overlap and lets it decay"
                 )
-            overlap[:, first:last] = np.maximum(depth, 0.0)
+            overlap[deep, first:last] = np.maximum(depth[deep], 0.0)
         history.overlap.assign(overlap)
+
+    def rewind(self, state: State) -> None:
+        """Stored overlaps keep their age."""
+        if "contact_born" in state.specs:
+            state.contact_born.assign(state.contact_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
     def _where(self, k: int, point: int) -> str:
         """Reference place of a point of a contact."""
@@ -163,7 +188,7 @@ class Contact(Term):
 
     def _poses(self, at: At, active: wp.array) -> None:
         s = at.scratch[self.name]
-        args = [self.tables.data, at.work.law_value, active, s["attempt"]]
+        args = [self.tables.data, s["history"], at.work.law_value, active, s["attempt"]]
         at.launch(self.kernels.poses, (self.model.worlds, len(self.tables.colliders)), args)
 
     # in a step
@@ -215,7 +240,7 @@ class Contact(Term):
     def refresh(self, at: At, flags: wp.array) -> None:
         k, m, attempt = self.kernels, self.model, at.scratch[self.name]["attempt"]
         at.launch(k.partial_lag, (m.worlds, LAG_LANES), [flags, attempt])
-        at.launch(k.relax, m.worlds, [flags, attempt, at.work.newton.unsettled])
+        at.launch(k.relax, m.worlds, [flags, at.work.newton.tol, attempt, at.work.newton.unsettled])
         at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
         self._pick(at, flags, fresh=0)
 
@@ -255,8 +280,8 @@ class Contact(Term):
         s, m, w = at.scratch[self.name], self.model, at.work
         if not s.get("finished"):
             self._finish(at, accepted)
-        args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
-        at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), args)
+        args = [self.tables.data, s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"]]
+        at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), [*args, s["attempt"]])
 
     def report(self, at: At) -> None:
         args = [at.scratch[self.name]["attempt"], self.report_offset, at.work.report]
@@ -315,17 +340,34 @@ class Contact(Term):
         return {contact_block_kernels(self.model.dtype).module}
 
     def explain(self, at: At, world: int) -> tuple[type[PenetrationError], str] | None:
-        number = int(at.scratch[self.name]["attempt"].through.numpy()[world]) - 1
-        if number < 0:
+        found = int(at.scratch[self.name]["attempt"].through.numpy()[world])
+        if found == 0 or int(at.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
             return None
+        number = abs(found) - 1
         t = self.tables
         k = int(np.searchsorted(t.first, number, side="right")) - 1
         contact = t.contacts[k]
+        if found < 0:
+            return PenetrationError, (
+                f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than {MOST_TURN:g} rad in "
+                "the step, in which it is touched; take a smaller dt"
+            )
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
             f"{self._where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
             "smaller dt, a larger stiffness= of the contact, or a thicker shape"
         )
+
+    def remark(self, at: At, world: int) -> str:
+        touched = at.scratch[self.name]["attempt"].touched.numpy()[world] > 0
+        t = self.tables
+        pairs = [
+            f"{contact.name!r} with collider {contact.collider.name!r}"
+            for k, contact in enumerate(t.contacts)
+            if touched[t.row_start[k] : t.row_start[k + 1]].any()
+        ]
+        more = f" and {len(pairs) - 3} more" if len(pairs) > 3 else ""
+        return f"; in touch: contact {', '.join(pairs[:3])}{more}" if pairs else ""
 
     def parameters(self) -> dict[str, Callable[[Any], None]]:
         return contact_parameters(self.tables)
@@ -383,33 +425,24 @@ class Contact(Term):
         every = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
         laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
-        shapes: dict[str, tuple[int, ...]] = {
-            "born": (B,),
-            "place": (B, K),
-            "turn": (B, K),
-            "pick": (B, C),
-            "picks": (B, C),
-            "lags": (B,),
-        }
         if history is None:
-            history = history_struct()()
-            for name, var in history_struct().vars.items():
-                known = f"contact_{name}" in state.specs
-                array = getattr(state, f"contact_{name}") if known else zeros(shapes.get(name, (B, P)), var.type.dtype)
-                setattr(history, name, array)
-        attempt = attempt_struct(m.dtype)()
-        for name in ("place", "turn", "pick", "picks", "lags", "start", "depth", "speed", "level"):
-            dtype = attempt_struct(m.dtype).vars[name].type.dtype
-            setattr(attempt, name, zeros(shapes.get(name, (B, P)), dtype))
+
+            def take(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+                return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
+
+            history = self._history(take)
+        attempt = self._attempt(B, lambda _, shape, dtype: zeros(shape, dtype))
         attempt.speed.fill_(1.0)
         if "contact_place" in state.specs:  # statics puts its time back to 0
             attempt.place, attempt.turn = history.place, history.turn
         else:
-            launch(self.kernels.poses, (B, K), [t.data, value, every, attempt])
+            launch(self.kernels.poses, (B, K), [t.data, history, value, every, attempt])
+            attempt.shift.zero_()
+            attempt.spin.zero_()
         gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
         for group in t.groups:
             dim = (B, group.count, group.data.points)
-            launch(self.kernels.settle, dim, [t.data, group.data, state.displacement, attempt])
+            launch(self.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
             args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
             launch(self.kernels.levels, dim, args)
         launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt, zeros((B,), wp.int32)])

@@ -227,6 +227,8 @@ class ContactTables:
             center, axes = collider.shape.frame()
             h.update(f"{collider.name} {collider.shape.kind}".encode())
             h.update(np.concatenate([collider.shape.sizes, center, axes.ravel()]).tobytes())
+            if collider.rotation is not None:
+                h.update(np.concatenate([collider.rotation.anchor, collider.rotation.axis]).tobytes())
         for contact, p in zip(self.contacts, self.host):
             fixed = ("surface", "collider", *PER_WORLD)
             values = {k: v for k, v in vars(contact).items() if k not in fixed}

@@ -219,6 +219,9 @@ class Term:
     def start(self, at: At, active: wp.array) -> None:
         """The state of active worlds was set: bring up to it what follows it. Time laws and work.u are at the state."""
 
+    def rewind(self, state: State) -> None:
+        """The time of a state is about to be put to 0: shift what the term has stored of times."""
+
     # in a step, in this order
 
     def begin(self, at: At, active: wp.array) -> None:
@@ -324,6 +327,10 @@ class Term:
     def explain(self, at: At, world: int) -> tuple[type[ConvergenceError], str] | None:
         """Why the last attempt at a step of a world was refused, where the term knows, with the error that says so."""
         return None
+
+    def remark(self, at: At, world: int) -> str:
+        """What else is to be told of the last attempt at a refused step of a world; "" for nothing."""
+        return ""
 
     def parameters(self) -> Mapping[str, Callable[[Any], None]]:
         """What `Model.set_parameter` may set, by name, with what sets it: a scalar or (worlds,), checked there."""

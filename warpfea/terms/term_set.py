@@ -30,6 +30,7 @@ from .time_laws import TimeLaws, control_array
 
 if TYPE_CHECKING:
     from ..model.model import Model
+    from ..model.state import State
     from .workspace import Workspace
 
 __all__ = ["KINDS", "TermSet", "all_parts"]
@@ -186,6 +187,12 @@ class TermSet:
             out |= kind.features(self.model)
         out |= {term.name: True for term in self.all if type(term) not in KINDS}
         return out | {"controls": bool(self.laws.controls)}
+
+    def rewind(self, state: State) -> None:
+        """Put the time of a state to 0, and what terms have stored of times with it."""
+        for term in self.all:
+            term.rewind(state)
+        state.time.zero_()
 
     def hash(self, h: Any) -> None:
         """Feed what defines the terms into a hash."""
