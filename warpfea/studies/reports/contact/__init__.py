@@ -17,7 +17,7 @@ from typing import Any
 from ..parts import Part, run_tables
 from .ball import DENSITY, NU, RADIUS, SPEED, rebound_case
 from .ball import E as BALL_E
-from .block import TOL, WIDTH, A, E, hertz_case, mindlin_case
+from .block import WIDTH, A, E, hertz_case, mindlin_case
 
 __all__ = ["PARTS", "hertz", "mindlin", "rebound", "run"]
 
@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> None:
     """Do `warpfea study contact`."""
     options.device = options.device or "cpu"
     settings = {
-        "block": {"E": E, "sphere_radius": 1.0, "contact_radius": A, "even_zone_in_radii": WIDTH, "tol": TOL},
+        "block": {"E": E, "sphere_radius": 1.0, "contact_radius": A, "even_zone_in_radii": WIDTH, "tol": 1e-8},
         "ball": {"E": BALL_E, "nu": NU, "density": DENSITY, "radius": RADIUS, "speed": SPEED, "tol": 1e-8},
     }
     run_tables(options, PARTS, settings, device=options.device)
