@@ -116,6 +116,22 @@ _ENTRIES = (
         results=("joints_cpu.json", "joints_h200.json"),
     ),
     Entry(
+        name="contact",
+        module="reports.contact",
+        summary="contact with obstacles beside Hertz, Mindlin and finer runs",
+        about="A rigid sphere pressed into a deep block and moved sideways: contact radius, peak pressure, stiffnesses "
+        "and full slip beside the closed forms. An elastic ball thrown at a plane beside a quarter of the step and "
+        "half the mesh size.",
+        parts=(
+            ("hertz", "contact radius and peak pressure"),
+            ("mindlin", "tangential stiffness and full slip"),
+            ("rebound", "restitution and duration of an impact"),
+        ),
+        options=("device", "only"),
+        example="--out tests/results/contact_hertz_cpu.json",
+        results=("contact_hertz_cpu.json",),
+    ),
+    Entry(
         name="jacobi",
         module="reports.jacobi",
         summary="error and cost of the solver wf.Jacobi beside Newton's method",

@@ -1,0 +1,79 @@
+"""The committed result of `warpfea study contact`, and a coarse run: Hertz, Mindlin, an elastic ball's rebound."""
+
+import json
+import pathlib
+
+import pytest
+
+from warpfea.studies.reports.contact.ball import rebound_case
+from warpfea.studies.reports.contact.block import hertz_case
+
+RESULT = pathlib.Path(__file__).resolve().parent / "results" / "contact_hertz_cpu.json"
+MOST_NEWTON = 50
+"""Iterations of a load step in which points begin to slip."""
+
+
+@pytest.fixture(scope="module")
+def result():
+    content = json.loads(RESULT.read_text())
+    assert content["command"].startswith("warpfea study contact")
+    assert len(content["commit"]) >= 40
+    assert content["machine"]["device"] == "cpu"
+    assert content["versions"]["warp"]
+    assert content["settings"]["block"]["contact_radius"] <= 0.03 * content["settings"]["block"]["sphere_radius"]
+    return content
+
+
+def finest(rows):
+    return max(rows, key=lambda row: row["unknowns"])
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.45])
+def test_pressure_is_hertz(result, nu):
+    rows = [row for row in result["hertz"] if row["nu"] == nu]
+    row = finest(rows)
+    assert len(rows) >= 2
+    assert row["depth_over_a"] >= 40.0
+    assert row["a_over_R"] <= 0.03
+    assert 0.0 < row["penalty_share"] < 0.01
+    assert abs(row["a_error"]) < 0.03
+    assert abs(row["p0_error"]) < 0.03
+    assert row["newton"] <= 30 * row["load_steps"]
+
+
+def test_tangential_stiffness_and_full_slip_are_mindlin(result):
+    (row,) = result["mindlin"]
+    assert row["nu"] == 0.45
+    assert row["depth_over_a"] >= 40.0
+    assert row["first_share"] < 0.05
+    assert abs(row["slope_ratio_error"]) < 0.05
+    assert abs(row["full_slip_first_error"]) < 0.05
+    assert abs(row["full_slip_fitted_error"]) < 0.05
+    assert row["halvings"] == 0
+    assert row["newton_most"] <= MOST_NEWTON
+
+
+def test_rebound_of_a_ball_does_not_depend_on_step_and_mesh(result):
+    coarse, fine = sorted(result["rebound"], key=lambda row: row["unknowns"])
+    assert fine["cells"] == 2 * coarse["cells"]
+    assert fine["dt"] == pytest.approx(0.25 * coarse["dt"])
+    assert coarse["restitution"] == pytest.approx(fine["restitution"], rel=0.02)
+    assert coarse["duration"] == pytest.approx(fine["duration"], rel=0.02)
+    for row in (coarse, fine):
+        assert abs(row["ledger_residual"]) < 1e-6
+        assert row["halvings"] == 0
+        assert row["newton_most"] <= 30
+
+
+def test_coarse_block_is_near_hertz():
+    row = hertz_case(0.3, inner=4, outer=4, load_steps=2)
+    assert row["penalty_share"] < 0.01
+    assert abs(row["a_error"]) < 0.05
+    assert abs(row["p0_error"]) < 0.05
+
+
+def test_coarse_ball_comes_back():
+    row = rebound_case(cells=4, steps=25)
+    assert 0.95 < row["restitution"] < 1.0
+    assert row["duration_over_hertz"] == pytest.approx(1.0, abs=0.1)
+    assert abs(row["ledger_residual"]) < 1e-6

@@ -1,0 +1,54 @@
+"""`warpfea study contact`: deformable bodies on rigid obstacles beside Hertz and Mindlin, and a ball beside finer runs.
+
+hertz    a rigid sphere on a quarter block 60 contact radii deep: contact radius and peak pressure, from a line through
+         the squares of the points' pressures, beside those of the force.
+mindlin  the same on a half block with friction, then sideways: stiffness ratio, and where all slips.
+rebound  an elastic ball on a plane: restitution and duration, and those of a quarter of the step and half the mesh.
+
+Each row has its iterations and time. tests/results/contact_hertz_cpu.json is the committed result.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import Any
+
+from ..parts import Part, run_tables
+from .ball import DENSITY, NU, RADIUS, SPEED, rebound_case
+from .ball import E as BALL_E
+from .block import WIDTH, A, E, hertz_case, mindlin_case
+
+__all__ = ["PARTS", "hertz", "mindlin", "rebound", "run"]
+
+
+def hertz(device: Any) -> Iterator[dict[str, Any]]:
+    """Two meshes at two Poisson's ratios."""
+    for nu in (0.3, 0.45):
+        for inner, outer in ((4, 5), (6, 6)):
+            yield hertz_case(nu, inner=inner, outer=outer, device=device)
+
+
+def mindlin(device: Any) -> Iterator[dict[str, Any]]:
+    """One row."""
+    yield mindlin_case(device=device)
+
+
+def rebound(device: Any) -> Iterator[dict[str, Any]]:
+    """The run, and with a quarter of its step and half its mesh size."""
+    for integrator in ("bdf2",):
+        for factor in (1, 2):
+            yield rebound_case(cells=8 * factor, steps=50 * factor**2, integrator=integrator, device=device)
+
+
+PARTS: dict[str, Part] = {f.__name__: f for f in (hertz, mindlin, rebound)}
+
+
+def run(options: argparse.Namespace) -> None:
+    """Do `warpfea study contact`."""
+    options.device = options.device or "cpu"
+    settings = {
+        "block": {"E": E, "sphere_radius": 1.0, "contact_radius": A, "even_zone_in_radii": WIDTH, "tol": 1e-8},
+        "ball": {"E": BALL_E, "nu": NU, "density": DENSITY, "radius": RADIUS, "speed": SPEED, "tol": 1e-8},
+    }
+    run_tables(options, PARTS, settings, device=options.device)
