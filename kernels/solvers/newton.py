@@ -48,7 +48,7 @@ RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1
 """Tolerance of the first solve of a step that begins far from its end: what it is solved to is lost."""
-EXCURSIONS = 3
+EXCURSIONS = 1
 """Times in an attempt that full steps may lead deep into an obstacle: the way back may end where it began."""
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""

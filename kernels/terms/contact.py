@@ -15,7 +15,7 @@ from .contact_laws import SMOOTH, law_functions
 from .contact_shapes import shape_functions
 from .contact_touch import SLIPS, touch_functions
 
-__all__ = ["LAG_LANES", "MOST_TURN", "SPEED_FLOOR", "contact_kernels"]
+__all__ = ["MOST_TURN", "RELAX_LANES", "SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
 """Least approach speed that the default law's damping is made for, m/s."""
@@ -23,7 +23,7 @@ IDLE, LOADED, STIFF = 0, 1, 2
 """A point has no force; one without a derivative; one with."""
 MOST_TURN = 1.0
 """Angle by which a collider in touch may turn in a step, rad: of one that turns further a step knows nothing."""
-LAG_LANES = 128
+RELAX_LANES = 128
 SHRINKS = 0.35
 """Caps that come closer by less than this per change are relaxed."""
 PICKS = 4
@@ -68,7 +68,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         if con.path[k] >= 0:
             place += value[world, con.path[k]]
         if k == 0:
-            at.lags[world] = 0
+            at.changes[world] = 0
         at.place[world, k] = place
         at.turn[world, k] = turn
         at.shift[world, k] = place - his.place[world, k]
@@ -340,19 +340,19 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         rows[2, world, row] = energy[1]
 
     @wp.kernel(module=module)
-    def partial_lag(flags: wp.array(dtype=wp.int32), at: Attempt):
+    def partial_asked(flags: wp.array(dtype=wp.int32), at: Attempt):
         """Sums of what caps of the iterate differ from those held by, r, and of how that has changed, by lanes."""
         world, lane = wp.tid()
         if flags[world] == 0:
             return
         out = wp.vec4d()
-        for point in range(lane, at.lag.shape[1], LAG_LANES):
+        for point in range(lane, at.asked.shape[1], RELAX_LANES):
             if at.state[world, point] == STIFF:
                 r = at.next[world, point][0] - at.held[world, point][0]
-                old = at.lag[world, point]
+                old = at.asked[world, point]
                 new = at.next[world, point][0]
                 out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, new * new)
-        at.lag_sums[world, lane] = out
+        at.asked_sums[world, lane] = out
 
     @wp.kernel(module=module)
     def relax(flags: wp.array(dtype=wp.int32), tol: f64, at: Attempt, unsettled: wp.array(dtype=wp.int32)):
@@ -361,16 +361,16 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         if flags[world] == 0:
             return
         total = wp.vec4d()
-        for lane in range(LAG_LANES):
-            total += at.lag_sums[world, lane]
+        for lane in range(RELAX_LANES):
+            total += at.asked_sums[world, lane]
         omega = f64(1.0)
-        slow = total[2] > f64(SHRINKS) * f64(SHRINKS) * at.lag_size[world] and total[1] > f64(0.0)
-        if at.lags[world] > 0 and slow and total[2] > tol * tol * total[3]:
+        slow = total[2] > f64(SHRINKS) * f64(SHRINKS) * at.asked_size[world] and total[1] > f64(0.0)
+        if at.changes[world] > 0 and slow and total[2] > tol * tol * total[3]:
             omega = wp.clamp(-at.omega[world] * total[0] / total[1], f64(0.05), f64(2.0))
             unsettled[world] = 1
         at.omega[world] = omega
-        at.lag_size[world] = total[2]
-        at.lags[world] = at.lags[world] + 1
+        at.asked_size[world] = total[2]
+        at.changes[world] = at.changes[world] + 1
 
     @wp.kernel(module=module)
     def refresh(flags: wp.array(dtype=wp.int32), at: Attempt):
@@ -381,7 +381,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             r = new[0] - at.held[world, point][0]
             if at.omega[world] != f64(1.0):
                 new[0] = wp.max(at.held[world, point][0] + at.omega[world] * r, f64(0.0))
-            at.lag[world, point] = r
+            at.asked[world, point] = r
             at.held[world, point] = new
             at.plane[world, point] = at.next_plane[world, point]
 
@@ -431,6 +431,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module, poses=poses, begin_points=begin_points, settle=settle, explicit_forces=explicit_forces,
-        levels=levels, pick_deepest=pick_deepest, forces=forces, gather_points=gather_points, partial_lag=partial_lag,
-        relax=relax, refresh=refresh, product=product, diagonal=diagonal,
+        levels=levels, pick_deepest=pick_deepest, forces=forces, gather_points=gather_points,
+        partial_asked=partial_asked, relax=relax, refresh=refresh, product=product, diagonal=diagonal,
     )  # fmt: skip

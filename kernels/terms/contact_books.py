@@ -8,6 +8,7 @@ import warp as wp
 from ..common.entries import add_block_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SMALL, kernel_module, precision
+from .contact import IDLE
 from .contact_data import RECORD, attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import PAPER, SMOOTH, law_functions
 from .contact_touch import SLIPS, touch_functions
@@ -181,7 +182,8 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         for q in range(facets.points):
             point = facets.point + item * facets.points + q
             share = facets.share[q, item] * acts(con, at, world, c, point)
-            if share > f64(0.0):
+            idle = at.state[world, point] == IDLE and his.speed[world, record_of(con, c, point)] == f64(0.0)
+            if share > f64(0.0) and not idle:
                 o = outcome(con, facets, his, clock, at, world, c, q, item, point, u)
                 add(booked, 0, world, row, share * o.stored)
                 add(booked, 1, world, row, share * o.loss)

@@ -116,11 +116,11 @@ def attempt_struct(dtype: str):
         next: wp.array2d(dtype=wp.vec3d)  # those of the iterate
         plane: wp.array2d(dtype=wp.vec3d)  # normal of the plane of friction that is held
         next_plane: wp.array2d(dtype=wp.vec3d)  # that of the iterate
-        lag: wp.array2d(dtype=wp.float64)  # change of the cap that the iterate asked for when it was last taken anew
-        lag_sums: wp.array2d(dtype=wp.vec4d)  # [world, lane]
+        asked: wp.array2d(dtype=wp.float64)  # change of the cap that the iterate asked for when it was last taken anew
+        asked_sums: wp.array2d(dtype=wp.vec4d)  # [world, lane]
         omega: wp.array(dtype=wp.float64)  # [world] part of that change that was made
-        lag_size: wp.array(dtype=wp.float64)  # [world] sum of squares of the last change that was asked for
-        lags: wp.array(dtype=wp.int32)  # [world] changes in this attempt
+        asked_size: wp.array(dtype=wp.float64)  # [world] sum of squares of the last change that was asked for
+        changes: wp.array(dtype=wp.int32)  # [world] changes in this attempt
         state: wp.array2d(dtype=wp.int32)  # [world, point] whether it has a force
         force: wp.array2d(dtype=wp.vec3d)  # that the point adds to the residual, N, where it has one
         energy: wp.array2d(dtype=wp.vec2d)  # its potential, and the size of what that is made of, J

@@ -12,7 +12,7 @@ from ..base.errors import ModelError, PenetrationError
 from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
-from ..kernels.terms.contact import LAG_LANES, MOST_TURN, contact_kernels
+from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
@@ -84,8 +84,9 @@ class Contact(Term):
         t, B = self.tables, worlds
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
         shapes: dict[str, tuple[int, ...]] = {
-            "through": (B,), "elapsed": (B,), "omega": (B,), "lags": (B,), "lag_size": (B,), "lag_sums": (B, LAG_LANES),
-            "pick": (B, C), "picks": (B, C), "total": (B, C, len(RECORD)), "touched": (B, R),
+            "through": (B,), "elapsed": (B,), "omega": (B,), "changes": (B,), "asked_size": (B,),
+            "asked_sums": (B, RELAX_LANES), "pick": (B, C), "picks": (B, C), "total": (B, C, len(RECORD)),
+            "touched": (B, R),
             "rows": (len(RECORD), B, R),
         }  # fmt: skip
         shapes |= dict.fromkeys(("place", "turn", "shift", "spin", "angle"), (B, K))
@@ -242,7 +243,7 @@ class Contact(Term):
     @part("contact")
     def refresh(self, at: At, flags: wp.array) -> None:
         k, m, attempt = self.kernels, self.model, at.scratch[self.name]["attempt"]
-        at.launch(k.partial_lag, (m.worlds, LAG_LANES), [flags, attempt])
+        at.launch(k.partial_asked, (m.worlds, RELAX_LANES), [flags, attempt])
         at.launch(k.relax, m.worlds, [flags, at.work.newton.tol, attempt, at.work.newton.unsettled])
         at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
         self._pick(at, flags, fresh=0)

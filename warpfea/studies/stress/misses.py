@@ -7,21 +7,17 @@ from __future__ import annotations
 
 __all__ = ["MISSES", "reason_for"]
 
-_NEO = "refused on a GPU at a state that is unstable; found on the CPU"
 _THIN = "refused for the work spent or without a reason; with two levels on the CPU float32 is named now"
 
 MISSES: dict[tuple[str, str, str], str] = {
     ("annular/auto", "float64", ""): "the whole load at once takes 160 to 230 iterations; three load steps take 86",
     ("annular/auto", "float32", "cuda"): _THIN,
-    ("soft-thin-limbs", "float64", ""): "found, in 642 iterations in place of 80; it was refused before",
+    ("soft-thin-limbs", "float64", ""): "found, in 642 iterations on the CPU and 166 on a GPU, in place of 80",
     ("soft-dolphin", "float32", ""): "refused by name: float32 can't hold it",
     ("soft-thin-limbs", "float32", ""): "refused by name: float32 can't hold it",
-    ("neo-twisted/H3843", "float32", "cuda"): _NEO,
-    ("stretch/T10-10", "float64", "cuda"): "comes to an equilibrium that is not homogeneous",
-    ("stretch/T10-10", "float32", "cuda"): "comes to an equilibrium that is not homogeneous",
     ("thin-static/T10-500", "float32", "cuda"): _THIN,
-    ("thin-static/H3843-500", "float32", "cuda"): _THIN,
-    ("thin-dynamic/T10-500", "float32", "cuda"): _THIN,
+    ("contact-graze/1e-12", "float64", ""): "a touch within rounding takes up to 150 iterations and halvings",
+    ("contact-rest/10000-1e-05", "float32", ""): "impulse 1.8 % off over ten steps of 10 us, below what float32 resolves",
 }
 """Reasons by row, precision and kind of device ("": any)."""
 
