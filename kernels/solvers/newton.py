@@ -38,18 +38,12 @@ TURN, SHRINK = 0.5, 0.4
 """Most that such a step turns or stretches an element, and what remains of it when the best iterate was restored."""
 ROUNDS = 3
 """Linear solves of an attempt, over its iterations: those that lead to no step are bounded too."""
-LOST = 10
-"""Such solves that may lead to no step before the tangent is followed as it is; with 0 soft solids take longer."""
-SWIFT = 1.0e4
-FINE = 1.0e-10
-"""Roundings of a body's speed below which an error of velocities is none, in double precision: what it vibrates by may
-be nothing beside its flight."""
+LOST = 10  # such solves that lead to no step before the tangent is followed as it is; with 0 soft solids take longer
+SWIFT, FINE = 1.0e4, 1.0e-10  # roundings of its speed below which an error of a body's velocities is none; if so fine
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
-FAR_FORCING = 0.1
-"""Tolerance of the first solve of a step that begins far from its end: what it is solved to is lost."""
-EXCURSIONS = 1
-"""Times in an attempt that full steps may lead deep into an obstacle: the way back may end where it began."""
+FAR_FORCING = 0.1  # of the first solve of a step that begins far from its end: what it is solved to is lost
+EXCURSIONS = 1  # full steps deep into an obstacle in an attempt: the way back may end where it began
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
 

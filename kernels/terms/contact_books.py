@@ -183,7 +183,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             point = facets.point + item * facets.points + q
             share = facets.share[q, item] * acts(con, at, world, c, point)
             idle = at.state[world, point] == IDLE and his.speed[world, record_of(con, c, point)] == f64(0.0)
-            if share > f64(0.0) and not idle:
+            if share > f64(0.0) and (con.dead[c] != 0 or not idle):
                 o = outcome(con, facets, his, clock, at, world, c, q, item, point, u)
                 add(booked, 0, world, row, share * o.stored)
                 add(booked, 1, world, row, share * o.loss)

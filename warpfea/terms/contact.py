@@ -16,7 +16,7 @@ from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
-from .contact_fields import contact_field
+from .contact_fields import contact_field, nodal_force
 from .contact_parameters import contact_parameters
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
@@ -391,15 +391,7 @@ class Contact(Term):
 
     def nodal_force(self, state: State) -> np.ndarray:
         """Elastic forces of all contacts on slots, (worlds, slots, 3), N, at a state."""
-        _, force = self.at_points(state)
-        t, out = self.tables, np.zeros((state.worlds, self.model.slots, 3))
-        for k, (contact, p) in enumerate(zip(t.contacts, t.host)):
-            at_point = force[:, t.first[k] : t.first[k + 1]].reshape(-1, *p.area.shape, 3)
-            at_slot = np.einsum("bfpk,fpl->bflk", at_point, p.shape)
-            slots = p.conn + contact.body.slot_offset
-            for world in range(state.worlds):
-                np.add.at(out[world], slots, at_slot[world])
-        return out
+        return nodal_force(self.tables, self.at_points(state)[1])
 
     def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Places (worlds, colliders, 3), m, and turns (..., 3, 3) of the colliders at a state, and by how much their

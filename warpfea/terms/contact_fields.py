@@ -12,7 +12,7 @@ from ..kernels.terms.contact_laws import SMOOTH
 from ..model.discretisation import Discretisation, element_functions
 from .contact_tables import LAWS, ContactTables
 
-__all__ = ["contact_field"]
+__all__ = ["contact_field", "nodal_force"]
 
 
 def contact_field(
@@ -80,4 +80,15 @@ def _sample_places(body: Discretisation) -> np.ndarray:
     X = np.einsum("eps,esk->epk", np.broadcast_to(s, (len(cells), *s.shape[1:])), body.reference[body.connectivity])
     out = np.full((len(body.mesh.points) * samples.shape[1], 3), np.nan)
     out[(cells[:, :, None] * samples.shape[1] + np.arange(samples.shape[1])).reshape(len(cells), -1)] = X + body.origin
+    return out
+
+
+def nodal_force(tables: ContactTables, force: np.ndarray) -> np.ndarray:
+    """Forces on slots (worlds, slots, 3), N, of forces on points (worlds, points, 3)."""
+    out = np.zeros((len(force), tables.model.slots, 3))
+    for k, (contact, p) in enumerate(zip(tables.contacts, tables.host)):
+        at_point = force[:, tables.first[k] : tables.first[k + 1]].reshape(-1, *p.area.shape, 3)
+        at_slot = np.einsum("bfpk,fpl->bflk", at_point, p.shape)
+        for world in range(len(force)):
+            np.add.at(out[world], p.conn + contact.body.slot_offset, at_slot[world])
     return out
