@@ -17,6 +17,7 @@ __all__ = [
     "FAIL_LINE_SEARCH",
     "FAIL_NAN",
     "FAIL_WORK",
+    "FLOOR_LANES",
     "FLOOR_ROWS",
     "LANES",
     "TERM_ROWS",
@@ -37,7 +38,7 @@ FAIL_WORK = 11
 
 COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
 FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|
-LANES = 32
+LANES, FLOOR_LANES = 32, 16
 TERM_ROWS = 3
 """Rows summed per world of what terms store: the potential with what is held in a line search (multipliers, caps), the
 potential with what they would hold next, and its magnitude."""

@@ -16,7 +16,7 @@ from .control import (
     FAIL_LINE_SEARCH,
     FAIL_NAN,
     FAIL_WORK,
-    LANES,
+    FLOOR_LANES,
     control_struct,
 )
 from .judging import TRIES, judging_functions
@@ -210,7 +210,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         dq = ctl.dq_dv[world]
         largest, whole = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
-            for lane in range(LANES):
+            for lane in range(FLOOR_LANES):
                 whole += ctl.floor_sums[0, world, part, lane]
                 largest = wp.max(largest, ctl.floor_sums[4, world, part, lane])
         if wp.static(walls):  # a gap is rounded as places are
@@ -219,7 +219,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         for part in range(component_of_part.shape[0]):
             if ctl.quiet[world, component_of_part[part]] == 0:
                 work, kinetic, strain, step, speed = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
-                for lane in range(LANES):
+                for lane in range(FLOOR_LANES):
                     work += ctl.floor_sums[0, world, part, lane]
                     kinetic += ctl.floor_sums[1, world, part, lane]
                     strain += ctl.floor_sums[2, world, part, lane]

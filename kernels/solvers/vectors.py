@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from .control import COMPONENT_ROWS, LANES, control_struct
+from .control import COMPONENT_ROWS, FLOOR_LANES, LANES, control_struct
 
 __all__ = ["vector_kernels"]
 
@@ -114,7 +114,7 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
             return
         work, kinetic, strain = f64(0.0), f64(0.0), f64(0.0)
         step, size, speed = f64(0.0), f64(0.0), f64(0.0)
-        for k in range(start[part] + lane, start[part + 1], LANES):
+        for k in range(start[part] + lane, start[part + 1], FLOOR_LANES):
             i = k
             if slot.shape[0] > 0:
                 i = slot[k]
@@ -124,7 +124,7 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
             step = wp.max(step, f64(wp.max(wp.abs(p))))
             size = wp.max(size, f64(wp.max(wp.abs(u[world, i]))))
             speed = wp.max(speed, f64(wp.max(wp.abs(v[world, i]))))
-        for k in range(element_start[part] + lane, element_start[part + 1], LANES):
+        for k in range(element_start[part] + lane, element_start[part + 1], FLOOR_LANES):
             e = k
             if element.shape[0] > 0:
                 e = element[k]

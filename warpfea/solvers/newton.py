@@ -13,7 +13,7 @@ from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.launch import labelled
 from ..kernels.elements.materials import ANY_J
-from ..kernels.solvers.control import LANES
+from ..kernels.solvers.control import FLOOR_LANES
 from ..kernels.solvers.newton import newton_kernels
 from .direct import Direct
 from .pcg import PCG
@@ -336,7 +336,7 @@ class NewtonLoop:
         m, w, k = self.model, self.work, self.kernels
         args = [w.newton, m.part_slot_start, m.part_slot, m.part_element_start, m.part_element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
-        self.launch(k.floor_partial, (m.worlds, m.part_count, LANES), args)
+        self.launch(k.floor_partial, (m.worlds, m.part_count, FLOOR_LANES), args)
         self.launch(k.judge_floor, m.worlds, [w.newton, m.component_of_part])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)

@@ -12,7 +12,7 @@ from ..base.memory import enough_memory
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
-from ..kernels.solvers.control import COMPONENT_ROWS, FLOOR_ROWS, LANES, TERM_ROWS, control_struct
+from ..kernels.solvers.control import COMPONENT_ROWS, FLOOR_LANES, FLOOR_ROWS, LANES, TERM_ROWS, control_struct
 from ..kernels.solvers.pcg import LANES as GROUP_LANES
 from ..kernels.solvers.pcg import pcg_struct
 from ..kernels.step.control import step_struct
@@ -100,7 +100,7 @@ class Workspace:
         self.newton = self.struct(
             control_struct(), B, skip=skip,
             history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
-            term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.part_count, LANES),
+            term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.part_count, FLOOR_LANES),
         )  # fmt: skip
         self.newton.components = C
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any

@@ -13,6 +13,7 @@ rounding decides.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import pathlib
 from collections.abc import Callable
@@ -180,6 +181,8 @@ def scenes(options: argparse.Namespace) -> None:
     for case in chosen:
         rows.append(measure(case, device=options.device))
         print(_line(rows[-1], was.get(case.label)), flush=True)
+        if before and case.label not in was:  # a scene that is new is compared with its first row from now on
+            before["rows"].insert(len(rows) - 1, dataclasses.asdict(rows[-1]))
         write(options, settings, rows, **more)
     write(options, settings, rows, **more)
 
