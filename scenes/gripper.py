@@ -45,8 +45,8 @@ def gripper(
         center = (sign * (half + apart + 0.5 * thick), 0.0, 0.65 * side)
         close = -sign * (apart + 0.5 * squeeze)
         path = [(0, 0, 0), (close, 0, 0), (close, 0, 0), (close, 0, lift), (close, 0, lift)]
-        jaw = wf.Box(center, size=(thick, 0.8 * side, 1.1 * side))
-        jaw = b.add_collider(jaw, path=([0.0, 0.3, 0.4, 0.8, 2.0], path), name=f"{name} jaw")
+        plate = wf.Box(center, size=(thick, 0.8 * side, 1.1 * side))
+        jaw = b.add_collider(plate, path=([0.0, 0.3, 0.4, 0.8, 2.0], path), name=f"{name} jaw")
         b.add_contact(block.surface("x-" if sign < 0.0 else "x+"), jaw, mu=mu, restitution=0.3, name=f"{name} grip")
     b.add_probe("middle", block.at((0.0, 0.0, half)))
     return b
