@@ -13,7 +13,6 @@ from scipy.optimize import brentq
 from ..base.errors import ModelError
 from ..kernels.terms.contact_data import contact_struct, facet_struct
 from ..kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH
-from ..laws import TimeLaw
 from ..model.contact_points import ContactPoints, body_mass_total, contact_points, effective_modulus
 from ..model.contacts import Collider, Contact
 from .time_laws import TimeLaws
@@ -215,11 +214,6 @@ class ContactTables:
         put("anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)
         put("axis", [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K], wp.vec3d)
         return out
-
-    def laws_of(self) -> list[TimeLaw]:
-        """Time laws of the colliders."""
-        pairs = [(k.law, k.rotation.angle if k.rotation else None) for k in self.colliders]
-        return [law for pair in pairs for law in pair if law is not None]
 
     def hash(self, h: Any) -> None:
         """Feed what defines the contacts into a hash."""
