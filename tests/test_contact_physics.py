@@ -190,7 +190,7 @@ def test_explicit_paper_contact_gains_little_energy_at_20_steps(model):
     assert rebound(model, "paper", "explicit", [1.0], 20)[0] ** 2 - 1.0 < 2e-3
 
 
-def impacts(count, steps, law, per_contact, e=0.5, smoothing=None, tol=1e-10):
+def impacts(count, steps, law, per_contact, e=0.5, smoothing=None):
     """Worlds with random speeds and gaps, without halvings: the simulation, and those that have no solution.
 
     Eq. (77) jumps by gamma v at touch: a mass has no solution where its free end lies so little inside that this
@@ -212,7 +212,7 @@ def impacts(count, steps, law, per_contact, e=0.5, smoothing=None, tol=1e-10):
     u[:, :, 2], v[:, :, 2] = gap[:, None], -speed[:, None]
     state.displacement.assign(u)
     state.velocity.assign(v)
-    solver = wf.NewtonPCG(tol=tol, max_halvings=0)
+    solver = wf.NewtonPCG(tol=1e-10, max_halvings=0)
     sim = wf.Simulation(model, state, dt=h, solver=solver, on_failure="freeze", record=False)
     sim.step(steps)
     gamma = math.sqrt(contact.stiffness) * law_numbers(contact)["normal_damping"] * beta_of(e)
@@ -227,10 +227,12 @@ def test_default_law_always_finds_a_solution(e, per_contact):
     assert not sim.status.any()
 
 
-@pytest.mark.parametrize("per_contact", [3, 20])
+STANDS = pytest.mark.xfail(strict=True, reason="1 of 300 stands at 4e-10, tol 1e-10: the rounding of its gap")
+
+
+@pytest.mark.parametrize("per_contact", [pytest.param(3, marks=STANDS), 20])
 def test_paper_patch_ramped_in_always_finds_a_solution(per_contact):
-    # at 1e-10 one of 300 stands at 4e-10, which is the rounding of its gap
-    sim, without = impacts(300, 3, "paper", per_contact, smoothing=1e-3, tol=1e-9)
+    sim, without = impacts(300, 3, "paper", per_contact, smoothing=1e-3)
     assert without.any()
     assert sim.status.sum() == 0
 

@@ -448,7 +448,8 @@ def test_a_term_may_not_take_the_array_of_a_control():
 
 
 def test_equal_controls_may_meet_on_a_component():
-    twice(wf.Control("jaw", 3), wf.Control("jaw", 3))
+    model = twice(wf.Control("jaw", 3), wf.Control("jaw", 3))
+    assert list(model.terms.laws.controls) == ["jaw"]
 
 
 def test_an_open_joint_is_told_at_the_start():

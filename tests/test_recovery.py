@@ -180,7 +180,7 @@ def test_a_refusal_by_rounding_is_named():
     b.clamp(bar.nodes("x-"))
     b.add_traction(bar.surface("x+"), (0, 0, -2.5e5))
     with pytest.raises(
-        wf.ConvergenceError, match=r"float32 can't hold this case: .* after [0-8] halvings.*take float64"
+        wf.ConvergenceError, match=r"float32 can't hold this case: .* after 0 halvings.*take float64"
     ):
         wf.solve_static(b.finalize(device="cpu", dtype="float32"), load_steps=3)
 
