@@ -411,7 +411,7 @@ def twice(*laws):
     b, body = bar()
     for law in laws:
         add_moving(b, body, law)
-    b.finalize(device="cpu")
+    return b.finalize(device="cpu")
 
 
 def rod(law):
