@@ -14,7 +14,7 @@ import warp as wp
 import warpfea as wf
 from warpfea import elements as families
 from warpfea.elements.quadrature import conical_triangle, lobatto_square, triangle_3, triangle_7
-from warpfea.model import assembly, contacts
+from warpfea.model import assembly, shapes
 from warpfea.model.contact_points import body_mass_total, contact_points, effective_modulus
 from warpfea.model.discretisation import Discretisation
 from warpfea.model.handles import SurfaceSet
@@ -296,11 +296,11 @@ def test_mass_of_a_density_that_varies_and_of_none():
 # shapes
 
 SHAPES = {
-    "half-space": (wf.HalfSpace((0, 2, 2), 0.5), contacts.HALF_SPACE, (0, 0, 0), math.inf),
-    "sphere": (wf.Sphere((1, 2, 3), 0.5), contacts.SPHERE, (0.5, 0, 0), 0.5),
-    "box": (wf.Box((1, 2, 3), (1, 2, 4), axes=TURN), contacts.BOX, (0.5, 1, 2), math.inf),
-    "capsule": (wf.Capsule((0, 0, 1), (2, 1, 3), 0.5), contacts.CAPSULE, (0.5, 1.5, 0), 0.5),
-    "cylinder": (wf.Cylinder((0, 0, 1), (2, 1, 3), 0.5), contacts.CYLINDER, (0.5, 1.5, 0), 0.5),
+    "half-space": (wf.HalfSpace((0, 2, 2), 0.5), shapes.HALF_SPACE, (0, 0, 0), math.inf),
+    "sphere": (wf.Sphere((1, 2, 3), 0.5), shapes.SPHERE, (0.5, 0, 0), 0.5),
+    "box": (wf.Box((1, 2, 3), (1, 2, 4), axes=TURN), shapes.BOX, (0.5, 1, 2), math.inf),
+    "capsule": (wf.Capsule((0, 0, 1), (2, 1, 3), 0.5), shapes.CAPSULE, (0.5, 1.5, 0), 0.5),
+    "cylinder": (wf.Cylinder((0, 0, 1), (2, 1, 3), 0.5), shapes.CYLINDER, (0.5, 1.5, 0), 0.5),
 }
 CLOSED = [name for name in SHAPES if name != "half-space"]
 

@@ -53,11 +53,11 @@ from .elements.sections import Rectangle  # noqa: E402
 from .laws import Control  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
 from .model.bodies import Body  # noqa: E402
-from .model.contacts import Box, Capsule, Cylinder, HalfSpace, Sphere  # noqa: E402
 from .model.description import Rotation  # noqa: E402
 from .model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noqa: E402
 from .model.joints import Joint  # noqa: E402
 from .model.model import Model  # noqa: E402
+from .model.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere  # noqa: E402
 from .model.state import State  # noqa: E402
 from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402

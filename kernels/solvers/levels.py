@@ -265,6 +265,14 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             k += lanes
         return (s0 + s1) + (s2 + s3)
 
+    @wp.func
+    def put_row(root: wp.array2d(dtype=T), s: T, world: int, row: int, x: wp.array2d(dtype=T)):
+        """x[row] = s, scaled back where the stored inverse is."""
+        if wp.static(scaled):
+            x[world, row] = s * root[world, row]
+        else:
+            x[world, row] = s
+
     @wp.kernel(module=module)
     def apply_dense(
         matrix: wp.array3d(dtype=S),
@@ -282,9 +290,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         row = wp.min(index / lanes, x.shape[1] - 1)
         s = scalar_sum(row_times(matrix, root, r, world, row, lane, r.shape[1], lanes), lanes)
         if lane == 0:
-            if wp.static(scaled):
-                s = s * root[world, row]
-            x[world, row] = s
+            put_row(root, s, world, row, x)
 
     @wp.kernel(module=module)
     def apply_triangle(
@@ -306,9 +312,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         n = wp.where(upper != 0, r.shape[1], row + 1)
         s = scalar_sum(row_times(matrix, root, r, world, row, first, n, lanes), lanes)
         if lane == 0:
-            if wp.static(scaled):
-                s = s * root[world, row]
-            x[world, row] = s
+            put_row(root, s, world, row, x)
 
     return _types.SimpleNamespace(
         module=module,

@@ -10,11 +10,12 @@ from ..base.errors import ModelError
 from ..elements.sections import Rectangle
 from ..materials import Material
 from ..model.bodies import Body
-from ..model.contacts import Collider, Contact, Shape
+from ..model.contacts import Collider, Contact
 from ..model.description import BodyForce, Description, Rotation
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint
 from ..model.model import Model
+from ..model.shapes import Shape
 from ..terms.evaluation import Evaluation
 from ..terms.term import Term
 from ..terms.term_set import TermSet
@@ -399,15 +400,13 @@ class ModelBuilder:
         self._own(surface, "add_contact", Body, SurfaceSet)
         if collider is None or isinstance(collider, (Body, SurfaceSet)):
             raise NotImplementedError("add_contact: contact between bodies is a later part; give a collider")
-        contact = make_contact(
+        made = make_contact(
             self.description, surface, collider, name, mu=mu, mu_static=mu_static, restitution=restitution, law=law,
             treatment=treatment, stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
             smoothing=smoothing, overlap=overlap, overlap_time=overlap_time,
         )  # fmt: skip
-        self.description.contacts.append(contact)
-        return contact
-
-    # the end
+        self.description.contacts.append(made)
+        return made
 
     def finalize(self, *, device: Any = None, dtype: str = "float64", worlds: int = 1) -> Model:
         """Make the constant Model of what was described so far; what is added later is for the next `finalize`.

@@ -12,9 +12,10 @@ from ..base.names import did_you_mean
 from ..laws import time_law
 from ..model.bodies import Body
 from ..model.contact_points import check_points
-from ..model.contacts import Collider, ColliderRotation, Contact, Shape
+from ..model.contacts import Collider, ColliderRotation, Contact
 from ..model.description import Description, Rotation
 from ..model.handles import SurfaceSet
+from ..model.shapes import Shape
 from .bodies import unused_name
 from .checks import vector
 

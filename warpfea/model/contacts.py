@@ -9,24 +9,9 @@ import numpy as np
 from ..laws import TimeLaw
 from .discretisation import Discretisation
 from .handles import SurfaceSet
-from .shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE, Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+from .shapes import Shape
 
-__all__ = [
-    "BOX",
-    "CAPSULE",
-    "CYLINDER",
-    "HALF_SPACE",
-    "SPHERE",
-    "Box",
-    "Capsule",
-    "Collider",
-    "ColliderRotation",
-    "Contact",
-    "Cylinder",
-    "HalfSpace",
-    "Shape",
-    "Sphere",
-]
+__all__ = ["Collider", "ColliderRotation", "Contact"]
 
 
 @dataclass(frozen=True, eq=False)

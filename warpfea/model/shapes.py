@@ -9,6 +9,7 @@ import numpy as np
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
+from ..kernels.terms.contact_shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 
 __all__ = [
     "BOX",
@@ -24,8 +25,6 @@ __all__ = [
     "Sphere",
 ]
 
-HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER = range(5)
-"""Kinds of shapes, as kernels know them."""
 ORTHONORMAL = 1e-6
 """How far from 0 and 1 the products of axes may be; they are made orthonormal to rounding."""
 

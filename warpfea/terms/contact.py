@@ -201,6 +201,7 @@ class Contact(Term):
     def begin(self, at: At, active: wp.array) -> None:
         """Colliders at the end of the attempt, points at its beginning."""
         s, m = at.scratch[self.name], self.model
+        s["finished"] = False
         self._poses(at, active)
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
@@ -282,7 +283,7 @@ class Contact(Term):
     @part("contact")
     def commit(self, at: At, accepted: wp.array) -> None:
         s, m, w = at.scratch[self.name], self.model, at.work
-        if not s.get("finished"):
+        if not s["finished"]:  # without a ledger nothing is booked
             self._finish(at, accepted)
         args = [self.tables.data, s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"]]
         at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), [*args, s["attempt"]])

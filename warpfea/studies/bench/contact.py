@@ -24,7 +24,7 @@ from ... import mesh as meshes
 from ...builder.builder import ModelBuilder
 from ...kernels.terms.contact_data import RECORD
 from ...materials import SVK
-from ...model.contacts import HalfSpace
+from ...model.shapes import HalfSpace
 from ...simulation.simulation import Simulation
 from ...terms.contact import Contact
 from .measure import solver, write
