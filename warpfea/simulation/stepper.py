@@ -59,9 +59,7 @@ class Stepper:
         self.launch = Launcher(model.device)
         self.terms = model.terms
         self.launch.parts |= model.terms.parts
-        self.kernels = step_kernels(
-            model.dtype, integrator.coefficients, integrator.static, integrator.multistep, model.terms.traits
-        )
+        self.kernels = step_kernels(model.dtype, integrator, model.terms.traits)
         vec3 = model.types.vec3
         state.sealed = False
         model.terms.laws.register(state)
@@ -111,6 +109,9 @@ class Stepper:
         w.step.any_running = self.running
         w.step.max_halvings = self.solver.max_halvings
         w.step.stabilise = self.integrator.stabilise
+        w.step.parameter = self.integrator.parameter
+        if self.integrator.takes_velocity:
+            w.step.b = w.array("b", (self.model.worlds,), wp.float64)
         if self.integrator.multistep:
             w.step.previous_h = state.previous_step
             w.step.previous_end = state.previous_end
