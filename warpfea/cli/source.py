@@ -34,7 +34,7 @@ class Source:
         label: what the user wrote.
         scene: the scene. values: what it is called with.
         parameters: what a summary says.
-        dt, integrator, dtype, device, tol, solver, inversion: of the run.
+        dt, integrator, dtype, device, tol, solver, inversion, error: of the run.
         load_steps, static_tol: of statics; None: a motion, the solver's default.
     """
 
@@ -42,7 +42,7 @@ class Source:
     scene: Scene[Any]
     values: dict[str, Any]
     parameters: dict[str, Any]
-    dt: float
+    dt: float | str
     integrator: str
     dtype: str
     device: str | None
@@ -51,6 +51,7 @@ class Source:
     inversion: str
     load_steps: int | None = None
     static_tol: float | None = None
+    error: float | None = None
 
     def model(self) -> Model:
         """Call the scene and finalize; an error of the scene's own code is a ModelError with file and line."""
@@ -77,6 +78,7 @@ class Source:
             return Simulation(
                 model,
                 dt=self.dt,
+                error=self.error,
                 integrator=self.integrator,
                 solver=solver,
                 inversion=self.inversion,
@@ -144,12 +146,16 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
             raise UsageError(f"--{given[0].replace('_', '-')} is for mesh files; {options.what} is a scene, use --set")
         values = found.resolve(found.parse(options.set))
         parameters = values
+    dt = options.dt or saved.get("dt") or found.dt
+    error = options.error or (saved.get("error") if dt == "auto" else None)
+    if (error is None) == (dt == "auto"):
+        raise UsageError("--dt auto needs --error, such as 1e-4" if dt == "auto" else "--error is for --dt auto")
     return Source(
         label=options.what,
         scene=found,
         values=values,
         parameters=parameters,
-        dt=options.dt or saved.get("dt") or found.dt,
+        dt=dt,
         integrator=options.integrator or saved.get("integrator") or found.integrator,
         dtype=options.dtype or saved.get("dtype") or "float64",
         device=options.device,
@@ -158,4 +164,5 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         inversion=options.inversion,
         load_steps=(options.load_steps or 10) if getattr(options, "static", False) else None,
         static_tol=options.tol,
+        error=error,
     )

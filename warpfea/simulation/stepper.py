@@ -14,6 +14,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
 from ..base.memory import enough_memory
+from ..kernels.step.adaptive import MAX_LEVEL
 from ..kernels.step.control import REPORT
 from ..kernels.step.ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
@@ -22,6 +23,7 @@ from ..solvers import Jacobi, NewtonPCG, make_loop
 from ..terms.checks import check_measured
 from ..terms.term import At, Term
 from ..terms.workspace import Workspace
+from .adaptive import Adapt, Adaptive
 from .integrators import Integrator
 from .predictor import Predictor
 
@@ -52,6 +54,7 @@ class Stepper:
         capture: bool,
         constraint_tol: float = 0.0,
         inversion: str = "refuse",
+        adapt: Adapt | None = None,
         on_compile: OnCompile | None = None,
     ) -> None:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
@@ -88,10 +91,11 @@ class Stepper:
         if not integrator.static and isinstance(solver, NewtonPCG):
             self.newton.candidates = [partial(self._candidate, kind) for kind in CANDIDATES]
         self.running = self.work.any_flag[2:3]
+        self.adaptive = Adaptive(self.at, self.newton, self.v_before, integrator, adapt) if adapt else None
         self._bind()
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
-        self.backup = state.like() if solver.max_halvings > 0 else None
+        self.backup = state.like() if solver.max_halvings > 0 or self.adaptive else None
         self._load_modules()
         self.start_terms()
         self._measure_potential(None)
@@ -107,7 +111,7 @@ class Stepper:
         w.step.status = state.status
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running = self.running
-        w.step.max_halvings = self.solver.max_halvings
+        w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
         w.step.stabilise = self.integrator.stabilise
         w.step.parameter = self.integrator.parameter
         if self.integrator.takes_velocity:
@@ -192,6 +196,8 @@ class Stepper:
         out |= self.newton.modules() | self.terms.modules(self.at)
         if self.backup is not None:
             out.add(state_kernels().module)
+        if self.adaptive:
+            out.add(self.adaptive.kernels.module)
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
@@ -245,7 +251,13 @@ class Stepper:
         m, w, launch = self.model, self.work, self.launch
         self.running.zero_()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
+        if self.adaptive:
+            assert self.backup is not None
+            self.adaptive.open()
+            self.backup.copy_rows(launch, w.step.running, self.state)
         wp.capture_while(self.running, self._attempt)
+        if self.adaptive:
+            self.adaptive.close()
         self._report()
 
     @labelled("commit")
@@ -283,7 +295,11 @@ class Stepper:
         for term in self.terms:
             term.begin(self.at, running)
         self.newton.run()
+        if self.adaptive:
+            self.adaptive.judge()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
+        if self.adaptive:
+            self.adaptive.settle()
         self.commit()
 
     def _candidate(self, kind: int) -> None:

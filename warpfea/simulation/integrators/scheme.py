@@ -18,6 +18,8 @@ class Integrator:
         order: order of convergence in h.
         multistep: keeps the state before the last, q_{n-1} and v_{n-1}.
         takes_velocity: q~ takes v_n.
+        estimate: wp.func (h, previous h) -> vec3d, the weights of v_{n+1}, v_n and v_{n-1}, of sum 0, that give the
+            local error in position, m; None: steps can't be adapted to it.
         static: no inertia; v is the displacement increment of a load step.
         parameter: the number that `coefficients` gets, such as a spectral radius.
         stabilise: N/m per kg, of statics: springs from the last equilibrium to the next, fading with the load.
@@ -29,6 +31,7 @@ class Integrator:
     multistep: bool = False
     takes_velocity: bool = False
     static: bool = False
+    estimate: Any = field(default=None, compare=False)  # follows from the coefficients
     # kernels don't depend on these
     parameter: float = field(default=0.0, compare=False)
     stabilise: float = field(default=0.0, compare=False)
