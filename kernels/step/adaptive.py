@@ -2,11 +2,10 @@
 
 A substep of h is accepted where its error e in position, over the model's size, is at most
 
-    error * max(h, pace) / horizon,
+    SHARE error max(h, SPREAD pace) / horizon,
 
-with `pace` a running mean of the accepted sizes. In a smooth motion both are equal, and local errors add up over the
-horizon to what was asked. A jump is passed in steps much smaller than those around it: each may then err as much as one
-of these, for there are few of them.
+with `pace` a running mean of the accepted sizes: local errors then add up over the horizon to a share of what was
+asked. Where a velocity jumps, e is of order h however short the substep is: the pace lets it pass.
 """
 
 import functools
@@ -15,7 +14,6 @@ from typing import Any
 
 import warp as wp
 
-from ..common.structs import topology_struct
 from ..common.types import kernel_module, precision
 from ..solvers.control import FAIL_ERROR, control_struct
 from ..solvers.pcg import pcg_struct
@@ -37,13 +35,11 @@ GROW = 0.7
 CUT = 3
 """Halvings of a refused substep at most: where a motion is not smooth, the estimate falls with a lower power of h."""
 SPREAD = 0.125
-"""Part of the pace that counts: an error of the last of several short steps is one of the velocity as well."""
+"""Part of the pace that counts. With 1 a load or contact that sets in leaves errors of velocity, e / h, which grow on."""
 START = 0.1
 """Part of the error asked for that a multistep scheme's first step, of order 1, may have."""
 MEMORY = 16.0
 """Substeps that the pace looks back over."""
-FILTER = 0.1
-"""Relative residual of the filter's solve."""
 
 
 @functools.cache
@@ -79,7 +75,6 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Step, Newton, PCG, Adaptive = step_struct(), control_struct(), pcg_struct(), adaptive_struct()
-    Topology = topology_struct(dtype)
     estimate, order, multistep = scheme.estimate, scheme.order, scheme.multistep
     module = kernel_module(f"adaptive_{dtype}_{scheme.variant}")
 
@@ -117,22 +112,21 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         world = wp.tid()
         good = step.running[world] != 0 and newton.failed[world] == 0 and newton.turned[world] == 0
         ctl.flags[world] = wp.where(good, 1, 0)
-        newton.active[world] = ctl.flags[world]
         ctl.error[world] = f64(0.0)
 
     @wp.kernel(module=module)
     def local_error(
         step: Step,
         ctl: Adaptive,
+        is_position: wp.array(dtype=T),
         free: wp.array(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3),
         v_before: wp.array2d(dtype=vec3),
-        e: wp.array2d(dtype=vec3),
     ):
-        """Local error of the substep in position, on free components, m."""
+        """Largest local error of a free position in the substep, m. A maximum does not depend on the order."""
         world, slot = wp.tid()
-        if ctl.flags[world] == 0:
+        if ctl.flags[world] == 0 or is_position[slot] == T(0.0):
             return
         previous = f64(0.0)
         if wp.static(multistep):
@@ -140,59 +134,10 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
                 previous = step.previous_h[world]
         c = estimate(step.h[world], previous)
         # differences first: the velocities themselves may be large beside them
-        out = T(c[0]) * (v[world, slot] - v_n[world, slot])
+        e = T(c[0]) * (v[world, slot] - v_n[world, slot])
         if wp.static(multistep):
-            out -= T(c[2]) * (v_n[world, slot] - v_before[world, slot])
-        e[world, slot] = wp.cw_mul(free[slot], out)
-
-    @wp.kernel(module=module)
-    def begin_filter(
-        step: Step,
-        ctl: Adaptive,
-        topo: Topology,
-        e: wp.array2d(dtype=vec3),
-        x: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-    ):
-        """x = 0, r = m M e with the mass factor m: H x = r is e without what the step damps at once."""
-        world, slot = wp.tid()
-        if ctl.flags[world] == 0:
-            return
-        s = vec3()
-        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            s += topo.mass_value[k] * e[world, topo.mass_column[k]]
-        x[world, slot] = vec3()
-        r[world, slot] = T(step.mass_factor[world]) * wp.cw_mul(topo.free[slot], s)
-
-    @wp.kernel(module=module)
-    def begin_solve(ctl: Adaptive, pcg: PCG):
-        """Begin the conjugate gradients of the filter; a loose tolerance will do."""
-        world = wp.tid()
-        pcg.active[world] = 0
-        if ctl.flags[world] == 0:
-            return
-        norm = wp.sqrt(pcg.sums[1, world])
-        pcg.rz[world] = pcg.sums[0, world]
-        pcg.norm[world] = norm
-        pcg.first_norm[world] = norm
-        pcg.target[world] = f64(FILTER) * norm
-        pcg.iterations[world] = 0
-        pcg.negative[world] = 0
-        pcg.flip[world] = 0
-        pcg.strict[world] = 0
-        pcg.energy[world] = f64(0.0)
-        pcg.seen[world] = f64(0.0)
-        if norm > f64(0.0) and pcg.sums[0, world] > f64(0.0):
-            pcg.active[world] = 1
-            wp.atomic_max(pcg.any_active, 0, 1)
-
-    @wp.kernel(module=module)
-    def largest(ctl: Adaptive, is_position: wp.array(dtype=T), x: wp.array2d(dtype=vec3)):
-        """Largest error of a position, m. A maximum does not depend on the order."""
-        world, slot = wp.tid()
-        if ctl.flags[world] == 0 or is_position[slot] == T(0.0):
-            return
-        size = f64(wp.length(x[world, slot]))
+            e -= T(c[2]) * (v_n[world, slot] - v_before[world, slot])
+        size = f64(wp.length(wp.cw_mul(free[slot], e)))
         if not wp.isfinite(size):
             size = f64(1.0e300)
         wp.atomic_max(ctl.error, world, size)
@@ -208,7 +153,6 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     def judge(step: Step, newton: Newton, pcg: PCG, ctl: Adaptive):
         """Refuse a substep whose error is too large; find the size of the next."""
         world = wp.tid()
-        newton.active[world] = 0
         if step.running[world] == 0:
             return
         h = step.h[world]
@@ -281,9 +225,6 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         open_step=open_step,
         begin_estimate=begin_estimate,
         local_error=local_error,
-        begin_filter=begin_filter,
-        begin_solve=begin_solve,
-        largest=largest,
         judge=judge,
         settle=settle,
         close_step=close_step,

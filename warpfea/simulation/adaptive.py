@@ -18,7 +18,6 @@ from .integrators import INTEGRATORS, Integrator
 
 if TYPE_CHECKING:
     from ..model.model import Model
-    from ..solvers.newton import NewtonLoop
     from ..terms.term import At
 
 __all__ = ["Adapt", "Adaptive", "adapt_of"]
@@ -92,9 +91,9 @@ class Adaptive:
         instants: when worlds meet.
     """
 
-    def __init__(self, at: At, newton: NewtonLoop, v_before: wp.array, scheme: Integrator, asked: Adapt) -> None:
+    def __init__(self, at: At, v_before: wp.array, scheme: Integrator, asked: Adapt, *, max_tries: int) -> None:
         model, work = at.model, at.work
-        self.model, self.work, self.launch, self.newton = model, work, at.launch, newton
+        self.model, self.work, self.launch = model, work, at.launch
         self.velocity, self.v_before, self.error, self.order = at.state.velocity, v_before, asked.error, scheme.order
         self.instants = Instants(model.terms.laws.laws, asked.interval, asked.horizon)
         self.kernels = adaptive_kernels(model.dtype, scheme)
@@ -103,7 +102,7 @@ class Adaptive:
         self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("kept",), **shapes)
         self.control.kept = at.state.register("adaptive", wp.float64, (len(KEPT),))
         self.control.tolerance = asked.error * float(model.size)
-        self.control.max_tries = newton.max_halvings
+        self.control.max_tries = max_tries
 
     def aim(self, time: np.ndarray) -> None:
         """Before a step from times (B,), s: all worlds go to their next instant."""
@@ -130,14 +129,9 @@ class Adaptive:
     def judge(self) -> None:
         """Before the kernel `end_attempt`: estimate the error of what has converged, and refuse what is too far off."""
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
-        flags = ctl.flags
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
-        args = [w.step, ctl, m.topology.free, w.v, self.velocity, self.v_before, w.p]
+        args = [w.step, ctl, m.is_position, m.topology.free, w.v, self.velocity, self.v_before]
         launch(k.local_error, self.dim, args)
-        launch(k.begin_filter, self.dim, [w.step, ctl, m.topology, w.p, w.direction, w.r])
-        self.newton.residual.linearise(flags)
-        self.newton.pcg.run(flags, lambda: launch(k.begin_solve, m.worlds, [ctl, w.pcg]))
-        launch(k.largest, self.dim, [ctl, m.is_position, w.direction])
         launch(k.judge, m.worlds, [w.step, w.newton, w.pcg, ctl])
 
     def settle(self) -> None:

@@ -91,7 +91,10 @@ class Stepper:
         if not integrator.static and isinstance(solver, NewtonPCG):
             self.newton.candidates = [partial(self._candidate, kind) for kind in CANDIDATES]
         self.running = self.work.any_flag[2:3]
-        self.adaptive = Adaptive(self.at, self.newton, self.v_before, integrator, adapt) if adapt else None
+        self.adaptive: Adaptive | None = None
+        if adapt:
+            tries = solver.max_halvings
+            self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True

@@ -195,7 +195,7 @@ class NewtonLoop:
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
         ctl.linear_stress = int(all(block.key.law in ANY_J for block in model.blocks))
-        self.max_work, self.max_halvings = options.max_work, options.max_halvings
+        self.max_work = options.max_work
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.nonpotential = int(traits.nonpotential or rate)
         ctl.classical = int(self.classical)

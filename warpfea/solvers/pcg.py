@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import warp as wp
@@ -46,16 +45,11 @@ class PCG:
         launch(k.start, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
         if m.component_count > 1:
             launch(k.silence, self.dim, [w.newton, m.component_of_slot, active, w.r])
-        self.run(active, lambda: launch(k.begin, m.worlds, [w.newton, w.pcg]))
-
-    def run(self, active: wp.array, begin: Callable[[], None]) -> None:
-        """Solve H x = r for x in work.direction from what is there and in work.r; `begin` sets the target."""
-        w, launch = self.work, self.launch
         self.translate(active)
         self.preconditioner.prepare(active)
         self._precondition(active)
         w.pcg.any_active.zero_()
-        begin()
+        launch(k.begin, m.worlds, [w.newton, w.pcg])
         launch(self.residual.newton.copy_active, self.dim, [w.z, w.pcg.active, w.p])
         wp.capture_while(w.pcg.any_active, self._iterate)
         self.preconditioner.judge(active)
