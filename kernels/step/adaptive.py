@@ -35,7 +35,7 @@ GROW = 0.7
 CUT = 3
 """Halvings of a refused substep at most: where a motion is not smooth, the estimate falls with a lower power of h."""
 SPREAD = 0.125
-"""Part of the pace that counts. With 1 loads and contacts that set in leave errors of velocity, e / h, which grow on."""
+"""Part of the pace that counts. With 1, loads and contacts that set in leave errors of velocity, which grow on."""
 START = 0.1
 """Part of the error asked for that a multistep scheme's first step, of order 1, may have."""
 MEMORY = 16.0

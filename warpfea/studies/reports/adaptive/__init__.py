@@ -35,11 +35,11 @@ FINEST = {"backward_euler": 16384, "bdf2": 8192}
 """Most fixed steps."""
 LEFT_OUT = {("impact", "backward_euler"): (1e-4, 1e-5)}
 """Not run: backward Euler would take 3e5 and 3e6 steps."""
-_found: dict[str, Any] = {}
+_found: dict[Any, Any] = {}
 
 
 def move(name: str, *, steps: int | None = None, error: float | None = None, integrator: str, tol: float = 1e-8) -> Any:
-    """Run a scene with fixed steps or to an error: positions at the instants (PIECES, nodes, 3), m, and what it took."""
+    """Run a scene with fixed steps or to an error: positions (PIECES, nodes, 3) at the instants, m; what it took; size."""
     build, end = CASES[name]()
     model = build.finalize(device="cpu")
     options: dict[str, Any] = {"integrator": integrator, "solver": wf.NewtonPCG(tol=tol), "ledger": False}
@@ -113,7 +113,7 @@ def adaptive() -> Iterator[dict[str, Any]]:
 
 
 def best_fixed(rows: Rows, true: float, order: int) -> tuple[float, bool]:
-    """Newton iterations of the cheapest fixed step with a true error, and whether it is smaller than any in the rows."""
+    """Newton iterations of the cheapest fixed step with a true error, and whether that is below those of the rows."""
     ranked = sorted((row["true"], row["newton"]) for row in rows)
     least, most = ranked[0]
     if true < least:
@@ -128,6 +128,6 @@ PARTS: dict[str, Part] = {f.__name__: f for f in (references, fixed, adaptive)}
 
 def run(options: argparse.Namespace) -> None:
     """Do `warpfea study adaptive`."""
-    options.device = options.device or "cpu"
+    options.device = "cpu"
     settings = {"instants": PIECES, "tol": 1e-8, "errors": list(ERRORS), "fine": FINE}
     run_tables(options, PARTS, settings)
