@@ -19,7 +19,7 @@ FRAME = 1.0 / 60.0
 """Interval of steps without a run, s: a frame of animations."""
 SLACK = 1e-9
 """Part of an interval within which two times are one."""
-KINK = 0.05
+KINK = 0.25
 """Change of slope, over the steepest slope of the law, that counts as a kink: samples of a smooth curve do not."""
 
 

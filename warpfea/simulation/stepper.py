@@ -256,8 +256,8 @@ class Stepper:
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
         if self.adaptive:
             assert self.backup is not None
-            self.adaptive.open()
             self.backup.copy_rows(launch, w.step.running, self.state)
+            self.adaptive.open()
         wp.capture_while(self.running, self._attempt)
         if self.adaptive:
             self.adaptive.close()

@@ -39,7 +39,7 @@ _found: dict[Any, Any] = {}
 
 
 def move(name: str, *, steps: int | None = None, error: float | None = None, integrator: str, tol: float = 1e-8) -> Any:
-    """Run a scene with fixed steps or to an error: positions (PIECES, nodes, 3) at the instants, m; what it took; size."""
+    """Run a scene with fixed steps or to an error: positions (PIECES, nodes, 3), m; what it took; the size, m."""
     build, end = CASES[name]()
     model = build.finalize(device="cpu")
     options: dict[str, Any] = {"integrator": integrator, "solver": wf.NewtonPCG(tol=tol), "ledger": False}
