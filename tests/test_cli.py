@@ -483,6 +483,8 @@ def test_help_teaches(capfd, command):
     assert "usage: warpfea" in out
     if command in ([], ["run"], ["render"], ["bench"]):
         assert "examples:" in out
+    if command in (["run"], ["render"]):
+        assert "contact_pressure, gap" in " ".join(out.split())
 
 
 def test_the_bar_of_the_compilation_goes_to_stderr(capfd):
