@@ -166,6 +166,11 @@ def _add_run(commands: Any) -> None:
         metavar="N",
         help="of --static (default 10); auto: the whole load at once, halved where it is refused",
     )
+    to.add_argument(
+        "--stabilise",
+        action="store_true",
+        help="of --static: springs that fade with the load, for bodies that only contact holds",
+    )
     out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
     out.add_argument(
         "--usd", action=Once, metavar="FILE", help="animation (.usdc, .usda) with stress and displacement; validated"
