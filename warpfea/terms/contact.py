@@ -15,6 +15,7 @@ from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
 from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
+from ..kernels.terms.contact_place import place_kernels
 from ..model.state import State
 from .contact_fields import contact_field, nodal_force
 from .contact_parameters import contact_parameters
@@ -58,6 +59,7 @@ class Contact(Term):
         self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
         self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        self.places = place_kernels(model.dtype) if self.tables.lumped else None
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -86,11 +88,15 @@ class Contact(Term):
         shapes: dict[str, tuple[int, ...]] = {
             "through": (B,), "elapsed": (B,), "omega": (B,), "changes": (B,), "asked_size": (B,),
             "asked_sums": (B, RELAX_LANES), "pick": (B, C), "picks": (B, C), "total": (B, C, len(RECORD)),
-            "touched": (B, R),
+            "touched": (B, R), "near": (B, R), "spot": (B, R), "best": (B, R), "moves": (B, C), "middle": (B, C),
+            "weight": (B, C, max(group.conn.shape[1] for group in t.groups)),
             "rows": (len(RECORD), B, R),
         }  # fmt: skip
         shapes |= dict.fromkeys(("place", "turn", "shift", "spin", "angle"), (B, K))
-        shapes |= {} if t.lumped else {"level": (1, 1)}
+        if not t.lumped:
+            shapes |= dict.fromkeys(("level", "near", "spot", "best", "moves", "middle"), (1, 1)) | {
+                "weight": (1, 1, 1)
+            }
         shapes |= {} if t.explicit else dict.fromkeys(("dead", "dead_spring"), (1, 1))
         out = attempt_struct(self.model.dtype)()
         for name, var in attempt_struct(self.model.dtype).vars.items():
@@ -103,6 +109,8 @@ class Contact(Term):
         shapes: dict[str, tuple[int, ...]] = {"born": (), "posed": ()}
         shapes |= dict.fromkeys(("place", "turn", "angle", "grown"), (len(self.tables.colliders),))
         for name, var in history_struct().vars.items():
+            if name == "lead" and not self.tables.moving:
+                continue
             shape = shapes.get(name, (self.tables.points,))
             setattr(out, name, make(f"contact_{name}", var.type.dtype, shape))
         return out
@@ -131,7 +139,7 @@ class Contact(Term):
         at.scratch[self.name] = {"history": self._history(at.state.register)}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
-        return [self.kernels.module]
+        return [self.kernels.module] + ([self.places.module] if self.places else [])
 
     def start(self, at: At, active: wp.array) -> None:
         """Colliders at the state's time, and what overlaps there.
@@ -160,7 +168,7 @@ class Contact(Term):
         history.posed.assign(posed)
         history.overlap.assign(overlap)
         history.born.assign(born)
-        gap, _ = self.at_points(state, history)
+        gap, _ = self.at_points(state, history, places=False)
         u = state.displacement.numpy()
         touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
         for k, contact in enumerate(self.tables.contacts):
@@ -177,7 +185,8 @@ class Contact(Term):
                     f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
                     "overlap='offset', which stores the overlap and lets it decay"
                 )
-            overlap[deep, first:last] = np.maximum(depth[deep], 0.0)
+            depth = np.maximum(depth[deep], 0.0)
+            overlap[deep, first:last] = depth.max(axis=1, keepdims=True) if contact.model == "sphere" else depth
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
@@ -232,14 +241,31 @@ class Contact(Term):
 
     def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
         """Choose the point of each lumped contact, at work.u."""
-        if not self.tables.lumped:
+        if not self.places:
             return
-        s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
-            at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
-        args = [self.tables.data, active, fresh, s["attempt"], w.newton.new_walls]
-        at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+        s, w = at.scratch[self.name], at.work
+        state = (at.state.displacement, at.state.velocity)
+        self._choose(at.launch, s, w.step.new_time, w.u, state, active, fresh, w.newton.new_walls)
+
+    def _choose(
+        self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
+        active: wp.array, fresh: int, changed: wp.array, *, settled: int = 0,
+    ) -> None:  # fmt: skip
+        """The deepest place of each lumped contact at displacements u, of an attempt that begins at `state`."""
+        k, t, B = self.places, self.tables, self.model.worlds
+        groups = [group for group in t.groups if group.lumped]
+        for group in groups:
+            args = [t.data, group.data, s["history"], time, u, active, s["attempt"]]
+            launch(k.levels, (B, group.count, group.data.points), args)
+        for group in groups:
+            args = [t.data, group.data, s["history"], time, u, active, s["attempt"]]
+            launch(k.seek, (B, group.count), args)
+        args = [t.data, s["row_start"], active, fresh, s["attempt"], changed]
+        launch(k.pick_deepest, (B, len(t.contacts)), args)
+        for group in groups:
+            if group.data.moving:
+                args = [t.data, group.data, s["history"], s["clock"], *state, active, settled, s["attempt"]]
+                launch(k.take, (B, group.count), args)
 
     @part("contact")
     def refresh(self, at: At, flags: wp.array) -> None:
@@ -309,7 +335,8 @@ class Contact(Term):
     # in a linear solve
 
     def keep(self, at: At) -> list[tuple[str, wp.array]]:
-        return [("stiffness", at.scratch[self.name]["attempt"].stiffness)]
+        attempt = at.scratch[self.name]["attempt"]
+        return [("stiffness", attempt.stiffness)] + ([("weight", attempt.weight)] if self.tables.moving else [])
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
         if "contact blocks" not in self.model.cache:
@@ -338,8 +365,9 @@ class Contact(Term):
         """The points' stiffness, which is positive."""
         m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
-            args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0], dq_dv, active, out]
-            at.launch(kernel, (m.worlds, count), args)
+            args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0]]
+            weight = kept[1] if self.tables.moving else at.scratch[self.name]["attempt"].weight
+            at.launch(kernel, (m.worlds, count), [*args, weight, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:
         return {contact_block_kernels(self.model.dtype).module}
@@ -410,8 +438,9 @@ class Contact(Term):
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         return contact_field(self.tables, field, body, state.worlds, lambda: self.at_points(state))
 
-    def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""
+    def at_points(self, state: State, history: Any = None, *, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; with `places`
+        the gap of a lumped contact's deepest place is that of the point next to it."""
         m, t, B = self.model, self.tables, state.worlds
         launch, laws = Launcher(m.device), m.terms.laws
         K, P, C = len(t.colliders), t.points, len(t.contacts)
@@ -440,11 +469,19 @@ class Contact(Term):
         for group in t.groups:
             dim = (B, group.count, group.data.points)
             launch(self.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
-            args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
-            launch(self.kernels.levels, dim, args)
-        launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt, zeros((B,), wp.int32)])
+        if self.places:
+            clock = clock_struct()()
+            clock.time, clock.still = state.time, 1
+            s = {
+                "history": history,
+                "attempt": attempt,
+                "clock": clock,
+                "row_start": m.array("contact", t.row_start, wp.int32),
+            }
+            pair = (state.displacement, state.displacement)
+            self._choose(launch, s, state.time, state.displacement, pair, every, 1, zeros((B,), wp.int32), settled=1)
         for group in t.groups:
             dim = (B, group.count, group.data.points)
-            args = [t.data, group.data, history, state.displacement, state.time, attempt, gap, force]
+            args = [t.data, group.data, history, state.displacement, state.time, attempt, int(places), gap, force]
             launch(self.books.at_points, dim, args)
         return gap.numpy(), force.numpy()
