@@ -9,16 +9,15 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError, PenetrationError
-from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
 from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
-from ..kernels.terms.contact_place import place_kernels
 from ..model.state import State
 from .contact_fields import contact_field, nodal_force
 from .contact_parameters import contact_parameters
+from .contact_places import Places, at_points
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
 from .time_laws import TimeLaws
@@ -59,7 +58,7 @@ class Contact(Term):
         self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
         self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
-        self.places = place_kernels(model.dtype) if self.tables.lumped else None
+        self.places = Places(self.tables) if self.tables.lumped else None
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -81,7 +80,7 @@ class Contact(Term):
 
     # for one simulation
 
-    def _attempt(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
+    def attempt_of(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
         """The struct of an attempt, with arrays from make(name, shape, dtype)."""
         t, B = self.tables, worlds
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
@@ -103,7 +102,7 @@ class Contact(Term):
             setattr(out, name, make(name, shapes.get(name, (B, P)), var.type.dtype))
         return out
 
-    def _history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+    def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
         """The struct of the history, with arrays from make(name, dtype, shape of a world)."""
         out = history_struct()()
         shapes: dict[str, tuple[int, ...]] = {"born": (), "posed": ()}
@@ -118,7 +117,7 @@ class Contact(Term):
     def allocate(self, work: Workspace, at: At) -> None:
         t, B = self.tables, self.model.worlds
         C, R = len(t.contacts), t.rows
-        attempt = self._attempt(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
+        attempt = self.attempt_of(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
         attempt.omega.fill_(1.0)
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "part"):
@@ -136,10 +135,10 @@ class Contact(Term):
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
     def register(self, at: At) -> None:
-        at.scratch[self.name] = {"history": self._history(at.state.register)}
+        at.scratch[self.name] = {"history": self.history_of(at.state.register)}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
-        return [self.kernels.module] + ([self.places.module] if self.places else [])
+        return [self.kernels.module] + ([self.places.kernels.module] if self.places else [])
 
     def start(self, at: At, active: wp.array) -> None:
         """Colliders at the state's time, and what overlaps there.
@@ -245,27 +244,8 @@ class Contact(Term):
             return
         s, w = at.scratch[self.name], at.work
         state = (at.state.displacement, at.state.velocity)
-        self._choose(at.launch, s, w.step.new_time, w.u, state, active, fresh, w.newton.new_walls)
-
-    def _choose(
-        self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
-        active: wp.array, fresh: int, changed: wp.array, *, settled: int = 0,
-    ) -> None:  # fmt: skip
-        """The deepest place of each lumped contact at displacements u, of an attempt that begins at `state`."""
-        k, t, B = self.places, self.tables, self.model.worlds
-        groups = [group for group in t.groups if group.lumped]
-        for group in groups:
-            args = [t.data, group.data, s["history"], time, u, active, s["attempt"]]
-            launch(k.levels, (B, group.count, group.data.points), args)
-        for group in groups:
-            args = [t.data, group.data, s["history"], time, u, active, s["attempt"]]
-            launch(k.seek, (B, group.count), args)
-        args = [t.data, s["row_start"], active, fresh, s["attempt"], changed]
-        launch(k.pick_deepest, (B, len(t.contacts)), args)
-        for group in groups:
-            if group.data.moving:
-                args = [t.data, group.data, s["history"], s["clock"], *state, active, settled, s["attempt"]]
-                launch(k.take, (B, group.count), args)
+        place = self.places.choose
+        place(at.launch, s, w.step.new_time, w.u, state, active, w.newton.new_walls, fresh=fresh)
 
     @part("contact")
     def refresh(self, at: At, flags: wp.array) -> None:
@@ -441,47 +421,4 @@ class Contact(Term):
     def at_points(self, state: State, history: Any = None, *, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; with `places`
         the gap of a lumped contact's deepest place is that of the point next to it."""
-        m, t, B = self.model, self.tables, state.worlds
-        launch, laws = Launcher(m.device), m.terms.laws
-        K, P, C = len(t.colliders), t.points, len(t.contacts)
-
-        def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=m.device)
-
-        every = wp.ones(B, dtype=wp.int32, device=m.device)
-        value = zeros((B, max(laws.count, 1)), wp.vec3d)
-        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
-        if history is None:
-
-            def take(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
-                return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
-
-            history = self._history(take)
-        attempt = self._attempt(B, lambda _, shape, dtype: zeros(shape, dtype))
-        attempt.speed.fill_(1.0)
-        if "contact_place" in state.specs:  # statics puts its time back to 0
-            attempt.place, attempt.turn = history.place, history.turn
-        else:
-            launch(self.kernels.poses, (B, K), [t.data, history, value, every, attempt])
-            attempt.shift.zero_()
-            attempt.spin.zero_()
-        gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
-        for group in t.groups:
-            dim = (B, group.count, group.data.points)
-            launch(self.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
-        if self.places:
-            clock = clock_struct()()
-            clock.time, clock.still = state.time, 1
-            s = {
-                "history": history,
-                "attempt": attempt,
-                "clock": clock,
-                "row_start": m.array("contact", t.row_start, wp.int32),
-            }
-            pair = (state.displacement, state.displacement)
-            self._choose(launch, s, state.time, state.displacement, pair, every, 1, zeros((B,), wp.int32), settled=1)
-        for group in t.groups:
-            dim = (B, group.count, group.data.points)
-            args = [t.data, group.data, history, state.displacement, state.time, attempt, int(places), gap, force]
-            launch(self.books.at_points, dim, args)
-        return gap.numpy(), force.numpy()
+        return at_points(self, state, history, places)
