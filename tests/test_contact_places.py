@@ -13,7 +13,7 @@ from warpfea.model.contact_points import RULES, lagrange_basis
 
 @pytest.mark.parametrize("count", [3, 4, 7, 9, 16, 25])
 def test_polynomials_of_the_points(count):
-    """1 at their own point and 0 at the others, a sum of 1 anywhere; along an edge of a triangle only its points count."""
+    """1 at their own point and 0 at the others, a sum of 1 anywhere; on an edge only its points count."""
     rule = next(known[count] for known in RULES.values() if count in known)
     basis, power = lagrange_basis(rule.points)
 
@@ -44,7 +44,7 @@ def pressed(mesh, shape, **options):
 
 
 @pytest.mark.parametrize("element", ["T4", "T10"])
-@pytest.mark.parametrize("x, y", [(0.031, 0.057), (0.083, 0.012)])
+@pytest.mark.parametrize(("x", "y"), [(0.031, 0.057), (0.083, 0.012)])
 def test_a_flat_face_is_touched_between_its_points(element, x, y):
     """A cube of 0.1 m over a ball of 20 mm: Hertz's force at the ball's top, wherever that is on the face."""
     R = 0.02
