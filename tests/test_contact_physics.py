@@ -351,55 +351,6 @@ def test_smooth_law_creeps_as_its_formula_says():
     assert sim.probe("p").velocity[0, -1, 0] == pytest.approx(v_eps * part / math.sqrt(1.0 - part**2), rel=1e-9)
 
 
-@pytest.mark.parametrize("element", ["T4", "T10"])
-def test_a_block_pressed_to_a_wall_does_not_creep(element):
-    b = wf.ModelBuilder(gravity=(0, 0, -G))
-    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element=element)
-    body = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000.0), name="cube")
-    b.add_traction(body.surface("x+"), (-2000.0, 0, 0))
-    wall = b.add_collider(wf.HalfSpace((1, 0, 0)))
-    contact = b.add_contact(body.surface("x-"), wall, mu=1.0, restitution=0.5)
-    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, solver=wf.NewtonPCG(tol=1e-10), record=False)
-    sim.step(1000)
-    before = sim.positions(body).copy()
-    sim.step(1000)
-    assert np.abs(sim.positions(body) - before).max() < 1e-11
-    assert force_of(record(sim, contact)) == pytest.approx([20.0, 0.0, G], rel=1e-6, abs=1e-6)
-
-
-def turned_block(law):
-    """Places of a block on a plate that turns at 10 rad/s, in its frame, after each of ten turns."""
-    h, speed, rest, ramp = 2.0 * math.pi / 10.0 / 200, 10.0, 200, 20
-    times = h * np.arange(rest + ramp + 2001)
-    angle = speed * h * np.maximum(np.arange(len(times)) - rest - ramp / 2, 0.0)
-    angle[rest : rest + ramp + 1] = 0.5 * speed * h * np.arange(ramp + 1) ** 2 / ramp
-    b = wf.ModelBuilder(gravity=(0, 0, -G))
-    path = wf.Rotation(anchor=(0.05, 0.05, 0), axis=(0, 0, 1), angle=(times, angle))
-    plate = b.add_collider(wf.HalfSpace((0, 0, 1)), path=path)
-    body = cube(b, origin=(0.02, 0, 0), material=wf.SVK(E=1e8, nu=0.3, density=1000.0))
-    b.add_contact(body.surface("z-"), plate, mu=0.8, restitution=0.5, stiffness=0.1, law=law)
-    sim = wf.Simulation(b.finalize(device="cpu"), dt=h, solver=wf.NewtonPCG(tol=1e-10), record=False)
-    sim.step(rest + ramp)
-    places = []
-    for turn in range(10):
-        sim.step(200)
-        a = angle[rest + ramp + 200 * (turn + 1)]
-        R = np.array([[math.cos(a), math.sin(a), 0], [-math.sin(a), math.cos(a), 0], [0, 0, 1]])
-        places.append((sim.positions(body)[0] - (0.05, 0.05, 0)) @ R.T)
-    return np.array(places)
-
-
-def test_a_stuck_block_stays_on_a_turning_plate():
-    places = turned_block("default")
-    assert np.abs(places[-1] - places[0]).max() < 1e-5 * 0.1
-
-
-def test_the_paper_s_law_walks_on_a_turning_plate():
-    """Eq. (78) does not turn the spring with the bodies: stated among the law's defects."""
-    places = turned_block("paper")
-    assert 1e-4 < np.abs(places[-1] - places[0]).max() / 0.1 < 0.1
-
-
 @pytest.mark.parametrize(("tangent", "slides"), [(0.249, False), (0.251, True)])
 def test_static_friction_of_one_contact(tangent, slides):
     model, sim, contact = block("sphere", mu=0.2, mu_static=0.25, guided=True, g=(1e-2, 0, 0))
