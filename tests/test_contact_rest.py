@@ -32,7 +32,7 @@ def assert_still(row):
 def assert_stuck(row):
     assert row["moved"] < 1e-5
     assert max(row["moved_by_turn"]) < 1e-5
-    assert abs(row["ledger_residual"]) < 1e-9
+    assert abs(row["ledger_residual"]) < 1e-7  # J, of 0.1 J in motion, over thousands of steps at tol 1e-10
 
 
 def assert_walking(row):
