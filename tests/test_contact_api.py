@@ -328,7 +328,7 @@ def test_a_checkpoint_of_other_values_is_refused(tmp_path):
     for name, value in (("pad.mu", 0.4), ("pad.restitution", 0.4), ("pad.stiffness", 2), ("floor.offset", -0.003)):
         other = thrown()[2]
         other.set_parameter(name, value)
-        with pytest.raises(wf.CheckpointError, match="another model"):
+        with pytest.raises(wf.CheckpointError, match=r"another model: .*contacts differ"):
             wf.Simulation(other, dt=DT).resume(path)
     same = thrown(mu=0.3)[2]
     same.set_parameter("pad.mu", 0.5)
