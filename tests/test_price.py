@@ -31,7 +31,7 @@ def assert_priced(row):
         assert [name for name in full["modules"] if TRACES[feature] in name], feature
     for what in ("bytes", "launches", "unknowns"):
         assert own[what] < full[what], what
-    assert row["moved"] < 1e-5
+    assert row["moved"] < 1e-4  # both to the tolerance of the scene
 
 
 def test_no_scene_pays_for_what_it_does_not_use():
