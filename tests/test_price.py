@@ -45,7 +45,7 @@ def test_no_scene_pays_for_what_it_does_not_use():
         assert_priced(row)
         own, full = row["shipped"]["ms_per_step"], row["all"]["ms_per_step"]
         assert row["ratio"] == pytest.approx(full / own)
-        assert row["ratio"] > 1.3, row["scene"]
+        assert row["ratio"] > 1.0, row["scene"]
 
 
 def test_a_scene_is_priced_as_in_the_table(tmp_path, capfd):
