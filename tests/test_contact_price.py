@@ -13,7 +13,6 @@ from warpfea.studies.bench.contact_solves import BESIDE, SOLVES, solve_rows
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 FILES = {"contact_cpu.json": ("cpu", 8000, 1.3), "contact_h200.json": ("cuda", 100_000, 1.1)}
 """Device, unknowns at least, and most that a step may take over one without contact where the bodies are apart."""
-APART = pytest.mark.xfail(strict=True, reason="1.14 on the H200: a launch per product, and six small ones per iterate")
 
 
 def content_of(name):
@@ -45,7 +44,7 @@ def test_resting_and_sliding(name):
         assert rows[scene]["carried"] > 0.9, "it is not in touch"
 
 
-@pytest.mark.parametrize("name", ["contact_cpu.json", pytest.param("contact_h200.json", marks=APART)])
+@pytest.mark.parametrize("name", FILES)
 def test_apart(name):
     rows = rows_of(name)
     assert rows["apart"]["newton_per_step"] == rows["none"]["newton_per_step"]
