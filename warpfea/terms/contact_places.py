@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,9 +12,6 @@ from ..kernels.terms.contact_data import clock_struct
 from ..kernels.terms.contact_place import place_kernels
 from ..model.state import State
 from .contact_tables import ContactTables
-
-if TYPE_CHECKING:
-    from .contact import Contact
 
 __all__ = ["Places", "at_points"]
 
@@ -60,8 +57,8 @@ class Places:
                 launch(k.take, (B, group.count), args)
 
 
-def at_points(term: Contact, state: State, history: Any = None, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """See `Contact.at_points`."""
+def at_points(term: Any, state: State, history: Any = None, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """See `Contact.at_points`; `term` is the term."""
     m, t, B = term.model, term.tables, state.worlds
     launch, laws = Launcher(m.device), m.terms.laws
     K, P = len(t.colliders), t.points
