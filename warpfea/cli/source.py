@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import argparse
 import pathlib
-import traceback
 from dataclasses import dataclass
 from typing import Any
 
 from ..base.console import compile_bar
-from ..base.errors import Error, ModelError, UsageError
-from ..base.names import did_you_mean
-from ..builder.scene import Scene, find, load_file
+from ..base.errors import UsageError
+from ..builder.scene import Scene, load_file, locate, split_name
 from ..mesh import FORMATS
 from ..model.model import Model
 from ..simulation.simulation import Simulation
@@ -53,17 +51,8 @@ class Source:
     static_tol: float | None = None
 
     def model(self) -> Model:
-        """Call the scene and finalize; an error of the scene's own code is a ModelError with file and line."""
-        try:
-            builder = self.scene.build(self.values)
-        except (Error, NotImplementedError):
-            raise
-        except Exception as error:
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            raise ModelError(
-                f"scene {self.scene.name!r}: {type(error).__name__}: {error} ({last.filename}:{last.lineno})"
-            ) from error
-        return builder.finalize(device=self.device, dtype=self.dtype)
+        """Call the scene and finalize."""
+        return self.scene.build(self.values).finalize(device=self.device, dtype=self.dtype)
 
     def simulation(self, model: Model, show: bool | None) -> Simulation:
         """The simulation, or with load steps that of statics; shows a bar while kernels compile."""
@@ -102,20 +91,12 @@ def load(file: str) -> dict[str, Scene[Any]]:
 
 def find_scene(what: str) -> Scene[Any]:
     """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
-    file, colon, name = what.rpartition(":")
-    if not (colon and file.endswith(".py")):
-        file, name = what, ""
-    if not file.endswith(".py"):
+    file, _ = split_name(what)
+    if file is None:
         _check_suffix(what)
-        return find(what)
-    found = load(file)
-    if not name:
-        if len(found) > 1:
-            raise UsageError(f"{file} holds several scenes, give {file}:NAME with one of {', '.join(found)}")
-        return next(iter(found.values()))
-    if name not in found:
-        raise UsageError(f"{file} has no scene {name!r}; it has {', '.join(found)}{did_you_mean(name, found)}")
-    return found[name]
+    else:
+        existing(file)
+    return locate(what)
 
 
 def _check_suffix(what: str) -> None:
