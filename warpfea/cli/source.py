@@ -12,9 +12,11 @@ from ..base.errors import UsageError
 from ..builder.scene import Scene, load_file, locate, split_name
 from ..mesh import FORMATS
 from ..model.model import Model
+from ..simulation.methods import method
 from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
+from ..studies.accuracy.problems import find_problem, problem_names
 from .arguments import existing
 from .part import OPTIONS, part_scene
 
@@ -66,7 +68,7 @@ class Source:
             return Simulation(
                 model,
                 dt=self.dt,
-                integrator=self.integrator,
+                integrator=method(self.integrator),
                 solver=solver,
                 inversion=self.inversion,
                 on_compile=bar,
@@ -90,7 +92,9 @@ def load(file: str) -> dict[str, Scene[Any]]:
 
 
 def find_scene(what: str) -> Scene[Any]:
-    """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
+    """The scene NAME, one made for studies too, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
+    if what in problem_names():
+        return find_problem(what)
     file, _ = split_name(what)
     if file is None:
         _check_suffix(what)

@@ -23,6 +23,7 @@ from .finer import finer_motion, finer_setting
 from .measure import DONE, REFUSED, Outcome, step_options
 from .measure import measure as run_once
 from .motion import RESOLVED, Motion, distances, known_motion
+from .problems import find_problem, problem_names
 from .report import MEASURES, Row, Study, with_orders, with_pareto
 from .settings import OPTIONS, Axes, Setting, make_axes, product
 from .split import split as parts_of_error
@@ -157,7 +158,7 @@ def study(
 def _scene(given: Any, dt: float | None, t_end: float | None) -> tuple[str, Scene[Any]]:
     """A scene, and how the command line names it."""
     if isinstance(given, str):
-        return given, locate(given)
+        return given, find_problem(given) if given in problem_names() else locate(given)
     if isinstance(given, Scene):
         return given.name, given
     if callable(given):
