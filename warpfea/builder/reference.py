@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ModelError
+from ..base.usercode import user_code
 
 __all__ = ["Reference", "read_reference", "reference_of"]
 
@@ -70,7 +71,8 @@ def reference_of(given: Any, parameters: Mapping[str, Any]) -> Reference | None:
         missing = [name for name, p in wanted.items() if name not in parameters and p.default is p.empty]
         if missing:
             raise ModelError(f"reference {given.__name__!r}: {missing[0]!r} is no parameter of the scene")
-        given = given(**{name: parameters[name] for name in wanted if name in parameters})
+        with user_code(f"reference {given.__name__!r}"):
+            given = given(**{name: parameters[name] for name in wanted if name in parameters})
     if given is None or isinstance(given, Reference):
         return given
     if isinstance(given, Mapping):

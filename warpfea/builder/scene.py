@@ -23,15 +23,15 @@ import pathlib
 import pkgutil
 import re
 import sys
-import traceback
 import types
 import typing
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec
 
-from ..base.errors import Error, ModelError
+from ..base.errors import ModelError
 from ..base.names import did_you_mean
+from ..base.usercode import user_code
 
 if TYPE_CHECKING:
     from .builder import ModelBuilder
@@ -156,15 +156,8 @@ class Scene(Generic[P]):
         """
         from .builder import ModelBuilder
 
-        try:
+        with user_code(f"scene {self.name!r}"):
             out = self.function(**given)  # type: ignore[call-arg]
-        except (Error, NotImplementedError):
-            raise
-        except Exception as error:
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            raise ModelError(
-                f"scene {self.name!r}: {type(error).__name__}: {error} ({last.filename}:{last.lineno})"
-            ) from error
         if not isinstance(out, ModelBuilder):
             raise ModelError(f"scene {self.name!r} must return a ModelBuilder, it returned {type(out).__name__}")
         return out

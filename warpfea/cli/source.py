@@ -92,7 +92,7 @@ def load(file: str) -> dict[str, Scene[Any]]:
 
 
 def find_scene(what: str) -> Scene[Any]:
-    """The scene NAME, one made for studies too, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
+    """The scene NAME, of studies too, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
     if what in problem_names():
         return find_problem(what)
     file, _ = split_name(what)

@@ -48,6 +48,7 @@ def accuracy(options: argparse.Namespace) -> int:
         repeat=options.repeat,
         limit=options.limit,
         out=options.out,
+        name=options.name,
         progress=progress(options),
         what=options.what,
         words=options.words,

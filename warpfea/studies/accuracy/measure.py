@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...base.errors import CapacityError, ConstraintError, ConvergenceError, ModelError
+from ...base.usercode import user_code
 from ...builder.scene import Scene
 from ...model.model import Model
 from ...simulation.methods import method
@@ -24,8 +25,9 @@ from .settings import Setting
 __all__ = ["DONE", "FAILED", "LONG", "REFUSED", "Outcome", "measure", "step_options"]
 
 DONE, FAILED, LONG, REFUSED = "done", "failed", "too long", "refused"
-KINDS = ("kinetic", "strain", "potential", "work", "viscous", "contact", "contact_loss", "friction", "collider_work")
-"""Columns of the energy ledger that say how much energy is exchanged."""
+HELD = ("kinetic", "strain", "contact")
+CHANGES = ("potential", "work", "viscous", "contact_loss", "friction", "collider_work")
+"""Columns of the energy ledger that say how much energy there is to exchange: their size, or their change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,10 @@ def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | 
         return Outcome(first.status, first.why, numbers)
     probes = {p.name: first.sim.probe(p.name) for p in model.probes}
     times = next(iter(probes.values())).time
-    values = None if scene.field is None else np.asarray(scene.field(first.sim), dtype=float)
+    values = None
+    if scene.field is not None:
+        with user_code(f"field of scene {scene.name!r}"):
+            values = np.asarray(scene.field(first.sim), dtype=float)
     return Outcome(
         DONE,
         "",
@@ -172,11 +177,11 @@ class _Run:
         """What the run took and lost: counts over all steps, bytes on the device, energies in J.
 
         drift: largest of |change of energy + losses of the model - work|, which is what the steps lost or won, with
-        what the solver left; exchanged: largest change of one kind of energy.
+        what the solver left; exchanged: the most that one kind of energy held (kinetic, strain), or changed by.
         """
         sim, info = self.sim, self.sim.model.info()
         table = {name: np.array([float(e[name][0]) for e in self.energies]) for name in self.energies[0]}
-        kinds = [np.abs(table[name] - table[name][0]).max() for name in KINDS if name in table]
+        kinds = [np.abs(table[name] - (name in CHANGES) * table[name][0]).max() for name in (*HELD, *CHANGES)]
         drift = np.abs(table["ledger_residual"] - table["integrator"])
         return {
             "time": float(sim.time[0]),

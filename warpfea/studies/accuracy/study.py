@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pathlib
+import re
 import statistics
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -59,6 +60,7 @@ def study(
     repeat: int = 3,
     limit: float | None = None,
     out: str | pathlib.Path | None = None,
+    name: str | None = None,
     progress: bool | None = None,
     what: str | None = None,
     words: Sequence[str] | None = None,
@@ -85,6 +87,7 @@ def study(
         repeat: runs of each setting for the times; those longer than 2 s are not repeated.
         limit: s, after which a run is given up.
         out: folder for NAME.json, .csv, .png, and NAME.points.jsonl, from which an interrupted study goes on.
+        name: of the files; by default that of the scene.
         progress: show a bar; by default when stderr is a terminal.
         what, words: how the command line names the scene, and its words, for the files.
 
@@ -98,25 +101,27 @@ def study(
         KeyboardInterrupt: after Ctrl-C; finished runs are kept in `out`.
     """
     named, found = _scene(scene, dt, t_end)
-    what = what or named
+    what, name = what or named, name or found.name
+    if not re.fullmatch(r"[\w.-]+", name):
+        raise ModelError(f"study: name {name!r} is to be part of names of files: letters, digits, _ - and .")
     sweep = dict(over or {})
-    for name, many in (("methods", methods), ("error", error)):
+    for option, many in (("methods", methods), ("error", error)):
         if many is not None:
-            if name in sweep:
-                raise ModelError(f"study: {name} is given twice")
-            sweep[name] = many
+            if option in sweep:
+                raise ModelError(f"study: {option} is given twice")
+            sweep[option] = many
     _check_choice("measure", measure, MEASURES)
     _check_choice("split", split, SPLITS)
     if not (isinstance(repeat, int) and repeat >= 1):
         raise ModelError(f"study: repeat = {repeat!r} must be a positive whole number")
-    for name, value in (("target", target), ("limit", limit), ("dt", dt), ("t_end", t_end), ("tol", tol)):
+    for option, value in (("target", target), ("limit", limit), ("dt", dt), ("t_end", t_end), ("tol", tol)):
         if value is not None and not (math.isfinite(value) and value > 0.0):
-            raise ModelError(f"study: {name} = {value!r} must be a positive finite number")
+            raise ModelError(f"study: {option} = {value!r} must be a positive finite number")
     axes = make_axes(found, sweep, mesh)
     values = dict(parameters or {})
     _check_names("parameter", values, found.parameters)
     _check_names("finer", finer or {}, [*OPTIONS, *found.parameters])
-    swept = {name: many[0] for name, many in axes.over.items() if name not in OPTIONS}
+    swept = {axis: many[0] for axis, many in axes.over.items() if axis not in OPTIONS}
     base = Setting(
         method=found.integrator,
         dt=float(dt or found.dt),
@@ -128,7 +133,7 @@ def study(
         t_end=float(t_end or found.t_end),
         values=found.resolve(swept | values),
     )
-    make_axes(found, {name: [base.get(name)] for name in ("method", "solver", "dtype")}, None)
+    make_axes(found, {option: [base.get(option)] for option in ("method", "solver", "dtype")}, None)
     settings = product(base, axes)
     for setting in settings:
         step_options(setting)
@@ -138,7 +143,7 @@ def study(
     with quiet_warp():
         _check_probes(found, settings[0], probes)
         folder = None if out is None else prepare(out)
-        store = Store(folder and folder / f"{found.name}.points.jsonl", lambda dev: code_version(found, dev))
+        store = Store(folder and folder / f"{name}.points.jsonl", lambda dev: code_version(found, dev))
         work = _Work(found, axes, store, repeat, limit, progress, known, probes, dict(finer or {}), measure, base)
         rows, references, motions = work.rows(settings)
         answer = _answer(rows, target)
@@ -149,7 +154,7 @@ def study(
         "t_end": base.t_end, "repeat": repeat, "limit": limit, "split": split, "parameters": base.values, "dt": base.dt,
         "tol": base.tol, "solver": solver, "dtype": dtype, "integrator": base.method, "probes": probes,
     }  # fmt: skip
-    result = Study(found.name, what, rows, axes, measure, target, references, told, answer, command)
+    result = Study(name, what, rows, axes, measure, target, references, told, answer, command)
     if folder is not None:
         result.write(folder, words or ["study", what])
     return result
@@ -248,7 +253,12 @@ class _Work:
         self.known, self.chosen, self.finer, self.measured, self.base = known, chosen, finer, measured, base
         self.show = sys.stderr.isatty() if progress is None else progress
 
-    def run(self, setting: Setting, repeat: int = 1, limit: float | None = None) -> Outcome:
+    def run(self, setting: Setting) -> Outcome:
+        """The outcome of a setting beside those of the sweep."""
+        self.bar.total = (self.bar.total or 0) + 1
+        return self.point(setting, 1, None)
+
+    def point(self, setting: Setting, repeat: int, limit: float | None) -> Outcome:
         """The outcome of a setting, run unless it is known."""
         found = self.store.get(setting, repeat, limit)
         if found is None:
@@ -276,7 +286,7 @@ class _Work:
                     best = finer_setting(group, self.axes, self.finer, self.base.dt or self.scene.dt)
                     motions[name] = finer_motion(best, self.axes, self.chosen, self.run)
                 for setting in group:
-                    outcomes[id(setting)] = self.run(setting, self.repeat, self.limit)
+                    outcomes[id(setting)] = self.point(setting, self.repeat, self.limit)
                 done = [o for s in group if (o := outcomes[id(s)]).status == DONE]
                 if known is not None and done:
                     motions[name] = known_motion(known, self.chosen, done[0], self.base.t_end)
