@@ -43,10 +43,10 @@ def draw(study: Any, path: pathlib.Path) -> None:
     front = sorted((r.seconds, r.error) for r in study.rows if r.pareto and r.error)
     if front:
         axes.plot(*zip(*front), color="0.6", linewidth=5.0, alpha=0.35, zorder=1, label="Pareto front")
+    _frame(axes, study)
     _reference(axes, study)
     if study.target is not None:
         axes.axhline(study.target, color="0.3", linestyle="--", linewidth=1.0, label=f"target {study.target:g}")
-    _frame(axes, study)
     failed = [r for r in study.rows if r.status != DONE]
     if failed:
         at = [r.seconds or axes.get_xlim()[0] for r in failed]
@@ -85,8 +85,7 @@ def _curve(axes: Any, label: str, rows: list[Any], color: str, marker: str) -> N
 def _reference(axes: Any, study: Any) -> None:
     """A band below which errors are not resolved."""
     own = max((ref["own_error"].get(study.measure, 0.0) for ref in study.references), default=0.0)
-    errors = [r.error for r in study.rows if r.error]
-    if own > 0.0 and errors and RESOLVED * own > 0.1 * min(errors):
+    if RESOLVED * own > axes.get_ylim()[0]:
         text = f"{RESOLVED:g} times the error of the reference ({number(own, 2)})"
         axes.axhline(RESOLVED * own, color="0.4", linestyle=":", linewidth=1.2, label=text)
 
