@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...base.errors import CapacityError, ConstraintError, ConvergenceError, ModelError
+from ...base.errors import CapacityError, ConstraintError, ConvergenceError, Error
 from ...base.usercode import user_code
 from ...builder.scene import Scene
 from ...model.model import Model
@@ -101,7 +101,7 @@ def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | 
         runs = repeated(lambda: _Run(model, setting, limit), lambda run: run.seconds, repeat)
     except (ConvergenceError, ConstraintError, CapacityError) as error:  # before the first step
         return Outcome(FAILED, _line(error))
-    except (ModelError, NotImplementedError) as error:
+    except (Error, NotImplementedError) as error:
         return Outcome(REFUSED, _line(error))
     first = runs[0]
     numbers = first.numbers() | {"setup_s": setup, "seconds": [run.seconds for run in runs]}

@@ -89,6 +89,8 @@ class Row:
         """What the rows of one curve share."""
         along = ("dt", "error") if axes.along == "step" else (axes.along,)
         first = {"method": self.setting.method} | {k: v for k, v in self.swept.items() if k not in along}
+        if axes.along == "step" and self.setting.error is not None:
+            first["steps"] = "adaptive"
         return tuple(first.items())
 
 
@@ -188,12 +190,12 @@ class Study(Sequence[Row]):
     def fits(self) -> list[dict[str, Any]]:
         """Order of each curve along its own size, by least squares over the rows that are resolved."""
         out: list[dict[str, Any]] = []
-        along = "dt" if self.axes.along == "step" else self.axes.along
-        if along not in self.axes.sizes:
-            return out
         for label, rows in self.curves().items():
-            good = [r for r in rows if r.resolved and r.error and r.swept.get(along) is not None]
-            if len(good) > 1:
+            along = self.axes.along
+            if along == "step":
+                along = "dt" if rows[0].setting.error is None else "error"
+            good = [r for r in rows if r.resolved and r.error and r.swept.get(along or "") is not None]
+            if along in self.axes.sizes and len(good) > 1:
                 sizes = np.log([mean_size(r.swept[along]) for r in good])
                 slope = float(np.polyfit(sizes, np.log([r.error or 1.0 for r in good]), 1)[0])
                 slope = -slope if along in self.axes.mesh else slope
