@@ -22,7 +22,8 @@ from warpfea.studies.accuracy import Row, Study
 from warpfea.studies.accuracy.measure import Outcome
 from warpfea.studies.accuracy.motion import interpolant, observed
 from warpfea.studies.accuracy.problems import find_problem, problem_names
-from warpfea.studies.accuracy.settings import make_axes, parse_over
+from warpfea.studies.accuracy.report import with_orders
+from warpfea.studies.accuracy.settings import make_axes, parse_over, product
 
 G, T = 9.81, 0.04
 START = np.array([1.0, 0.5, 0.5])
@@ -186,6 +187,21 @@ def test_a_parameter_of_the_problem_has_references_of_its_own():
     assert [ref["values"] for ref in found.references] == [{"gravity": G}, {"gravity": 2 * G}]
     assert found.references[1]["travel"] == pytest.approx(2 * found.references[0]["travel"], rel=1e-3)
     assert found[0].error == pytest.approx(found[2].error, rel=1e-3)
+
+
+def test_steps_that_adapt_stand_beside_fixed_ones(fall):
+    """Rows made by hand: a curve of their own, the slope of true against asked error, and the command that runs one."""
+    axes = make_axes(falling, {"dt": [1e-2, 5e-3], "error": [1e-2, 1e-3], "method": ["bdf2"]}, None)
+    settings = product(fall[0].setting, axes)
+    assert [(s.dt, s.error) for s in settings] == [(1e-2, None), (5e-3, None), (None, 1e-2), (None, 1e-3)]
+    errors = [4e-2, 1e-2, 2e-2, 2e-3]
+    rows = [Row(s, {"dt": s.dt, "error": s.error, "method": s.method}, "done", error=e, resolved=True, seconds=1.0)
+            for s, e in zip(settings, errors)]  # fmt: skip
+    found = Study("falling", "falling", with_orders(rows, axes), axes, "l2", None, [], {}, None, None)
+    assert list(found.curves()) == ["bdf2", "bdf2 steps=adaptive"]
+    assert [(f["size"], round(f["order"], 6)) for f in found.fits()] == [("dt", 2.0), ("error", 1.0)]
+    assert found[3].orders == pytest.approx({"error": 1.0})
+    assert "--dt auto --error 0.001" in settings[3].command("falling", falling)
 
 
 def test_repeats_give_minimum_and_median():
