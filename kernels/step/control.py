@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-__all__ = ["REPORT", "STATUS", "step_struct"]
+__all__ = ["REPORT", "STATUS", "Coefficients", "step_struct"]
 
 STATUS = {"running": 0, "failed": 1, "frozen": 2}
 
@@ -25,6 +25,17 @@ REPORT = (
     "floor",
 )
 """Columns of the report of a step, [world, column] in float64; probes follow."""
+
+
+@wp.struct
+class Coefficients:
+    """Of a time discretisation: q~ = a0 q_n - a1 q_{n-1} + b v_n, v~ = a0 v_n - a1 v_{n-1}."""
+
+    a0: wp.float64
+    a1: wp.float64
+    b: wp.float64  # s
+    dq_dv: wp.float64  # s
+    mass_factor: wp.float64  # 1/s
 
 
 @functools.cache
@@ -48,14 +59,17 @@ def step_struct():
         previous_h: wp.array(dtype=wp.float64)  # state of multistep schemes; 0 before the first step
         previous_end: wp.array(dtype=wp.float64)  # time that the step before ended at
         dt: wp.array(dtype=wp.float64)
-        a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1}
+        a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1} + b v_n
         a1: wp.array(dtype=wp.float64)
-        dq_dv: wp.array(dtype=wp.float64)  # beta h
-        mass_factor: wp.array(dtype=wp.float64)  # 1/(beta h); in statics that of springs, `stabilise`
+        b: wp.array(dtype=wp.float64)  # of schemes that take v_n
+        dq_dv: wp.array(dtype=wp.float64)
+        mass_factor: wp.array(dtype=wp.float64)  # of the inertia; in statics that of springs, `stabilise`
         ramp: wp.array(dtype=wp.float64)  # factor of constant loads
         gravity: wp.array(dtype=wp.vec3d)
         any_running: wp.array(dtype=wp.int32)
+        any_refused: wp.array(dtype=wp.int32)  # for the first time in the step; for good
         max_halvings: wp.int32
+        parameter: wp.float64  # of the integrator
         stabilise: wp.float64  # N/m per kg, of statics: springs from the last equilibrium, none at full load
         total_J: wp.array(dtype=wp.float64)
         ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to

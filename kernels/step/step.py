@@ -6,6 +6,7 @@ the level falls again as soon as the position is even, so that time stays an exa
 
 import functools
 import types as _types
+from typing import Any
 
 import warp as wp
 
@@ -23,16 +24,14 @@ FULL = 1e-9
 
 
 @functools.cache
-def step_kernels(
-    dtype: str, coefficients: wp.Function, static: bool, multistep: bool, traits: Traits = NO_TERMS
-) -> _types.SimpleNamespace:
+def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     """Kernels of the step loop.
 
     Args:
         dtype: precision of the vectors.
-        coefficients: wp.func (h, previous h) -> vec3d(a0, a1, beta) of the time discretisation.
-        static: no inertia, v is the displacement increment.
-        multistep: the scheme uses the step before the last.
+        scheme: the time discretisation, with `coefficients`, a wp.func (h, previous h, parameter) -> Coefficients, and
+            what its kernels are specialised for: static (no inertia, v is the displacement increment), multistep (it
+            uses the step before the last), takes_velocity (q~ takes v_n), variant (their name).
         traits: of the model; "nonpotential" and "gated" count.
     """
     p = precision(dtype)
@@ -43,7 +42,9 @@ def step_kernels(
     PCG = pcg_struct()
     nonpotential, gated = traits.nonpotential, traits.gated
     variant = traits.suffix("nonpotential", "gated")
-    module = kernel_module(f"step_{dtype}_{coefficients.key}_{static}_{multistep}{variant}")
+    coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
+    takes_velocity = scheme.takes_velocity
+    module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
@@ -74,6 +75,7 @@ def step_kernels(
         world = wp.tid()
         if world == 0:
             step.any_running[0] = 0
+            step.any_refused[0] = 0
         step.accepted[world] = 0
         step.first_refusal[world] = 0
         newton.active[world] = step.running[world]
@@ -95,17 +97,19 @@ def step_kernels(
             # a state that was set, reset or advanced by another scheme since has no past
             if step.previous_end[world] == step.time[world]:
                 previous = step.previous_h[world]
-        c = coefficients(h, previous)
-        step.a0[world] = c[0]
-        step.a1[world] = c[1]
+        c = coefficients(h, previous, step.parameter)
+        step.a0[world] = c.a0
+        step.a1[world] = c.a1
+        if wp.static(takes_velocity):
+            step.b[world] = c.b
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
             step.ramp[world] = step.new_time[world]
             short = f64(1.0) - step.new_time[world]
             step.mass_factor[world] = wp.where(short > f64(FULL), step.stabilise * short, f64(0.0))
         else:
-            step.dq_dv[world] = c[2] * h
-            step.mass_factor[world] = f64(1.0) / (c[2] * h)
+            step.dq_dv[world] = c.dq_dv
+            step.mass_factor[world] = c.mass_factor
             step.ramp[world] = f64(1.0)
 
     @wp.kernel(module=module)
@@ -138,6 +142,8 @@ def step_kernels(
             a1 = T(step.a1[world])
             q = a0 * q - a1 * u_before[world, slot]
             w = a0 * w - a1 * v_before[world, slot]
+        if wp.static(takes_velocity):
+            q += T(step.b[world]) * v_n[world, slot]
         q_tilde[world, slot] = q
         v_tilde[world, slot] = w
         first = vec3()
@@ -213,6 +219,7 @@ def step_kernels(
         step.refused[world] = 1
         if step.halvings[world] == 0:
             step.first_refusal[world] = 1
+            wp.atomic_max(step.any_refused, 0, 1)
         step.halvings[world] = step.halvings[world] + 1
         level = step.level[world] + 1
         why = newton.failed[world]
@@ -221,6 +228,7 @@ def step_kernels(
         if hopeless or level > step.max_halvings:
             step.status[world] = wp.static(STATUS["failed"])
             step.running[world] = 0
+            wp.atomic_max(step.any_refused, 1, 1)
         else:
             step.level[world] = level
             step.part[world] = step.part[world] * 2

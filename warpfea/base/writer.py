@@ -60,7 +60,7 @@ def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:
         raise OutputError(f"{target}: the folder {folder} does not exist")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"{target}: the folder {folder} is not writable")
-    probe = folder / f".{os.getpid()}-{next(_counter)}.part"
+    probe = folder / temporary_beside(target).name
     try:  # a full disk, or a file system that takes no files, shows only so
         probe.touch()
         probe.unlink()
