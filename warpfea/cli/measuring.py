@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import pathlib
 import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
+from .accuracy import SCENE, add_accuracy
 from .arguments import Once, Parser, add_general, call, count, counts, positive
 
-__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "check_study"]
+__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "with_scene"]
 
 PROFILE_EXAMPLES = """\
 examples:
@@ -75,7 +77,8 @@ def add_bench(commands: Any) -> None:
         "  warpfea bench --peer --large --out peer.json\n  warpfea bench --peer --rows 'beam-*,bar-3x2x1'\n"
         "  warpfea bench --growth --out growth.json\n  warpfea bench --product --out product.json\n"
         "  warpfea bench --cpu --out cpu.json\n  warpfea bench --contact --out contact.json\n"
-        "  warpfea bench --scenes --device cpu --before old.json --out scenes.json",
+        "  warpfea bench --scenes --device cpu --before old.json --out scenes.json\n"
+        "  warpfea bench --price --rows 'pendulum,hook' --out price.json",
     )
     kind = to.add_mutually_exclusive_group()
     kind.add_argument("--peer", action="store_true", help="120 steps to 5e-4 N on the peer's sizes, beside its times")
@@ -84,6 +87,7 @@ def add_bench(commands: Any) -> None:
     kind.add_argument("--cpu", action="store_true", help="ms per step of three linear solvers on this CPU, to 5e-4 N")
     kind.add_argument("--scenes", action="store_true", help="launches, modules, bytes and iterations of every scene")
     kind.add_argument("--contact", action="store_true", help="a step with contact beside one without")
+    kind.add_argument("--price", action="store_true", help="every scene beside itself with all that it leaves out")
     to.add_argument(
         "--problem",
         action="append",
@@ -113,7 +117,7 @@ def add_bench(commands: Any) -> None:
         metavar="N",
         help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
     )
-    group = to.add_argument_group("with --peer, --cpu or --scenes")
+    group = to.add_argument_group("with --peer, --cpu, --scenes or --price")
     group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
     group.add_argument(
         "--before", metavar="FILE", help="--scenes: an earlier file to stand beside (the `before` in it, if it has one)"
@@ -151,13 +155,16 @@ def add_study(commands: Any) -> None:
 
     to = commands.add_parser(
         "study",
-        help="repeat the measurements behind the tables: accuracy, agreement, cost",
-        description="Repeat a measurement: its rows are printed, and written with --out. The committed results lie in "
+        help="error against run time of a scene; the measurements behind the tables",
+        description="Measure error against run time of a scene or a file of your own (warpfea study SCENE --help), or "
+        "repeat a measurement: its rows are printed, and written with --out. The committed results lie in "
         "tests/results.",
-        epilog="examples:\n  warpfea study ancf-tets --quick\n  warpfea study joints --help\n"
+        epilog="examples:\n  warpfea study cantilever --over dt=1e-2,5e-3 --methods backward_euler,bdf2 --target 1e-2\n"
+        "  warpfea study my_scene.py --help\n  warpfea study ancf-tets --quick\n  warpfea study joints --help\n"
         "  warpfea study mechanisms --only free_fall --out mechanisms.json",
     )
     names = to.add_subparsers(title="studies", metavar="STUDY", dest="study", required=True, parser_class=Parser)
+    add_accuracy(names)
     for entry in STUDIES.values():
         lines = ["parts:", *_columns(entry.parts), ""] if entry.parts else []
         lines += [f"takes {entry.takes} on two cores", "", "example:"]
@@ -200,13 +207,25 @@ def add_stress(commands: Any) -> None:
     to.set_defaults(command=call("stress", "stress"))
 
 
-def check_study(words: Sequence[str]) -> None:
-    """Refuse a study that is not there, scenes among them, in words of our own. UsageError."""
+def with_scene(words: Sequence[str]) -> list[str]:
+    """The words of `warpfea study NAME` with what says that NAME is a scene, where it is no study.
+
+    Raises:
+        UsageError: NAME is neither a study, a scene nor a file; in words of our own.
+    """
+    from ..builder.scene import names
+    from ..studies.accuracy.problems import problem_names
     from ..studies.registry import STUDIES
 
-    if len(words) > 1 and words[0] == "study" and not words[1].startswith("-") and words[1] not in STUDIES:
-        hint = did_you_mean(words[1], STUDIES)
-        raise UsageError(f"study {words[1]!r} is not part of this version; there are {', '.join(STUDIES)}{hint}")
+    if len(words) < 2 or words[0] != "study" or words[1].startswith("-") or words[1] in (*STUDIES, SCENE):
+        return list(words)
+    scenes = [*names(), *problem_names()]
+    if not pathlib.Path(words[1]).suffix and words[1] not in scenes:
+        raise UsageError(
+            f"study {words[1]!r} is neither a study ({', '.join(STUDIES)}) nor a scene ({', '.join(scenes)}) nor a "
+            f"file{did_you_mean(words[1], [*STUDIES, *scenes])}"
+        )
+    return [words[0], SCENE, *words[1:]]
 
 
 def _columns(rows: Sequence[tuple[str, str]]) -> list[str]:

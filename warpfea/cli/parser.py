@@ -9,6 +9,7 @@ from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
+from ..solvers import SOLVERS
 from .arguments import (
     Once,
     Parser,
@@ -23,7 +24,7 @@ from .arguments import (
     step_size,
     vector,
 )
-from .measuring import add_bench, add_profile, add_stress, add_study, check_study
+from .measuring import add_bench, add_profile, add_stress, add_study, with_scene
 
 __all__ = ["parse"]
 
@@ -37,7 +38,8 @@ examples:
   warpfea info hook                                     what a scene costs, before running it
   warpfea info part.msh                                 groups and size of a mesh
 
-exit codes: 0 done, 2 bad input or usage, 3 a step was refused, 4 output failed, 130 interrupted (files are valid)
+exit codes: 0 done, 1 a defect of warpfea, 2 bad input or usage, 3 a step was refused or joints were not held,
+    4 output failed, 130 interrupted (files are valid)
 """
 
 RUN_EXAMPLES = """\
@@ -96,8 +98,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     add_profile(commands, _add_model)
     if words and words[0] in LATER:
         raise UsageError(f"{words[0]}: {LATER[words[0]]} is not part of this version")
-    check_study(words)
-    arguments, rest = top.parse_known_args(_join_negative(words))
+    arguments, rest = top.parse_known_args(_join_negative(with_scene(words)))
     if rest:
         known = commands.choices[words[0]]._option_string_actions if words[0] in commands.choices else ()
         hint = did_you_mean(rest[0].partition("=")[0], known) if rest[0].startswith("-") else ""
@@ -150,9 +151,9 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     how.add_argument("--integrator", metavar="NAME", help="backward_euler or bdf2")
     how.add_argument(
         "--solver",
-        choices=("newton-pcg", "jacobi"),
+        choices=tuple(SOLVERS),
         default="newton-pcg",
-        help="of a step, by default newton-pcg; jacobi: few cheap iterations, what is left is told",
+        help="of a step, by default newton-pcg; jacobi: few cheap iterations, what is left is told; direct: SuperLU",
     )
     how.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
     how.add_argument(
@@ -178,6 +179,11 @@ def _add_run(commands: Any) -> None:
         type=load_steps,
         metavar="N",
         help="of --static (default 10); auto: the whole load at once, halved where it is refused",
+    )
+    to.add_argument(
+        "--stabilise",
+        action="store_true",
+        help="of --static: springs that fade with the load, for bodies that only contact holds",
     )
     out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
     out.add_argument(
@@ -207,7 +213,11 @@ def _add_run(commands: Any) -> None:
 
 def _add_look(to: Any) -> None:
     """What pictures show."""
-    to.add_argument("--field", metavar="NAME", help="field in colour: von_mises (default), displacement, or none")
+    to.add_argument(
+        "--field",
+        metavar="NAME",
+        help="field in colour: von_mises (default), displacement, contact_pressure, gap, or none",
+    )
     to.add_argument("--view", type=pair, metavar="AZIMUTH,ELEVATION", help="of the camera, degrees")
     to.add_argument("--range", type=color_range, metavar="LOW,HIGH", help="of the colours, SI units")
 
