@@ -285,3 +285,49 @@ def test_the_command_line_adapts_steps(tmp_path, capsys):
     assert "--dt auto needs --error" in capsys.readouterr().err
     assert main([*options, "--error", "1e-3"]) == 2
     assert "--error is for --dt auto" in capsys.readouterr().err
+
+
+# the committed study
+
+SMOOTH = ("stiff", "dead_points", "free_flight")
+STRUCK = ("impact", "contact")
+
+
+def study(scene, integrator):
+    content = json.loads(RESULT.read_text())
+    return [row for row in content["adaptive"] if (row["scene"], row["integrator"]) == (scene, integrator)]
+
+
+def test_references_are_ten_times_finer_than_what_they_judge():
+    content = json.loads(RESULT.read_text())
+    for row in content["references"]:
+        least = min(r["true"] for r in content["adaptive"] if r["scene"] == row["scene"])
+        assert 3.0 * row["own_error"] < 10.0 * least  # the difference from a run of four times the error
+
+
+@pytest.mark.parametrize("integrator", SCHEMES)
+@pytest.mark.parametrize("scene", SMOOTH + STRUCK)
+def test_true_errors_keep_to_those_asked(scene, integrator):
+    rows = study(scene, integrator)
+    assert len(rows) >= 2
+    for row in rows:
+        assert 0.01 <= row["true"] / row["asked"] <= 5.0
+
+
+@pytest.mark.parametrize("integrator", SCHEMES)
+@pytest.mark.parametrize("scene", SMOOTH + STRUCK)
+def test_true_errors_fall_as_those_asked(scene, integrator):
+    rows = study(scene, integrator)
+    slope = np.polyfit(np.log([row["asked"] for row in rows]), np.log([row["true"] for row in rows]), 1)[0]
+    assert 0.8 <= slope <= 1.2
+
+
+def limit_of(scene):
+    return 1.5 if scene in SMOOTH else 0.7
+
+
+@pytest.mark.parametrize("integrator", SCHEMES)
+@pytest.mark.parametrize("scene", SMOOTH + STRUCK)
+def test_newton_iterations_beside_the_best_fixed_step(scene, integrator):
+    for row in study(scene, integrator):
+        assert row["cost"] <= limit_of(scene), row

@@ -144,6 +144,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.func
     def power(x: f64, n: int) -> f64:
+        """x to the power n, n >= 1."""
         out = x
         for _k in range(1, n):
             out = out * x
