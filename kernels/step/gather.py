@@ -31,8 +31,9 @@ REACTION = wp.constant(wp.float64(1.0e-6))
 
 @functools.cache
 def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """Kernels over slots. Of the traits "nonpotential", "tangent", "pooled" and "ties" count."""
+    """Kernels over slots. Of the traits "nonpotential", "tangent", "pooled", "ties" and "midpoint" count."""
     nonpotential, tangent, pooled, ties = traits.nonpotential, traits.tangent, traits.pooled, traits.ties
+    midpoint = traits.midpoint
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
@@ -42,7 +43,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     Pattern = pattern_struct()
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     free_inverse = inverse_function(dtype)
-    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'ties')}"
+    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'ties', 'midpoint')}"
     module = kernel_module(f"gather_{name}", max_unroll=SMALL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
 
@@ -167,10 +168,15 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         balance.rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
         balance.rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
         balance.rows[4, world, slot] = f64(kinetic - work)
+        if wp.static(midpoint):  # there is no Phi: half of the square of what the Newton step is solved for
+            sought = residual_force
+            if wp.static(ties):
+                sought = balance.gradient[world, slot]
+            balance.rows[4, world, slot] = f64(0.5) * weighted(wp.cw_mul(sought, free), D)
         balance.rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
         balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
         balance.rows[7, world, slot] = f64(0.0)
-        if wp.static(nonpotential):
+        if wp.static(nonpotential and not midpoint):
             balance.rows[7, world, slot] = f64(
                 wp.dot(balance.nonpotential_held[world, slot] - balance.nonpotential[world, slot], vs)
             )
