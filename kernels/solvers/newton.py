@@ -401,7 +401,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             else:
                 good = ctl.slot_sums[6, world] - alpha * bend <= f64(WOLFE) * wp.abs(ctl.slope[world])
             if wp.static(midpoint):
-                good = change <= -f64(2.0 * ARMIJO) * alpha * old_phi
+                good = finite and change <= f64(-2.0) * f64(ARMIJO) * alpha * old_phi
             if ctl.nonpotential != 0 and norm <= f64(0.5) * old_norm:
                 good = True
         if ctl.domain_J[world] <= f64(0.0):
