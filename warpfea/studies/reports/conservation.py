@@ -79,7 +79,7 @@ def tumble(family: str, law: str, device: Any = "cpu", dtype: str = "float64", w
 
     def velocity(X: np.ndarray) -> np.ndarray:
         arm = X - np.array([0.5, 0.1, 0.1])
-        return np.cross(spin, arm) + (1.0, -0.5, 0.3) + arm * (14.0, 0.0, -7.0)
+        return np.cross(spin, arm) + (1.0, -0.5, 0.3) + arm * (10.0, 0.0, -5.0)
 
     b.set_initial(body, velocity=velocity)
     return b.finalize(device=device, dtype=dtype, worlds=worlds)
