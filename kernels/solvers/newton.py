@@ -159,13 +159,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             if first == 0:
                 ctl.predicted[world] = 0
 
-    @wp.kernel(module=module)
-    def free_step(ctl: Control):
-        """Before terms limit a step: the full one."""
-        world = wp.tid()
-        if ctl.active[world] != 0:
-            ctl.limit[world] = f64(1.0)
-
     @wp.func
     def lost(ctl: Control, world: int) -> bool:
         """Whether solves with other matrices than the tangent have led nowhere too often, of laws that have a tangent
@@ -430,13 +423,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         else:
             shorten(ctl, world, reused)
 
-    @wp.kernel(module=module)
-    def any_set(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
-        """out[0] = 1 where any world's flag is set; out must be 0 before."""
-        world = wp.tid()
-        if flags[world] != 0:
-            wp.atomic_max(out, 0, 1)
-
     vectors = vector_kernels(dtype, module)
     outer = outer_kernels(traits, module)
     return _types.SimpleNamespace(
@@ -451,8 +437,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         plan_leap=plan_leap,
         compare=compare,
         judge_floor=judge_floor,
-        free_step=free_step,
         begin_search=begin_search,
         judge_trial=judge_trial,
-        any_set=any_set,
     )

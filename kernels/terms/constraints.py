@@ -201,7 +201,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """c at u, its gradients at u_stage; multipliers of the trial step alpha; the rows of the augmented potential."""
+        """c at u, its gradients at u_stage; multipliers of the trial step; the rows of the augmented potential."""
         world, row = wp.tid()
         if active[world] == 0:
             return

@@ -14,7 +14,8 @@ from ..kernels.elements.element import element_kernels
 from ..kernels.elements.materials import ANY_J, NCOEF
 from ..kernels.elements.mixed import mixed_product
 from ..kernels.elements.points import block_struct
-from ..kernels.elements.tied import tied_kernels, tied_struct
+from ..kernels.elements.tied import tied_kernels
+from ..kernels.elements.tied_block import tied_struct
 from ..kernels.elements.with_mass import with_mass_kernel
 from . import assembly
 

@@ -142,7 +142,9 @@ _ENTRIES = (
         "largest errors of energy and of both momenta. revolutions takes long: it keeps a checkpoint beside --out, and "
         "the same command goes on from it after an interruption.",
         parts=(
-            ("free", "a tumbling body of each family and law"),
+            *((family, "a tumbling body of each law") for family in ("T4", "T10", "ENMC", "FN", "H3843")),
+            ("3243", "of each integration"),
+            ("3443", "of each integration"),
             ("constrained", "mechanisms without damping"),
             ("revolutions", "ten thousand turns of two bodies"),
         ),

@@ -251,7 +251,7 @@ class Constraints(Term):
         k = constraint_block_kernels(self.model.dtype)
         pairs, count = self.model.cache["couplings"]
         args = [self.model.topology, matrix.pattern.data, pairs]
-        kernel, more = k.add_penalties, kept
+        kernel, more = k.add_penalties, list[Any](kept)
         if not projected:
             kernel, more = k.add_tangent, [self.tables.data, at.work.multipliers, at.share]
         at.launch(kernel, (self.model.worlds, count), [*args, *more, dq_dv, active, out])
