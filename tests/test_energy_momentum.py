@@ -31,7 +31,7 @@ def residual_at(sim, v):
 
 @pytest.mark.parametrize("operator", ["elements", "matrix"])
 @pytest.mark.parametrize(
-    ("family", "law"), [("T10", "svk"), ("T4", "mooney_rivlin"), ("3243 tied", "svk"), ("3443 tied", "svk")]
+    ("family", "law"), [("T10", "svk"), ("T4", "neo_hookean"), ("3243 tied", "svk"), ("3443 tied", "svk")]
 )
 def test_the_operator_differs_from_the_derivative_by_the_turn_of_a_step(family, law, operator):
     """H - dg/dv is B_mid^T D (B_mid - B_1)/2: it falls with the step at a fixed spin, and all else is exact."""
@@ -63,9 +63,7 @@ def test_the_operator_differs_from_the_derivative_by_the_turn_of_a_step(family, 
     assert 3.0 < far[0] / far[1] < 5.5
 
 
-@pytest.mark.parametrize(
-    ("family", "law"), [("T10", "svk"), ("T4", "neo_hookean"), ("ENMC", "mooney_rivlin"), ("3243 tied", "svk")]
-)
+@pytest.mark.parametrize(("family", "law"), [("T10", "svk"), ("T4", "neo_hookean"), ("3243 tied", "svk")])
 def test_columns_and_whole_elements_give_one_matrix(family, law):
     """What a GPU launches and what the CPU does, here on the CPU both; and the product with it."""
     sim = simulate(tumble(family, law), solver=wf.NewtonPCG(operator="matrix"), capture=False)
@@ -100,7 +98,11 @@ def test_columns_and_whole_elements_give_one_matrix(family, law):
 # conservation
 
 
-@pytest.mark.parametrize(("family", "law"), CASES)
+QUICK = [case for case in CASES if case[1] == "svk" or case in (("T10", "mooney_rivlin"), ("T4", "neo_hookean"))]
+SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in CASES if case not in QUICK]
+
+
+@pytest.mark.parametrize(("family", "law"), QUICK + SLOW)
 def test_free_bodies_keep_energy_and_momenta(family, law):
     """1 % of the way of tests/results/conservation_cpu.json, see test_conservation_results.py."""
     sim = simulate(tumble(family, law))
