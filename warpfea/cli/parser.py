@@ -134,7 +134,7 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     how.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
     how.add_argument("--dt", type=positive, metavar="S", help="step, s")
-    how.add_argument("--integrator", metavar="NAME", help="backward_euler or bdf2")
+    how.add_argument("--integrator", metavar="NAME", help="backward_euler, bdf2 or energy_momentum")
     how.add_argument(
         "--solver",
         choices=tuple(SOLVERS),
