@@ -20,10 +20,11 @@ Locking and its remedies, all in the choice of what is integrated where ("tied")
 - curvature thickness: a director interpolated between two directions is too short in between; on a curved or strongly
   bent shell that costs more than bending (a thin quarter arc of 16 elements bends 0.13 of what it should). The strain
   across the thickness is taken at the nodes and interpolated (Betsch and Stein 1995, Commun. Numer. Methods Eng.
-  11:899). The strains in the surface that it is coupled to are taken at 2x2 points, whose sum of their variations is
-  the integral: at the nodes it is not, and a pressed plate would not stay uniform (its thickness varied by 2e-4 of the
-  change, its pressure on a flat collider by 1e-3). Averages of surface gradients in their place, instead of strains,
-  lock a thin arc (0.83 of the deflection with 16 elements, 0.37 with 8).
+  11:899). The strains in the surface that it is coupled to are taken at 2x2 points, which integrate their variations on
+  any flat quad; at the nodes alone they do not balance those of plane stress, and a pressed plate is not uniform (its
+  pressure on a flat collider varied by 1e-3). Means of the surface gradients at the nodes, in place of strains at
+  points, lock a thin arc (0.83 of the deflection with 16 elements, 0.37 with 8). Strains averaged to the nodes do not,
+  but make the surface stiffer (Cook's membrane, nu = 0.49, 4x4 elements: by 6 %).
 - membrane: needs no remedy. The cubic surface follows an arc without stretching to fourth order in its angle; with the
   thickness strain out of the way a thin arc (R/t = 1000) bends as a thick one does: plane stress stays at 4x4 points.
 "full" is Paper I's law at 4x4x2 points, without remedies. What "tied" gives up: it passes the patch test under plane
