@@ -65,6 +65,7 @@ from .outputs.vtk import VTUWriter  # noqa: E402
 from .simulation.checkpoint import Checkpoint  # noqa: E402
 from .simulation.simulation import Simulation, StepReport  # noqa: E402
 from .simulation.statics import solve_static  # noqa: E402
+from .simulation.integrators import GeneralizedAlpha  # noqa: E402
 from .solvers import Jacobi, NewtonPCG  # noqa: E402
 
 __all__ = [
@@ -83,6 +84,7 @@ __all__ = [
     "ElementSet",
     "Error",
     "GIFWriter",
+    "GeneralizedAlpha",
     "HalfSpace",
     "Jacobi",
     "Joint",
@@ -119,7 +121,6 @@ __all__ = [
 
 _LATER = {
     "TriMesh": "rigid triangle meshes",
-    "GeneralizedAlpha": "generalised-alpha steps",
 }
 
 

@@ -52,7 +52,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     f64 = wp.float64
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
     shared = newton_kernels(dtype, traits)
-    measure, record, accept = shared.measure, shared.record, shared.accept
+    measure, record, accept, closure = shared.measure, shared.record, shared.accept, shared.closure
     paired = acceleration in ("secants", "anderson")
     module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'gated', 'limited')}")
 
@@ -82,7 +82,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             if ctl.norm[world] > jac.growth * jac.first_norm[world]:
                 ctl.failed[world] = FAIL_GROWTH
             if wp.static(traits.gated):
-                if ctl.open[world] * ctl.constraint_tol > jac.gap:
+                if ctl.open[world] * closure(ctl, world, ctl.constraint_tol) > jac.gap:
                     ctl.failed[world] = FAIL_CONSTRAINT
             if ctl.failed[world] == 0:
                 ctl.rough[world] = 1

@@ -70,6 +70,14 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         return ctl.slot_sums[5, world] + energy / ctl.dq_dv[world]
 
     @wp.func
+    def closure(ctl: Control, world: int, tol: f64) -> f64:
+        """Violation that is allowed, m: accelerations in the state are off by it over (dq/dv)^2."""
+        if ctl.constraint_pace > f64(0.0) and tol < f64(1.0e200):
+            pace = ctl.constraint_pace * ctl.dq_dv[world] * ctl.dq_dv[world]
+            return wp.min(tol, wp.max(pace, ctl.constraint_least))
+        return tol
+
+    @wp.func
     def largest_violation(ctl: Control, world: int) -> f64:
         """Of the constraints of all components, m."""
         largest = f64(0.0)
@@ -111,9 +119,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 accept = f64(PREDICTED) * accept  # what is left would add up over steps that none solves for
             loud = norm > accept
             if wp.static(gated):
-                if ctl.violation[world, c] > ctl.constraint_tol:
+                allowed = closure(ctl, world, ctl.constraint_tol)
+                if ctl.violation[world, c] > allowed:
                     loud = True
-                    excess = wp.max(excess, ctl.violation[world, c] / ctl.constraint_tol)
+                    excess = wp.max(excess, ctl.violation[world, c] / allowed)
                     floor_excess = f64(1.0e300)
             ctl.quiet[world, c] = wp.where(loud, 0, 1)
             if loud:
@@ -128,7 +137,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             largest = wp.max(largest, ratio)
             excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))
         if wp.static(gated):
-            ctl.open[world] = largest_violation(ctl, world) / ctl.constraint_tol
+            ctl.open[world] = largest_violation(ctl, world) / closure(ctl, world, ctl.constraint_tol)
         ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
         ctl.relative[world] = largest
         ctl.excess[world] = excess
@@ -224,6 +233,6 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             give_up(ctl, world, why)
 
     return _types.SimpleNamespace(
-        objective=objective, magnitude=magnitude, largest_violation=largest_violation, measure=measure, record=record,
+        objective=objective, magnitude=magnitude, closure=closure, largest_violation=largest_violation, measure=measure, record=record,
         accept=accept, ask=ask, patience=patience, give_up=give_up, settle=settle, fail=fail,
     )  # fmt: skip

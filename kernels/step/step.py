@@ -31,7 +31,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         dtype: precision of the vectors.
         scheme: the time discretisation, with `coefficients`, a wp.func (h, previous h, parameter) -> Coefficients, and
             what its kernels are specialised for: static (no inertia, v is the displacement increment), multistep (it
-            uses the step before the last), takes_velocity (q~ takes v_n), variant (their name).
+            uses the step before the last), takes_velocity (q~ takes v_n), accelerated (it keeps accelerations: a_n and
+            w_n stand in place of the state before the last), variant (their name).
         traits: of the model; "nonpotential" and "gated" count.
     """
     p = precision(dtype)
@@ -43,7 +44,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     nonpotential, gated = traits.nonpotential, traits.gated
     variant = traits.suffix("nonpotential", "gated")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
-    takes_velocity = scheme.takes_velocity
+    takes_velocity, accelerated = scheme.takes_velocity, scheme.accelerated
     module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
 
     @wp.kernel(module=module)
@@ -101,6 +102,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         step.a1[world] = c.a1
         if wp.static(takes_velocity):
             step.b[world] = c.b
+        if wp.static(accelerated):
+            step.q_a[world] = c.q_a
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
             step.ramp[world] = step.new_time[world]
@@ -127,7 +130,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         """q~, v~ and the first iterate; a clamped component keeps its place.
 
         The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) where the step before is known: its error is
-        of the second order in h then, which a stiff rotating body needs.
+        of the second order in h then, which a stiff rotating body needs. With accelerations it is v_n + h g.
         """
         world, slot = wp.tid()
         if step.running[world] == 0:
@@ -143,6 +146,10 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             w = a0 * w - a1 * v_before[world, slot]
         if wp.static(takes_velocity):
             q += T(step.b[world]) * v_n[world, slot]
+        if wp.static(accelerated):
+            c = coefficients(step.h[world], f64(0.0), step.parameter)
+            q += T(c.q_a) * u_before[world, slot]
+            w += T(c.v_a) * u_before[world, slot] + T(c.v_w) * v_before[world, slot]
         q_tilde[world, slot] = q
         v_tilde[world, slot] = w
         first = vec3()
@@ -153,6 +160,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
                 if step.a1[world] > f64(0.0):  # goes on as it went: exact for a constant acceleration too
                     ratio = T(step.h[world] / step.previous_h[world])
                     first = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
+            if wp.static(accelerated):
+                first = v_n[world, slot] + (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         keep = (T(1.0) / dq) * (u_n[world, slot] - q)
         f = free[slot]
         for k in range(3):
@@ -181,6 +190,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         new = v_n[world, slot]
         if kind == 0:
             new = v_tilde[world, slot] + (dq * is_position[slot]) * vec3(step.gravity[world])
+            if wp.static(accelerated):
+                new = v_n[world, slot] + (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         elif kind == 2:
             new = (T(1.0) / dq) * (u_n[world, slot] - q_tilde[world, slot])
         f = free[slot]
@@ -261,6 +272,15 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             if slot == 0:
                 step.previous_h[world] = step.h[world]
                 step.previous_end[world] = step.new_time[world]
+        if wp.static(accelerated):
+            c = coefficients(step.h[world], f64(0.0), step.parameter)
+            a = u_before[world, slot]
+            new = v[world, slot]
+            before = v_n[world, slot] + T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
+            u_before[world, slot] = T(c.a_v) * (new - v_n[world, slot]) - T(c.a_a) * a
+            v_before[world, slot] = T(c.mass_factor) * (new - before)
+            if slot == 0:
+                step.previous_end[world] = step.new_time[world]
         u_n[world, slot] = u[world, slot]
         if slot == 0:
             newton.potential[world] = newton.elem_sums[0, world]
@@ -323,7 +343,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         end_attempt=end_attempt,
         failed_now=failed_now,
         commit=commit,
-        **vars(ledger_kernels(dtype, multistep, nonpotential, module)),
+        **vars(ledger_kernels(dtype, multistep or accelerated, nonpotential, module)),
         write_report=write_report,
         probe_values=probe_values,
     )

@@ -55,7 +55,8 @@ class Damping(Term):
         if not at.inertia:
             return set()
         out = {b.kernels.viscous_force.module for b in self.model.blocks if b.key.damping == "explicit"}
-        out |= {b.kernels.strain_history.module for b in self.model.blocks if b.key.damping == "incremental"}
+        name = "moving_history" if at.accelerated else "strain_history"
+        out |= {getattr(b.kernels, name).module for b in self.model.blocks if b.key.damping == "incremental"}
         return out | ({self.kernels.add_explicit.module} if self.explicit else set())
 
     @part("loads")
@@ -68,7 +69,10 @@ class Damping(Term):
             w.contribution.zero_()  # the gather below sums the entries of all blocks
         for block in m.blocks:
             dim = (m.worlds, block.count)
-            if block.key.damping == "incremental":
+            if block.key.damping == "incremental" and at.accelerated:
+                args = [block.data, state.displacement, state.velocity, at.u_before, w.step.b, w.step.q_a, active]
+                launch(block.kernels.moving_history, dim, [*args, w.history])
+            elif block.key.damping == "incremental":
                 args = [block.data, state.displacement, at.u_before, w.step.a0, w.step.a1, active, w.history]
                 launch(block.kernels.strain_history, dim, args)
             elif block.key.damping == "explicit":

@@ -49,8 +49,10 @@ class At:
 
     Attributes:
         model, work, launch, state: of the simulation.
-        u_before: [world, slot] displacements of the step before the last, of multistep schemes.
+        u_before: [world, slot] displacements of the step before the last, of multistep schemes; the algorithmic
+            accelerations of schemes that keep them.
         inertia: the step is dynamic; in statics there are no rates.
+        accelerated: the scheme keeps accelerations.
         options: of the solver.
         scratch: what terms allocated, by their names.
     """
@@ -61,6 +63,7 @@ class At:
     state: State
     u_before: wp.array
     inertia: bool
+    accelerated: bool = False
     options: Any = None
     scratch: dict[str, Any] = field(default_factory=dict)
 

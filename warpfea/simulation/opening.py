@@ -1,0 +1,322 @@
+"""Consistent velocities and accelerations, from which schemes start that keep accelerations.
+
+At a state (q, v) at time t, with supports and constraints c(q, t) = 0 of which c' and c'' are derivatives along the motion,
+
+    M dv + J^T L = 0,    J (v + dv) + c_t = 0,        M w + J^T m = f - f_int,    J w = -(c'' without J w)
+
+are solved on the host, by factors of the mass matrix and a dense matrix of the constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.step.control import STATUS
+from ..kernels.terms.constraints import DISTANCE, TURN
+from ..laws import TimeLaw
+from .kinks import jumps, kinks
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..solvers.residual import Residual
+    from ..terms.term import At
+    from .integrators import Integrator
+
+__all__ = ["Opening"]
+
+SAME = 1e-6
+"""Times closer than this part of a step are the same."""
+FACTORED = 20_000
+"""Slots up to which the mass matrix is factorised; larger ones are solved iteratively."""
+FIRST = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
+SECOND = np.array([35.0, -104.0, 114.0, -56.0, 11.0]) / 12.0
+"""Derivatives at the first of five points."""
+REDUNDANT = 1e-11
+"""Singular values of the matrix of the constraints below this part of the largest are of redundant rows."""
+
+
+class Opening:
+    """Starts worlds whose state was set, or at whose time a law of a load or drive has a kink.
+
+    Attributes:
+        count: starts of a world so far.
+    """
+
+    def __init__(self, at: At, residual: Residual, integrator: Integrator) -> None:
+        self.at, self.residual, self.integrator = at, residual, integrator
+        self.model = at.model
+        supports = at.model.terms.supports
+        self.driven = supports.moved is not None or supports.turned is not None
+        self.count = 0
+        self._mass: list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]] = []
+        refuse(at.model, integrator, self.driven)
+
+    def prepare(self, dt: float) -> None:
+        """Before a step of size dt, s: start the worlds that need it."""
+        state = self.at.state
+        time, known = state.time.numpy(), state.previous_end.numpy()  # type: ignore[attr-defined]
+        ahead, kinked = self._kinks(time, dt)
+        flags = (state.status.numpy() == STATUS["running"]) & ((known != time) | kinked)  # type: ignore[attr-defined]
+        if flags.any():
+            self._start(flags, time, ahead, dt)
+
+    def _kinks(self, time: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times (B,) just after a jump that the state is at, else its own; whether a kink lies in the step before."""
+        ahead, near = time.copy(), SAME * dt
+        found = np.zeros(len(time), dtype=bool)
+        drives = self._drive_laws()
+        for number, law in enumerate(self.model.terms.laws.laws):
+            for begin, end in jumps(law, dt):
+                found |= (begin > time - dt + near) & (begin <= time + near)
+                ahead = np.where((begin <= time + near) & (end > time), np.maximum(ahead, end), ahead)
+            if number in drives:  # forces with a kink leave accelerations continuous
+                for kink in kinks(law, dt):
+                    found |= (kink > time - dt + near) & (kink <= time + near)
+        return ahead, found
+
+    def _drive_laws(self) -> set[int]:
+        """Numbers of the laws that prescribe places."""
+        terms = self.model.terms
+        out = set()
+        if terms.supports.moved is not None:
+            out |= set(terms.supports.moved.law.numpy().ravel().tolist())
+        if terms.supports.turned is not None:
+            out |= set(terms.supports.turned.law.numpy().tolist())
+        if self.model.constraints is not None:
+            out |= set(terms.constraints.tables.data.law.numpy().tolist())
+        return out
+
+    def _start(self, flags: np.ndarray, time: np.ndarray, ahead: np.ndarray, dt: float) -> None:
+        state: Any = self.at.state
+        laws = self._law_motion(flags, ahead, dt)
+        v = state.velocity.numpy().astype(float)
+        before = self._kinetic(v)
+        goals = {}
+        for world in np.flatnonzero(flags):
+            goals[world] = self._goals(world, v[world], laws[:, world])
+            v[world] += self._impulse(v[world], *goals[world])
+        self._set(state.velocity, flags, v)
+        self._book(flags, self._kinetic(v) - before)
+        g = self._unbalanced(flags, ahead, dt)
+        w = np.zeros_like(v)
+        for world in np.flatnonzero(flags):
+            goals[world] = self._goals(world, v[world], laws[:, world])
+            w[world] = self._acceleration(g[world], *goals[world])
+        self._set(state.acceleration, flags, w)
+        self._set(state.algorithmic_acceleration, flags, w)
+        self._set(state.previous_end, flags, time)
+        self.count += 1
+
+    @staticmethod
+    def _set(array: wp.array, flags: np.ndarray, values: np.ndarray) -> None:
+        host = array.numpy()
+        host[flags] = values[flags]
+        array.assign(host)
+
+    def _kinetic(self, v: np.ndarray) -> np.ndarray:
+        """1/2 v.M v, (B,), J."""
+        return np.array([0.5 * np.sum(one * (self.model.mass_host @ one)) for one in v])
+
+    def _book(self, flags: np.ndarray, change: np.ndarray) -> None:
+        """What the impulse does is the integrator's."""
+        state: Any = self.at.state
+        if "ledger" in state.specs:
+            columns = list(self.model.terms.ledger)
+            ledger = state.ledger.numpy()
+            ledger[flags, columns.index("kinetic")] += change[flags]
+            ledger[flags, columns.index("integrator")] -= change[flags]
+            state.ledger.assign(ledger)
+
+    def _law_motion(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
+        """(3, B, laws, 3): values of the time laws, their rates and second rates from the time (B,) on.
+
+        Of samples the slope after the time, without a second rate; of a function differences over dt.
+        """
+        laws = self.model.terms.laws.laws
+        points = np.array([self._law_values(flags, time + 0.25 * dt * k) for k in range(len(FIRST))])
+        out = np.zeros((3, *points.shape[1:]))
+        out[0] = points[0]
+        for k, law in enumerate(laws):
+            if law.function is not None:
+                out[1, :, k] = np.tensordot(FIRST, points[:, :, k], 1) / (0.25 * dt)
+                out[2, :, k] = np.tensordot(SECOND, points[:, :, k], 1) / (0.25 * dt) ** 2
+            else:
+                out[1, :, k] = [slope_after(law, t + SAME * dt) for t in time]
+        return out
+
+    def _law_values(self, flags: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Values of the time laws in the flagged worlds at times (B,), (B, laws, 3)."""
+        m, w = self.model, self.at.work
+        self._set(w.step.new_time, flags, time)
+        active = self._active(flags)
+        m.terms.laws.evaluate(self.at.launch, self.at.state, w.step.new_time, w.step.ramp, active, w.law_value)
+        return w.law_value.numpy().copy()
+
+    def _active(self, flags: np.ndarray) -> Any:
+        return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
+
+    def _unbalanced(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
+        """f_int + J^T lambda - f at the state in the flagged worlds, with the laws at times (B,); (B, slots, 3), N."""
+        m, at, w = self.model, self.at, self.at.work
+        every, active = np.ones(len(flags)), self._active(flags)
+        # rates of strain are those of the state: E~ = E - (dq/dv) dE/dt
+        for array, value in ((w.step.ramp, 1.0), (w.step.h, dt), (w.step.dq_dv, dt), (w.step.b, -dt), (w.step.q_a, 0.0)):
+            self._set(array, flags, value * every)
+        self._set(w.step.mass_factor, flags, every / dt)
+        self._law_values(flags, time)
+        m.terms.dead.take_gravity(at.launch, w.law_value, active)
+        for array, values in ((w.u, at.state.displacement), (w.v, at.state.velocity), (w.v_tilde, at.state.velocity)):
+            self._set(array, flags, values.numpy())
+        for term in m.terms:
+            term.begin(at, active)
+        for term in m.terms:
+            term.prepare(at, active)
+        self.residual.balance(active)
+        return w.g.numpy().astype(float)
+
+    # supports and constraints
+
+    def _goals(self, world: int, v: np.ndarray, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any, np.ndarray, np.ndarray]:
+        """Prescribed velocities and accelerations (slots, 3), J (rows, 3 slots), and c' - J v and c'' - J w (rows,)."""
+        m = self.model
+        rate, bend = np.zeros_like(v), np.zeros_like(v)
+        self._drives(laws, rate, bend)
+        if m.constraints is None:
+            return rate, bend, None, np.zeros(0), np.zeros(0)
+        u = self.at.state.displacement.numpy()[world].astype(float)
+        gradients, first, second = constraint_rates(m.constraints.tables, u, v, laws)
+        J = m.constraints.tables.expand(gradients)
+        return rate, bend, J, first - J @ v.ravel(), second
+
+    def _drives(self, laws: np.ndarray, rate: np.ndarray, bend: np.ndarray) -> None:
+        """Fill in the motion of driven slots."""
+        supports = self.model.terms.supports
+        if (d := supports.moved) is not None:
+            slot, law = d.slot.numpy(), d.law.numpy()
+            k, c = np.nonzero(law >= 0)
+            rate[slot[k], c] = laws[1][law[k, c], c]
+            bend[slot[k], c] = laws[2][law[k, c], c]
+        if (d := supports.turned) is not None:
+            slot, law, on = d.slot.numpy(), d.law.numpy(), d.components.numpy() != 0.0
+            angle, first, second = (laws[k][law, 0][:, None] for k in range(3))
+            turn = np.cross(d.axis.numpy(), d.arm.numpy())
+            twice = np.cross(d.axis.numpy(), turn)
+            along = np.cos(angle) * turn + np.sin(angle) * twice
+            across = np.cos(angle) * twice - np.sin(angle) * turn
+            for target, values in ((rate, first * along), (bend, second * along + first**2 * across)):
+                target[slot] = np.where(on, values, target[slot])
+
+    # linear algebra
+
+    def _impulse(self, v: np.ndarray, rate: np.ndarray, bend: np.ndarray, J: Any, c_t: Any, rest: Any) -> np.ndarray:
+        """dv, m/s: nothing where velocities are consistent."""
+        held = self.model.free_host == 0.0
+        jump = np.where(held, rate - v, 0.0)
+        if J is None and not jump.any():
+            return jump
+        missing = None if J is None else -(J @ v.ravel() + c_t)
+        return self._saddle(np.zeros_like(v), jump, J, missing)
+
+    def _acceleration(self, g: np.ndarray, rate: Any, bend: np.ndarray, J: Any, c_t: Any, rest: Any) -> np.ndarray:
+        """w, m/s^2."""
+        return self._saddle(-g, np.where(self.model.free_host == 0.0, bend, 0.0), J, None if J is None else -rest)
+
+    def _saddle(self, force: np.ndarray, held: np.ndarray, J: Any, goal: Any) -> np.ndarray:
+        """x (slots, 3) with M x + J^T m = force on free components, x = held on others, and J x = goal."""
+        m = self.model
+        x = self._solve(force - m.mass_host @ held) + held
+        if J is None:
+            return x
+        free = m.free_host.ravel() != 0.0
+        columns = (J.toarray() * free).reshape(-1, m.slots, 3)
+        inverse = np.array([self._solve(row).ravel() for row in columns])  # rows of J M^-1
+        matrix = J @ inverse.T
+        multipliers = np.linalg.lstsq(matrix, J @ x.ravel() - goal, rcond=REDUNDANT)[0]
+        return x - (multipliers @ inverse).reshape(x.shape)
+
+    def _solve(self, force: np.ndarray) -> np.ndarray:
+        """M^-1 force on the free components, 0 on others."""
+        if not self._mass:
+            self._mass = [mass_solver(self.model, c) for c in range(3)]
+        out = np.zeros_like(force)
+        for c, (free, solve) in enumerate(self._mass):
+            if len(free) and force[free, c].any():
+                out[free, c] = solve(force[free, c])
+        return out
+
+
+def mass_solver(model: Model, component: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """The slots that are free in a component, and what solves with the mass matrix among them."""
+    free = np.flatnonzero(model.free_host[:, component])
+    M = model.mass_host[free][:, free].astype(float).tocsc()
+    if len(free) <= FACTORED:
+        return free, spl.splu(M).solve if len(free) else lambda f: f
+    scale = sp.diags(1.0 / M.diagonal())
+    return free, lambda f: spl.cg(M, f, rtol=1e-14, atol=0.0, maxiter=2000, M=scale)[0]
+
+
+def slope_after(law: TimeLaw, time: float) -> np.ndarray:
+    """(3,) slope of a sampled law in the interval that begins at a time or holds it; 0 beyond its samples."""
+    k = int(np.searchsorted(law.times, time, side="right")) - 1
+    if k < 0 or k >= len(law.times) - 1:
+        return np.zeros(3)
+    return (law.values[k + 1] - law.values[k]) / (law.times[k + 1] - law.times[k])
+
+
+def constraint_rates(tables: Any, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients (rows, 3, 3), first rates c' (rows,) m/s, and second rates without J w, m/s^2, of one world's rows.
+
+    u, v: (slots, 3); laws: (3, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
+    """
+    count = tables.count
+    moved, speed = np.zeros((2, 3 * count, 3))
+    for out, field in ((moved, u), (speed, v)):
+        np.add.at(out, tables.term_host, tables.weight_host[:, None] * field[tables.slot_host])
+    a, b, a2 = (tables.reference_host + moved).reshape(count, 3, 3).swapaxes(0, 1)
+    da, db, da2 = speed.reshape(count, 3, 3).swapaxes(0, 1)
+    kind, scale = tables.data.kind.numpy(), tables.scale_host
+    f, df, ddf = tables.data.fixed.numpy().copy(), np.zeros(count), np.zeros(count)
+    law, component = tables.data.law.numpy(), tables.data.law_component.numpy()
+    on = law >= 0
+    f[on] += laws[0][law[on], component[on]]
+    df[on], ddf[on] = (laws[k][law[on], component[on]] for k in (1, 2))
+
+    def dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.sum(x * y, axis=1)
+
+    G = np.stack([b, a, np.zeros_like(a)], axis=1)
+    first, second = dot(da, b) + dot(a, db) - df, 2.0 * dot(da, db) - ddf
+    far = kind == DISTANCE
+    size = np.where(far, np.linalg.norm(a, axis=1), 1.0)
+    n = a / size[:, None]
+    G[far] = np.stack([n, 0 * a, 0 * a], axis=1)[far]
+    first[far] = (dot(n, da) - df)[far]
+    second[far] = ((dot(da, da) - dot(n, da) ** 2) / size - ddf)[far]
+    turn = kind == TURN
+    s, c, w, dw = (x[:, None] for x in (np.sin(f), np.cos(f), df, ddf))
+    d, e = c * a2 - s * a, s * a2 + c * a
+    rate = c * da2 - s * da - w * e
+    bend = -2.0 * w * (s * da2 + c * da) - dw * e - w**2 * d
+    G[turn] = np.stack([-s * b, d, c * b], axis=1)[turn]
+    first[turn] = (dot(rate, b) + dot(d, db))[turn]
+    second[turn] = (dot(bend, b) + 2.0 * dot(rate, db))[turn]
+    return scale[:, None, None] * G, scale * first, scale * second
+
+
+def refuse(model: Model, integrator: Integrator, driven: bool) -> None:
+    """Raise ModelError where prescribed places would make the accelerations of an undamped scheme grow."""
+    if integrator.parameter < 1.0:
+        return
+    if model.constraints is not None or driven:
+        what = f"joint {model.constraints.joints[0].name!r}" if model.constraints is not None else "a drive"
+        raise ModelError(
+            f"{integrator!r}: with rho_inf = 1 the forces of joints and drives grow from step to step, and the model "
+            f"has {what}; take rho_inf below 1, such as 0.8"
+        )
