@@ -116,7 +116,7 @@ def tip_errors(model, exact, integrator, h, t_end, halved):
 
 
 @pytest.mark.parametrize("halved", [False, True], ids=["uniform", "halved"])
-@pytest.mark.parametrize(("integrator", "order", "slack"), [("backward_euler", 1, 0.05), ("bdf2", 2, 0.1)])
+@pytest.mark.parametrize(("integrator", "order", "slack"), [("backward_euler", 1, 0.05), ("bdf2", 2, 0.1), ("generalized_alpha", 2, 0.1)])
 def test_order_of_convergence(cantilever, data, integrator, order, slack, halved):
     ref = data.json("S3_exact_svk_q5")
     exact = np.array(ref["runs"]["reference"]["trajectory"]["tip_mean"])
@@ -141,7 +141,7 @@ def test_order_of_convergence_over_a_longer_time(cantilever, data, integrator, h
     assert np.log(worst[0] / worst[1]) / np.log(hs[0] / hs[1]) == pytest.approx(order, abs=slack)
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "generalized_alpha"])
 def test_a_refused_step_equals_two_of_half_the_size(cantilever, data, integrator):
     _, model = cantilever(data.json("S3_BE_svk_q4"))
     options = {"integrator": integrator, "ledger": False}
