@@ -104,6 +104,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.b[world] = c.b
         if wp.static(accelerated):
             step.q_a[world] = c.q_a
+            step.stretch[world] = h / step.previous_h[world]
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
             step.ramp[world] = step.new_time[world]
@@ -113,6 +114,11 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.dq_dv[world] = c.dq_dv
             step.mass_factor[world] = c.mass_factor
             step.ramp[world] = f64(1.0)
+
+    @wp.func
+    def averaged(stretch: f64, a: vec3, w: vec3) -> vec3:
+        """a_n for the step at hand: a is that of the last one's, of a time as far from w's as it was long."""
+        return w + T(stretch) * (a - w)
 
     @wp.kernel(module=module)
     def predict(
@@ -148,8 +154,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             q += T(step.b[world]) * v_n[world, slot]
         if wp.static(accelerated):
             c = coefficients(step.h[world], f64(0.0), step.parameter)
-            q += T(c.q_a) * u_before[world, slot]
-            w += T(c.v_a) * u_before[world, slot] + T(c.v_w) * v_before[world, slot]
+            a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
+            q += T(c.q_a) * a
+            w += T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
         q_tilde[world, slot] = q
         v_tilde[world, slot] = w
         first = vec3()
@@ -274,12 +281,13 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
                 step.previous_end[world] = step.new_time[world]
         if wp.static(accelerated):
             c = coefficients(step.h[world], f64(0.0), step.parameter)
-            a = u_before[world, slot]
+            a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
             new = v[world, slot]
             before = v_n[world, slot] + T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
             u_before[world, slot] = T(c.a_v) * (new - v_n[world, slot]) - T(c.a_a) * a
             v_before[world, slot] = T(c.mass_factor) * (new - before)
             if slot == 0:
+                step.previous_h[world] = step.h[world]
                 step.previous_end[world] = step.new_time[world]
         u_n[world, slot] = u[world, slot]
         if slot == 0:

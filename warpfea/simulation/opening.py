@@ -4,7 +4,9 @@ At a state (q, v) at time t, with supports and constraints c(q, t) = 0 of which 
 
     M dv + J^T L = 0,    J (v + dv) + c_t = 0,        M w + J^T m = f - f_int,    J w = -(c'' without J w)
 
-are solved on the host, by factors of the mass matrix and a dense matrix of the constraints.
+are solved on the host, by factors of the mass matrix and a dense matrix of the constraints. In the directions that
+supports and constraints prescribe, a_0 = w(t + (am - af) h), and v_0 is off by h^2 (1/6 - beta - (am - af)/2) w' (Arnold,
+Bruels and Cardona 2015): else the reactions of the first steps are of the first order.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ FACTORED = 20_000
 """Slots up to which the mass matrix is factorised; larger ones are solved iteratively."""
 FIRST = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
 SECOND = np.array([35.0, -104.0, 114.0, -56.0, 11.0]) / 12.0
+THIRD = np.array([-5.0, 18.0, -24.0, 14.0, -3.0]) / 2.0
 """Derivatives at the first of five points."""
 REDUNDANT = 1e-11
 """Singular values of the matrix of the constraints below this part of the largest are of redundant rows."""
@@ -96,21 +99,27 @@ class Opening:
     def _start(self, flags: np.ndarray, time: np.ndarray, ahead: np.ndarray, dt: float) -> None:
         state: Any = self.at.state
         laws = self._law_motion(flags, ahead, dt)
-        v = state.velocity.numpy().astype(float)
+        u, v = state.displacement.numpy().astype(float), state.velocity.numpy().astype(float)
         before = self._kinetic(v)
-        goals = {}
         for world in np.flatnonzero(flags):
-            goals[world] = self._goals(world, v[world], laws[:, world])
-            v[world] += self._impulse(v[world], *goals[world])
+            v[world] += self._impulse(u[world], v[world], laws[:, world])
+        self._set(state.velocity, flags, v)
+        g = self._unbalanced(flags, ahead, dt)
+        w, a = np.zeros_like(v), np.zeros_like(v)
+        rho = self.integrator.parameter
+        early = (rho - 1.0) / (rho + 1.0)  # a_n is of the time t + early dt
+        late = 1.0 / 6.0 - 1.0 / (rho + 1.0) ** 2 - 0.5 * early
+        for world in np.flatnonzero(flags):
+            motion = u[world], v[world], laws[:, world]
+            w[world] = self._acceleration(g[world], *motion)
+            jerk = self._jerk(*motion, w[world], 0.25 * dt)
+            a[world] = w[world] + early * dt * jerk
+            v[world] += late * dt**2 * jerk  # where prescribed places lead a scheme of constant steps to
         self._set(state.velocity, flags, v)
         self._book(flags, self._kinetic(v) - before)
-        g = self._unbalanced(flags, ahead, dt)
-        w = np.zeros_like(v)
-        for world in np.flatnonzero(flags):
-            goals[world] = self._goals(world, v[world], laws[:, world])
-            w[world] = self._acceleration(g[world], *goals[world])
         self._set(state.acceleration, flags, w)
-        self._set(state.algorithmic_acceleration, flags, w)
+        self._set(state.algorithmic_acceleration, flags, a)
+        self._set(state.previous_step, flags, np.full(len(time), dt))
         self._set(state.previous_end, flags, time)
         self.count += 1
 
@@ -135,18 +144,18 @@ class Opening:
             state.ledger.assign(ledger)
 
     def _law_motion(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
-        """(3, B, laws, 3): values of the time laws, their rates and second rates from the time (B,) on.
+        """(4, B, laws, 3): values of the time laws and their first three rates from the time (B,) on.
 
-        Of samples the slope after the time, without a second rate; of a function differences over dt.
+        Of samples the slope after the time alone; of a function differences over dt.
         """
         laws = self.model.terms.laws.laws
         points = np.array([self._law_values(flags, time + 0.25 * dt * k) for k in range(len(FIRST))])
-        out = np.zeros((3, *points.shape[1:]))
+        out = np.zeros((4, *points.shape[1:]))
         out[0] = points[0]
         for k, law in enumerate(laws):
             if law.function is not None:
-                out[1, :, k] = np.tensordot(FIRST, points[:, :, k], 1) / (0.25 * dt)
-                out[2, :, k] = np.tensordot(SECOND, points[:, :, k], 1) / (0.25 * dt) ** 2
+                for order, weights in enumerate((FIRST, SECOND, THIRD), start=1):
+                    out[order, :, k] = np.tensordot(weights, points[:, :, k], 1) / (0.25 * dt) ** order
             else:
                 out[1, :, k] = [slope_after(law, t + SAME * dt) for t in time]
         return out
@@ -183,20 +192,15 @@ class Opening:
 
     # supports and constraints
 
-    def _goals(self, world: int, v: np.ndarray, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any, np.ndarray, np.ndarray]:
-        """Prescribed velocities and accelerations (slots, 3), J (rows, 3 slots), and c' - J v and c'' - J w (rows,)."""
-        m = self.model
-        rate, bend = np.zeros_like(v), np.zeros_like(v)
-        self._drives(laws, rate, bend)
-        if m.constraints is None:
-            return rate, bend, None, np.zeros(0), np.zeros(0)
-        u = self.at.state.displacement.numpy()[world].astype(float)
-        gradients, first, second = constraint_rates(m.constraints.tables, u, v, laws)
-        J = m.constraints.tables.expand(gradients)
-        return rate, bend, J, first - J @ v.ravel(), second
+    def _rows(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        """J (rows, 3 slots), c' and c'' less J w (rows,)."""
+        tables = self.model.constraints
+        gradients, first, second = constraint_rates(tables, u, v, laws)
+        return tables.expand(gradients), first, second
 
-    def _drives(self, laws: np.ndarray, rate: np.ndarray, bend: np.ndarray) -> None:
-        """Fill in the motion of driven slots."""
+    def _held(self, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Velocities and accelerations of prescribed components, 0 of others, (slots, 3)."""
+        rate, bend = np.zeros((2, self.model.slots, 3))
         supports = self.model.terms.supports
         if (d := supports.moved) is not None:
             slot, law = d.slot.numpy(), d.law.numpy()
@@ -212,23 +216,47 @@ class Opening:
             across = np.cos(angle) * twice - np.sin(angle) * turn
             for target, values in ((rate, first * along), (bend, second * along + first**2 * across)):
                 target[slot] = np.where(on, values, target[slot])
+        held = self.model.free_host == 0.0
+        return np.where(held, rate, 0.0), np.where(held, bend, 0.0)
 
     # linear algebra
 
-    def _impulse(self, v: np.ndarray, rate: np.ndarray, bend: np.ndarray, J: Any, c_t: Any, rest: Any) -> np.ndarray:
+    def _impulse(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
         """dv, m/s: nothing where velocities are consistent."""
-        held = self.model.free_host == 0.0
-        jump = np.where(held, rate - v, 0.0)
-        if J is None and not jump.any():
-            return jump
-        missing = None if J is None else -(J @ v.ravel() + c_t)
-        return self._saddle(np.zeros_like(v), jump, J, missing)
+        jump = self._held(laws)[0] - np.where(self.model.free_host == 0.0, v, 0.0)
+        if self.model.constraints is None:
+            return self._saddle(np.zeros_like(v), jump) if jump.any() else jump
+        J, first, _ = self._rows(u, v, laws)
+        return self._saddle(np.zeros_like(v), jump, J, -first)
 
-    def _acceleration(self, g: np.ndarray, rate: Any, bend: np.ndarray, J: Any, c_t: Any, rest: Any) -> np.ndarray:
+    def _acceleration(self, g: np.ndarray, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
         """w, m/s^2."""
-        return self._saddle(-g, np.where(self.model.free_host == 0.0, bend, 0.0), J, None if J is None else -rest)
+        held = self._held(laws)[1]
+        if self.model.constraints is None:
+            return self._saddle(-g, held)
+        J, _, second = self._rows(u, v, laws)
+        return self._saddle(-g, held, J, -second)
 
-    def _saddle(self, force: np.ndarray, held: np.ndarray, J: Any, goal: Any) -> np.ndarray:
+    def _jerk(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray, w: np.ndarray, s: float) -> np.ndarray:
+        """The part of dw/dt, m/s^3, that supports and constraints prescribe, by differences over -s .. s.
+
+        The rest is left out: of stiff bodies it would be large, and their oscillations are none of a step's business.
+        """
+        if self.model.constraints is None and not self.driven:
+            return np.zeros_like(w)
+        held, goal, rows = np.zeros_like(w), None, None
+        for sign in (-0.5 / s, 0.5 / s):
+            x = np.copysign(s, sign)
+            there = np.tensordot([[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]], laws, 1)
+            held += sign * self._held(there)[1]
+            if self.model.constraints is not None:
+                J, _, second = self._rows(u + x * v + 0.5 * x**2 * w, v + x * w, there)
+                goal = (0.0 if goal is None else goal) - sign * (second + J @ w.ravel())
+        if self.model.constraints is not None:
+            rows = self._rows(u, v, laws)[0]
+        return self._saddle(np.zeros_like(w), held, rows, goal)
+
+    def _saddle(self, force: np.ndarray, held: np.ndarray, J: Any = None, goal: Any = None) -> np.ndarray:
         """x (slots, 3) with M x + J^T m = force on free components, x = held on others, and J x = goal."""
         m = self.model
         x = self._solve(force - m.mass_host @ held) + held
@@ -273,7 +301,7 @@ def slope_after(law: TimeLaw, time: float) -> np.ndarray:
 def constraint_rates(tables: Any, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gradients (rows, 3, 3), first rates c' (rows,) m/s, and second rates without J w, m/s^2, of one world's rows.
 
-    u, v: (slots, 3); laws: (3, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
+    u, v: (slots, 3); laws: (3 or 4, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
     """
     count = tables.count
     moved, speed = np.zeros((2, 3 * count, 3))

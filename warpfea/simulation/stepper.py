@@ -72,6 +72,7 @@ class Stepper:
         if integrator.accelerated:
             state.register("algorithmic_acceleration", vec3, (model.slots,))
             state.register("acceleration", vec3, (model.slots,))
+            state.register("previous_step", wp.float64)
             state.register("previous_end", wp.float64, initial=np.nan)
         if ledger:
             state.register("ledger", wp.float64, (len(model.terms.ledger),))
@@ -117,11 +118,11 @@ class Stepper:
         w.step.parameter = self.integrator.parameter
         if self.integrator.takes_velocity:
             w.step.b = w.array("b", (self.model.worlds,), wp.float64)
-        if self.integrator.multistep:
-            w.step.previous_h = state.previous_step
         if self.integrator.accelerated:
             w.step.q_a = w.array("q_a", (self.model.worlds,), wp.float64)
+            w.step.stretch = w.array("stretch", (self.model.worlds,), wp.float64)
         if self.integrator.multistep or self.integrator.accelerated:
+            w.step.previous_h = state.previous_step
             w.step.previous_end = state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
