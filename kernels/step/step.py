@@ -21,6 +21,8 @@ __all__ = ["step_kernels"]
 
 FULL = 1e-9
 """Part of the load that may lack where all of it counts as acting."""
+STRETCH = 2.0
+"""Largest growth of a step that accelerations are extrapolated for: after many halvings they are those of an event."""
 
 
 @functools.cache
@@ -104,7 +106,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.b[world] = c.b
         if wp.static(accelerated):
             step.q_a[world] = c.q_a
-            step.stretch[world] = h / step.previous_h[world]
+            step.stretch[world] = wp.min(h / step.previous_h[world], f64(STRETCH))
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
             step.ramp[world] = step.new_time[world]
