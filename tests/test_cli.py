@@ -271,6 +271,18 @@ def test_statics_of_a_scene_has_ten_load_steps(folder, capfd):
     assert json.loads(out)["steps"] == 10
 
 
+def test_statics_holds_what_rests_on_contact_with_stabilise(folder, capfd):
+    command = ["run", "belt", "--static", "--load-steps", "2", "--device", "cpu", "--json", "-"]
+    code, _, err = run(capfd, *command)
+    assert code == 2
+    assert "6 rigid motions free" in err
+    code, out, _ = run(capfd, *command, "--stabilise")
+    summary = json.loads(out)
+    (contact,) = summary["contacts"].values()
+    assert (code, summary["load"]) == (0, 1.0)
+    np.testing.assert_allclose(contact["force"][2], 9.81 * summary["mass"], rtol=1e-6)
+
+
 def test_statics_takes_the_whole_load_at_once_with_auto(folder, capfd):
     code, out, _ = run(capfd, *STATIC, *LIGHT, "--load-steps", "auto", "--json", "-")
     summary = json.loads(out)
@@ -483,6 +495,8 @@ def test_help_teaches(capfd, command):
     assert "usage: warpfea" in out
     if command in ([], ["run"], ["render"], ["bench"]):
         assert "examples:" in out
+    if command in (["run"], ["render"]):
+        assert "contact_pressure, gap" in " ".join(out.split())
 
 
 def test_the_bar_of_the_compilation_goes_to_stderr(capfd):
@@ -540,6 +554,7 @@ BAD = {
     "unknown format": (["run", "part.nas", *OUT], ["part.nas: .nas is not a format", ".msh"]),
     "info of a missing mesh": (["info", "none.msh"], ["none.msh"]),
     "load steps of a motion": ([*SHORT, "--load-steps", "3"], ["--load-steps is for --static"]),
+    "springs of a motion": ([*SHORT, "--stabilise"], ["--stabilise is for --static"]),
     "static with dt": (["run", "cantilever", "--static", "--dt", "1e-3"], ["--dt is for a motion"]),
     "static with a checkpoint": (["run", "cantilever", "--static", "--checkpoint", "o.npz"], ["--checkpoint is for"]),
     "static with jacobi": (["run", "cantilever", "--static", "--solver", "jacobi"], ["--solver jacobi"]),

@@ -8,10 +8,13 @@ import pytest
 import warpfea as wf
 from warpfea.simulation.checkpoint import save_checkpoint
 
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+DTYPES = ["float64", "float32"]
 FLOOR = wf.HalfSpace((0, 0, 1), 0.0)
 
 
-def resting(shape=FLOOR, *, path=None, worlds=1, dtype="float64", initial=None, velocity=None, **options):
+def resting(shape=FLOOR, *, path=None, worlds=1, dtype="float64", device="cpu", initial=None, velocity=None,
+            **options):  # fmt: skip
     """A cube of 0.1 m and 1 kg on an obstacle: cube, model."""
     b = wf.ModelBuilder()
     material = wf.SVK(E=1e6, nu=0.3, density=1000)
@@ -21,7 +24,7 @@ def resting(shape=FLOOR, *, path=None, worlds=1, dtype="float64", initial=None, 
         b.set_initial(cube, velocity=velocity, angular_velocity=(0, 3, 5))
     floor = b.add_collider(shape, path=path, name="floor")
     b.add_contact(cube, floor, **({"mu": 0.5, "restitution": 0.5, "name": "pad"} | options))
-    return cube, b.finalize(device="cpu", worlds=worlds, dtype=dtype)
+    return cube, b.finalize(device=device, worlds=worlds, dtype=dtype)
 
 
 def test_a_reset_leaves_overlaps_of_other_worlds():
@@ -43,8 +46,11 @@ def test_an_overlap_that_has_decayed_in_statics_stays_so():
     assert sim.contact_record("pad").force[0, :, 2] == pytest.approx(9.81, rel=1e-6)
 
 
-def test_a_control_written_before_a_checkpoint_moves_the_collider_after_it(tmp_path):
-    runs = [wf.Simulation(resting(path=wf.Control("jaw", 3))[1], dt=1e-3) for _ in range(2)]
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_control_written_before_a_checkpoint_moves_the_collider_after_it(tmp_path, device, dtype):
+    model = resting(path=wf.Control("jaw", 3), device=device, dtype=dtype)[1]
+    runs = [wf.Simulation(model, dt=1e-3) for _ in range(2)]
     runs[0].step(5)
     runs[0].controls["jaw"][:] = (0, 0, 1e-4)
     save_checkpoint(runs[0], tmp_path / "c.npz")
@@ -82,7 +88,7 @@ def test_explicit_contact_is_no_statics():
         wf.solve_static(model, stabilise=True)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_touch_within_rounding_is_no_overlap(dtype):
     """0.7 m are 1.2e-8 m less in single precision."""
     _, model = resting(wf.HalfSpace((0, 0, 1), 0.7), dtype=dtype, initial=lambda X: X + (0.0, 0.0, 0.7))
@@ -126,3 +132,27 @@ def test_static_friction_of_the_papers_law(treatment, tangent):
     gone = 0.5 * 9.81 * (np.sin(angle) - 0.25 * np.cos(angle)) * 0.04**2
     moved = sim.displacements(plate)[0, :, 0].mean()
     assert moved < 0.02 * gone if tangent < 0.5 else moved == pytest.approx(gone, rel=0.3)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("device", DEVICES)
+def test_jaws_closed_by_controls_in_four_worlds_equal_single_runs(device, dtype):
+    h, steps = 1.0 / 1024.0, 6
+    path = np.linspace(0.0, 3e-4, steps)[:, None] * np.array([1.0, 0.5, -0.5, 2.0])
+    together = wf.Simulation(resting(path=wf.Control("jaw", 3), worlds=4, device=device, dtype=dtype)[1], dt=h)
+    launches = together.stepper.launch.launches
+    for values in path:
+        together.controls["jaw"][:] = np.stack([0 * values, 0 * values, values], axis=1)
+        together.step()
+    assert together.stepper.launch.launches == launches
+    for world in range(4):
+        times, places = [0.0], [(0.0, 0.0, 0.0)]
+        for k, value in enumerate(path[:, world]):
+            times += [(k + 0.125) * h, (k + 1) * h]
+            places += [(0.0, 0.0, value)] * 2
+        alone = wf.Simulation(resting(path=(times, places), device=device, dtype=dtype)[1], dt=h)
+        alone.step(steps)
+        for name in ("displacement", "velocity", "ledger", "contact_spring", "contact_place"):
+            a, b = getattr(alone.state, name).numpy()[0], getattr(together.state, name).numpy()[world]
+            np.testing.assert_array_equal(a, b, err_msg=name)
+    assert together.contact_record("pad").normal_force.max() > 1.0

@@ -11,6 +11,7 @@ from warpfea.kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH, law_funct
 from warpfea.terms.contact_tables import beta_of, hunt_crossley_damping
 
 COUNT = 4000
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 STEP = 1e-6
 """Of central differences, over the depth's scale."""
 
@@ -45,23 +46,29 @@ def _kernels():
     return normal, tangent
 
 
-def law_at(law, lumped, k, g, ramp, eps, delta, delta_n):
+def law_at(law, lumped, k, g, ramp, eps, delta, delta_n, device="cpu"):
     """(n, 3): normal force, N, its derivative, N/m, and its potential, J."""
     shape = np.broadcast(g, delta, delta_n).shape
     arrays = [
-        wp.array(np.broadcast_to(x, shape).astype(float), dtype=wp.float64, device="cpu") for x in (g, delta, delta_n)
+        wp.array(np.broadcast_to(x, shape).astype(float), dtype=wp.float64, device=device) for x in (g, delta, delta_n)
     ]
-    out = wp.zeros(shape, dtype=wp.vec4d, device="cpu")
+    out = wp.zeros(shape, dtype=wp.vec4d, device=device)
     inputs = [law, lumped, k, arrays[0], ramp, eps, arrays[1], arrays[2], out]
-    wp.launch(_kernels()[0], shape[0], inputs, device="cpu")
+    wp.launch(_kernels()[0], shape[0], inputs, device=device)
     return out.numpy()
 
 
-def friction_at(smooth, a, b, slip, cap):
+def friction_at(smooth, a, b, slip, cap, device="cpu"):
     """(n, 2): potential, J, and what multiplies the trial force or the slip."""
-    out = wp.zeros(len(slip), dtype=wp.vec2d, device="cpu")
-    inputs = [smooth, a, b, wp.array(slip, dtype=wp.vec3d, device="cpu"), wp.array(cap, dtype=wp.float64, device="cpu")]
-    wp.launch(_kernels()[1], len(slip), [*inputs, out], device="cpu")
+    out = wp.zeros(len(slip), dtype=wp.vec2d, device=device)
+    inputs = [
+        smooth,
+        a,
+        b,
+        wp.array(slip, dtype=wp.vec3d, device=device),
+        wp.array(cap, dtype=wp.float64, device=device),
+    ]
+    wp.launch(_kernels()[1], len(slip), [*inputs, out], device=device)
     return out.numpy()
 
 
@@ -94,11 +101,12 @@ def inner(parts, delta, kinks):
 
 
 @pytest.mark.parametrize("name", NORMAL)
-def test_normal_force_is_the_derivative_of_its_potential(name):
+@pytest.mark.parametrize("device", DEVICES)
+def test_normal_force_is_the_derivative_of_its_potential(device, name):
     law, lumped, ramp, eps = NORMAL[name]
     g, delta, delta_n = random_depths(law)
-    at = [law_at(law, lumped, K, g, ramp, eps, delta + s, delta_n) for s in (-STEP, STEP)]
-    middle = law_at(law, lumped, K, g, ramp, eps, delta, delta_n)
+    at = [law_at(law, lumped, K, g, ramp, eps, delta + s, delta_n, device) for s in (-STEP, STEP)]
+    middle = law_at(law, lumped, K, g, ramp, eps, delta, delta_n, device)
     ok = inner(at, delta, (0.0, ramp))
     assert ok.mean() > 0.99
     difference = (at[1][:, 2] - at[0][:, 2]) / (2.0 * STEP)
@@ -108,12 +116,13 @@ def test_normal_force_is_the_derivative_of_its_potential(name):
 
 
 @pytest.mark.parametrize("name", NORMAL)
-def test_stiffness_is_the_derivative_of_the_normal_force(name):
+@pytest.mark.parametrize("device", DEVICES)
+def test_stiffness_is_the_derivative_of_the_normal_force(device, name):
     law, lumped, ramp, eps = NORMAL[name]
     g, delta, delta_n = random_depths(law, seed=1)
     delta = np.where(np.abs(delta) < 1e-2, 1e-2, delta)  # delta^(1/4) bends without bound at 0
-    at = [law_at(law, lumped, K, g, ramp, eps, delta + s, delta_n) for s in (-STEP, STEP)]
-    middle = law_at(law, lumped, K, g, ramp, eps, delta, delta_n)
+    at = [law_at(law, lumped, K, g, ramp, eps, delta + s, delta_n, device) for s in (-STEP, STEP)]
+    middle = law_at(law, lumped, K, g, ramp, eps, delta, delta_n, device)
     ok = inner(at, delta, (0.0, ramp))
     difference = (at[1][:, 0] - at[0][:, 0]) / (2.0 * STEP)
     assert (np.abs(difference - middle[:, 1]) / (K + g))[ok].max() < 1e-6
@@ -139,18 +148,19 @@ def test_smooth_force_tends_to_the_clip_as_eps_vanishes():
 
 
 @pytest.mark.parametrize("smooth", [0, 1])
-def test_friction_is_the_derivative_of_its_potential_and_never_above_its_cap(smooth):
+@pytest.mark.parametrize("device", DEVICES)
+def test_friction_is_the_derivative_of_its_potential_and_never_above_its_cap(device, smooth):
     rng = np.random.default_rng(4)
     slip = rng.normal(size=(COUNT, 3)) * rng.choice([1e-3, 1.0], COUNT)[:, None]
     cap = rng.uniform(0.0, 3.0, COUNT)
     a, b = (50.0, 0.02) if smooth else (2.0, 0.0)
-    factor = friction_at(smooth, a, b, slip, cap)[:, 1]
+    factor = friction_at(smooth, a, b, slip, cap, device)[:, 1]
     force = factor[:, None] * slip * (1.0 if smooth else a)
     assert (np.linalg.norm(force, axis=1) <= cap * (1.0 + 1e-14)).all()
     for axis in range(3):
         shift = np.zeros(3)
         shift[axis] = 1e-4 * (b / a if smooth else 1.0 / a)  # of the slip where the force bends
-        high, low = (friction_at(smooth, a, b, slip + s, cap)[:, 0] for s in (shift, -shift))
+        high, low = (friction_at(smooth, a, b, slip + s, cap, device)[:, 0] for s in (shift, -shift))
         assert np.abs((high - low) / (2.0 * shift[axis]) - force[:, axis]).max() < (1e-6 if smooth else 1e-4)
 
 

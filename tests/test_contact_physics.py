@@ -30,6 +30,9 @@ def everywhere(X):
     return np.ones(len(X), dtype=bool)
 
 
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+
+
 def cube(b, name="cube", map=None, origin=(0.0, 0.0, 0.0), material=STIFF):
     mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4", origin=origin, map=map)
     return b.add_solid(mesh, material=material, name=name)
@@ -54,7 +57,7 @@ def force_of(row):
 # laws through Simulation, all nodes driven
 
 
-def driven(values, times, options, path=None, low=1e-4, shape=None):
+def driven(values, times, options, path=None, low=1e-4, shape=None, device="cpu", dtype="float64"):
     """A cube on its corner, all nodes driven, over a plane `low` below it; a free body is there to be solved for."""
     b = wf.ModelBuilder()
     body = cube(b, map=tilted, material=wf.SVK(E=2e6, nu=0.3, density=1000.0))
@@ -63,26 +66,31 @@ def driven(values, times, options, path=None, low=1e-4, shape=None):
     floor = b.add_collider(shape or wf.HalfSpace((0, 0, 1), -low), path=path)
     contact = b.add_contact(body, floor, model="sphere", radius=0.3, **options)
     X = contact_points(contact.surface).X.reshape(-1, 3)
-    return wf.Simulation(b.finalize(device="cpu"), dt=times[1] - times[0]), contact, X[X[:, 2].argmin()]
+    return wf.Simulation(b.finalize(device=device, dtype=dtype), dt=times[1] - times[0]), contact, X[X[:, 2].argmin()]
 
 
 @pytest.mark.parametrize("shape", ["plane", "sphere"])
-def test_sphere_is_hertz(shape):
+@pytest.mark.parametrize(("dtype", "bound"), [("float64", 1e-10), ("float32", 2e-5)])
+@pytest.mark.parametrize("device", DEVICES)
+def test_sphere_is_hertz(device, dtype, bound, shape):
     times, depths = 0.1 * np.arange(7), np.array([0.0, -1e-3, 1e-5, 1e-3, 1e-2, 4e-3, 2e-2])
     values = np.zeros((7, 3))
     values[:, 2] = -depths
     ball = wf.Sphere((0.08, 0.0, -0.5), 0.5)  # below the corner
-    sim, contact, _ = driven(values, times, {}, low=0.0, shape=ball if shape == "sphere" else None)
+    sim, contact, _ = driven(
+        values, times, {}, low=0.0, shape=ball if shape == "sphere" else None, device=device, dtype=dtype
+    )
     R = 1.0 / (1.0 / 0.3 + (1.0 / 0.5 if shape == "sphere" else 0.0))
     for d in np.maximum(depths[1:], 0.0):
         sim.step()
         hertz = 4.0 / 3.0 * 2e6 / (1.0 - 0.3**2) * math.sqrt(R) * d**1.5
-        assert force_of(record(sim, contact)) == pytest.approx([0.0, 0.0, hertz], rel=1e-10, abs=1e-9)
+        assert force_of(record(sim, contact)) == pytest.approx([0.0, 0.0, hertz], rel=bound, abs=1e-9)
 
 
 @pytest.mark.parametrize("turning", [False, True], ids=["fixed plane", "turning plane"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_explicit_paper_law_on_a_random_sequence(turning, seed):
+@pytest.mark.parametrize("device", DEVICES)
+def test_explicit_paper_law_on_a_random_sequence(device, turning, seed):
     """Eqs. (73) to (83) written anew; the plane's velocity is that of the step to come."""
     rng = np.random.default_rng(seed)
     h, count, low, R, E, nu, e, mu, mass = 0.01, 200, 1e-4, 0.3, 2e6, 0.3, 0.4, 0.35, 1.0
@@ -94,7 +102,7 @@ def test_explicit_paper_law_on_a_random_sequence(turning, seed):
     axis, anchor = np.array([0.6, 0.8, 0.0]), np.array([0.1, 0.2, -low])
     path = wf.Rotation(anchor=tuple(anchor), axis=tuple(axis), angle=(times, angle)) if turning else None
     options = {"law": "paper", "treatment": "explicit", "mu": mu, "restitution": e}
-    sim, contact, corner = driven(u, times, options, path, low)
+    sim, contact, corner = driven(u, times, options, path, low, device=device)
     got = []
     for _ in range(count):
         sim.step()
@@ -258,7 +266,8 @@ def test_paper_patch_without_solution_raises():
 # friction
 
 
-def block(model="patch", *, mu, mu_static=None, guided=False, h=0.02, g=(0, 0, -G), stiffness=1e-2, **options):
+def block(model="patch", *, mu, mu_static=None, guided=False, h=0.02, g=(0, 0, -G), stiffness=1e-2, device="cpu",
+          **options):  # fmt: skip
     """A stiff cube on a plane, on its face or, guided along x at a depth of 0.2 mm, on its corner."""
     b = wf.ModelBuilder(gravity=g)
     floor = b.add_collider(wf.HalfSpace((0, 0, 1)))
@@ -272,7 +281,7 @@ def block(model="patch", *, mu, mu_static=None, guided=False, h=0.02, g=(0, 0, -
         surface, floor, mu=mu, mu_static=mu_static, restitution=0.3, stiffness=stiffness, **options
     )  # fmt: skip
     b.add_probe("p", body.at(middle(map)))
-    model = b.finalize(device="cpu")
+    model = b.finalize(device=device)
     return model, wf.Simulation(model, dt=h, solver=wf.NewtonPCG(tol=1e-10)), contact
 
 
@@ -318,10 +327,11 @@ def test_incline_slips_at_its_angle_of_friction(model, mu):
     assert 0.995 < math.atan(tangent) / wanted < 1.005
 
 
-def test_steady_slip_accelerates_as_it_should():
+@pytest.mark.parametrize("device", DEVICES)
+def test_steady_slip_accelerates_as_it_should(device):
     """And backward Euler's own sum gives the place."""
     angle, h, count = math.radians(25.0), 1e-2, 60
-    model, sim, _ = block(mu=0.3, h=h)
+    model, sim, _ = block(mu=0.3, h=h, device=device)
     for _ in range(40):
         tilt(model, 0.0)
         sim.step()
@@ -349,55 +359,6 @@ def test_smooth_law_creeps_as_its_formula_says():
     sim.step(300)
     part = tangent / mu
     assert sim.probe("p").velocity[0, -1, 0] == pytest.approx(v_eps * part / math.sqrt(1.0 - part**2), rel=1e-9)
-
-
-@pytest.mark.parametrize("element", ["T4", "T10"])
-def test_a_block_pressed_to_a_wall_does_not_creep(element):
-    b = wf.ModelBuilder(gravity=(0, 0, -G))
-    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element=element)
-    body = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000.0), name="cube")
-    b.add_traction(body.surface("x+"), (-2000.0, 0, 0))
-    wall = b.add_collider(wf.HalfSpace((1, 0, 0)))
-    contact = b.add_contact(body.surface("x-"), wall, mu=1.0, restitution=0.5)
-    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, solver=wf.NewtonPCG(tol=1e-10), record=False)
-    sim.step(1000)
-    before = sim.positions(body).copy()
-    sim.step(1000)
-    assert np.abs(sim.positions(body) - before).max() < 1e-11
-    assert force_of(record(sim, contact)) == pytest.approx([20.0, 0.0, G], rel=1e-6, abs=1e-6)
-
-
-def turned_block(law):
-    """Places of a block on a plate that turns at 10 rad/s, in its frame, after each of ten turns."""
-    h, speed, rest, ramp = 2.0 * math.pi / 10.0 / 200, 10.0, 200, 20
-    times = h * np.arange(rest + ramp + 2001)
-    angle = speed * h * np.maximum(np.arange(len(times)) - rest - ramp / 2, 0.0)
-    angle[rest : rest + ramp + 1] = 0.5 * speed * h * np.arange(ramp + 1) ** 2 / ramp
-    b = wf.ModelBuilder(gravity=(0, 0, -G))
-    path = wf.Rotation(anchor=(0.05, 0.05, 0), axis=(0, 0, 1), angle=(times, angle))
-    plate = b.add_collider(wf.HalfSpace((0, 0, 1)), path=path)
-    body = cube(b, origin=(0.02, 0, 0), material=wf.SVK(E=1e8, nu=0.3, density=1000.0))
-    b.add_contact(body.surface("z-"), plate, mu=0.8, restitution=0.5, stiffness=0.1, law=law)
-    sim = wf.Simulation(b.finalize(device="cpu"), dt=h, solver=wf.NewtonPCG(tol=1e-10), record=False)
-    sim.step(rest + ramp)
-    places = []
-    for turn in range(10):
-        sim.step(200)
-        a = angle[rest + ramp + 200 * (turn + 1)]
-        R = np.array([[math.cos(a), math.sin(a), 0], [-math.sin(a), math.cos(a), 0], [0, 0, 1]])
-        places.append((sim.positions(body)[0] - (0.05, 0.05, 0)) @ R.T)
-    return np.array(places)
-
-
-def test_a_stuck_block_stays_on_a_turning_plate():
-    places = turned_block("default")
-    assert np.abs(places[-1] - places[0]).max() < 1e-5 * 0.1
-
-
-def test_the_paper_s_law_walks_on_a_turning_plate():
-    """Eq. (78) does not turn the spring with the bodies: stated among the law's defects."""
-    places = turned_block("paper")
-    assert 1e-4 < np.abs(places[-1] - places[0]).max() / 0.1 < 0.1
 
 
 @pytest.mark.parametrize(("tangent", "slides"), [(0.249, False), (0.251, True)])

@@ -2,8 +2,13 @@
 
 import json
 import pathlib
+from dataclasses import asdict
 
+import numpy as np
 import pytest
+
+from warpfea.studies.bench.contact import start
+from warpfea.studies.bench.contact_solves import BESIDE, SOLVES, solve_rows
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 FILES = {"contact_cpu.json": ("cpu", 8000, 1.3), "contact_h200.json": ("cuda", 100_000, 1.1)}
@@ -11,18 +16,24 @@ FILES = {"contact_cpu.json": ("cpu", 8000, 1.3), "contact_h200.json": ("cuda", 1
 APART = pytest.mark.xfail(strict=True, reason="1.14 on the H200: a launch per product, and six small ones per iterate")
 
 
-def rows_of(name):
+def content_of(name):
     path = RESULTS / name
     assert path.exists(), f"{path} is missing: make it with `warpfea bench --contact`"
     content = json.loads(path.read_text())
-    device, unknowns, _ = FILES[name]
+    device, _, _ = FILES[name]
     assert content["command"].startswith("warpfea bench --contact --device")
     assert content["machine"]["device"].startswith(device)
     assert len(content["commit"]) >= 40
     assert content["versions"]["warp"]
-    rows = {row["scene"]: row for row in content["rows"]}
+    return content
+
+
+def rows_of(name):
+    """Of the smallest size that counts, by scene."""
+    _, unknowns, _ = FILES[name]
+    rows = {row["scene"]: row for row in reversed(content_of(name)["rows"]) if row["unknowns"] >= unknowns}
     assert set(rows) == {"none", "clamped", "apart", "resting", "sliding"}
-    assert all(row["unknowns"] >= unknowns and row["halvings"] == 0 for row in rows.values())
+    assert all(row["halvings"] == 0 for row in rows.values())
     return rows
 
 
@@ -39,3 +50,23 @@ def test_apart(name):
     rows = rows_of(name)
     assert rows["apart"]["newton_per_step"] == rows["none"]["newton_per_step"]
     assert rows["apart"]["ms_per_step"] <= FILES[name][2] * rows["none"]["ms_per_step"]
+
+
+def assert_solves(rows):
+    """Of one size."""
+    mean = {(row["scene"], row["stiffness"]): np.mean(row["pcg"]) for row in rows}
+    assert set(mean) == set(SOLVES)
+    for (scene, stiffness), iterations in mean.items():
+        if scene in BESIDE:
+            assert iterations <= 1.3 * mean[BESIDE[scene], 1.0], (scene, stiffness)
+    assert all(row["levels"] >= 2 for row in rows)
+
+
+@pytest.mark.parametrize(("least", "most"), [(8e3, 2e4), (8e4, 2e5)], ids=["10k", "100k"])
+def test_solves_take_few_more_iterations_than_with_contact_nodes_clamped(least, most):
+    assert_solves([row for row in content_of("contact_cpu.json")["solves"] if least < row["unknowns"] < most])
+
+
+def test_solves_of_a_small_block():
+    sims = {key: start(key[0], 4, "float64", "cpu", None, key[1]).sim for key in SOLVES}
+    assert_solves([asdict(row) for row in solve_rows(sims)])

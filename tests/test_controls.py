@@ -9,6 +9,7 @@ from warpfea.terms.term import Term
 
 H = 1.0 / 128.0  # exact in binary, so that the samples of a law are met exactly
 VALUES = np.array([0.25, 0.75, -0.5, 0.125])
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 RUBBER = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 
 
@@ -59,10 +60,10 @@ KINDS = {
 }
 
 
-def simulation(kind, law, worlds=1, dtype="float64", **options):
+def simulation(kind, law, worlds=1, dtype="float64", device="cpu", **options):
     b, body = bar()
     KINDS[kind][0](b, body, law)
-    model = b.finalize(device="cpu", dtype=dtype, worlds=worlds)
+    model = b.finalize(device=device, dtype=dtype, worlds=worlds)
     return wf.Simulation(model, dt=H, **options)
 
 
@@ -93,18 +94,21 @@ def assert_worlds_equal_single_runs(kind, dtype="float64", **options):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_worlds_driven_differently_equal_single_runs_bit_for_bit(kind):
-    assert_worlds_equal_single_runs(kind)
+@pytest.mark.parametrize("device", DEVICES)
+def test_worlds_driven_differently_equal_single_runs_bit_for_bit(device, kind):
+    assert_worlds_equal_single_runs(kind, device=device)
 
 
 @pytest.mark.parametrize("kind", ["displacement", "joint", "pressure"])
-def test_worlds_equal_single_runs_in_bdf2(kind):
-    assert_worlds_equal_single_runs(kind, integrator="bdf2")
+@pytest.mark.parametrize("device", DEVICES)
+def test_worlds_equal_single_runs_in_bdf2(device, kind):
+    assert_worlds_equal_single_runs(kind, integrator="bdf2", device=device)
 
 
 @pytest.mark.parametrize("kind", ["rotation", "joint", "load"])
-def test_worlds_equal_single_runs_in_float32(kind):
-    assert_worlds_equal_single_runs(kind, dtype="float32")
+@pytest.mark.parametrize("device", DEVICES)
+def test_worlds_equal_single_runs_in_float32(device, kind):
+    assert_worlds_equal_single_runs(kind, dtype="float32", device=device)
 
 
 def test_driven_nodes_and_joints_are_where_the_control_says():
@@ -232,20 +236,21 @@ def test_reset_of_a_driven_joint():
     assert sim.joint_value("rod") == pytest.approx([0.0, 1e-3], abs=1e-8)
 
 
-def test_a_checkpoint_holds_controls(tmp_path):
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_checkpoint_holds_controls(tmp_path, device):
     def run(sim, values):
         for value in values:
             sim.controls["c"][:, 0] = (value, -value)
             sim.step()
 
     path = 1e-3 * np.array([0.5, 1.0, 1.0, 0.3])
-    whole = simulation("joint", wf.Control("c"), worlds=2)
+    whole = simulation("joint", wf.Control("c"), worlds=2, device=device)
     run(whole, path)
     whole.step(2)
-    part = simulation("joint", wf.Control("c"), worlds=2)
+    part = simulation("joint", wf.Control("c"), worlds=2, device=device)
     run(part, path)
     part.run(t_end=5 * H, outputs=[wf.Checkpoint(tmp_path / "c.npz")])
-    rest = simulation("joint", wf.Control("c"), worlds=2)
+    rest = simulation("joint", wf.Control("c"), worlds=2, device=device)
     rest.resume(tmp_path / "c.npz")
     assert np.array_equal(rest.controls["c"], [[path[-1]], [-path[-1]]])
     rest.step()
@@ -255,10 +260,10 @@ def test_a_checkpoint_holds_controls(tmp_path):
     for law in (0.0, wf.Control("d"), wf.Control("c", initial=1e-3)):
         b, body = bar()
         add_rod(b, body, law)
-        model = b.finalize(device="cpu", worlds=2)
+        model = b.finalize(device=device, worlds=2)
         assert model.fingerprint() != whole.model.fingerprint()
     with pytest.raises(wf.CheckpointError, match="another model"):
-        simulation("joint", 0.0, worlds=2).resume(tmp_path / "c.npz")
+        simulation("joint", 0.0, worlds=2, device=device).resume(tmp_path / "c.npz")
 
 
 def test_a_refused_step_keeps_what_was_written():
@@ -288,8 +293,9 @@ def count_calls(patch, calls, names):
         patch.setattr(wp.array, name, counting(name, getattr(wp.array, name)))
 
 
-def test_a_step_is_the_same_recorded_graph_and_reads_nothing_more(monkeypatch):
-    sims = {law: simulation("pressure", law) for law in (wf.Control("c"), 0.0)}
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_step_is_the_same_recorded_graph_and_reads_nothing_more(monkeypatch, device):
+    sims = {law: simulation("pressure", law, device=device) for law in (wf.Control("c"), 0.0)}
     calls = []
     for law, sim in sims.items():
         stepper = sim.stepper

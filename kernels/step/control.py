@@ -77,6 +77,7 @@ def step_struct():
         ramp: wp.array(dtype=wp.float64)  # factor of constant loads
         gravity: wp.array(dtype=wp.vec3d)
         any_running: wp.array(dtype=wp.int32)
+        any_refused: wp.array(dtype=wp.int32)  # for the first time in the step; for good
         max_halvings: wp.int32
         parameter: wp.float64  # of the integrator
         stabilise: wp.float64  # N/m per kg, of statics: springs from the last equilibrium, none at full load

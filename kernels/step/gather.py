@@ -184,10 +184,19 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)
 
     @wp.func
+    def pool_range(more: Additions, slot: int) -> wp.vec2i:
+        """Entries of the pool that a slot has; read early, for a load that nothing waits for costs nothing."""
+        out = wp.vec2i()
+        if wp.static(pooled):
+            out = wp.vec2i(more.pool_start[slot], more.pool_start[slot + 1])
+        return out
+
+    @wp.func
     def finish(
         topo: Topology,
         h: vec3,
         more: Additions,
+        pool: wp.vec2i,
         p: vec3,
         con: Constraints,
         mul: Multipliers,
@@ -204,9 +213,10 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             out -= T(more.dq_dv[world]) * f
         if wp.static(pooled):
             stiff = vec3()
-            for k in range(more.pool_start[slot], more.pool_start[slot + 1]):
+            for k in range(pool[0], pool[1]):
                 stiff += more.pool[world, more.pool_entry[k]]
-            out += T(more.dq_dv[world]) * stiff
+            if pool[0] < pool[1]:
+                out += T(more.dq_dv[world]) * stiff
         if wp.static(ties):
             tie = wp.vec3d()
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
@@ -244,13 +254,14 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return
         share = f64(0.0)
         if slot < out.shape[1]:
+            pool = pool_range(more, slot)
             f = gathered(topo, contribution, world, slot)
             a = vec3()
             for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
                 a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
             dq = T(more.dq_dv[world])
             h = T(more.mass_factor[world]) * a + dq * f
-            share = finish(topo, h, more, p_in[world, slot], con, mul, world, slot, out)
+            share = finish(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
         share_of_warp(share, slot, more.warp, world, rows)
 
     @wp.kernel(module=module, launch_bounds=(256, SUM_BLOCKS[dtype]))
@@ -271,8 +282,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return
         share = f64(0.0)
         if slot < out.shape[1]:
+            pool = pool_range(more, slot)
             h = gathered(topo, contribution, world, slot)
-            share = finish(topo, h, more, p_in[world, slot], con, mul, world, slot, out)
+            share = finish(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
         share_of_warp(share, slot, more.warp, world, rows)
 
     @wp.kernel(module=matrix_module)
@@ -296,13 +308,15 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         slot = index / lanes
         lane = index % lanes
         h = vec3()
+        pool = wp.vec2i()
         if slot < out.shape[1]:
+            pool = pool_range(more, slot)
             for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
                 h += value[world, k] * p_in[world, pattern.column[k]]
         h = lane_sum(h, lanes)
         share = f64(0.0)
         if lane == 0 and slot < out.shape[1]:
-            share = finish(topo, h, more, p_in[world, slot], con, mul, world, slot, out)
+            share = finish(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
         share_of_warp(share, index, more.warp, world, rows)
 
     @wp.kernel(module=module)

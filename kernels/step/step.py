@@ -78,6 +78,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         world = wp.tid()
         if world == 0:
             step.any_running[0] = 0
+            step.any_refused[0] = 0
         step.accepted[world] = 0
         step.first_refusal[world] = 0
         newton.active[world] = step.running[world]
@@ -238,6 +239,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         step.refused[world] = 1
         if step.halvings[world] == 0:
             step.first_refusal[world] = 1
+            wp.atomic_max(step.any_refused, 0, 1)
         step.halvings[world] = step.halvings[world] + 1
         level = step.level[world] + 1
         why = newton.failed[world]
@@ -246,6 +248,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         if hopeless or level > step.max_halvings:
             step.status[world] = wp.static(STATUS["failed"])
             step.running[world] = 0
+            wp.atomic_max(step.any_refused, 1, 1)
         else:
             step.level[world] = level
             step.part[world] = step.part[world] * 2

@@ -316,11 +316,16 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         row = facets.row + item
         first = facets.point + item * facets.points
-        energy = wp.vec2d()
         touched = wp.int32(IDLE)
         for q in range(facets.points):
+            touched = wp.max(touched, at.state[world, first + q])
+        before = at.touched[world, row]
+        at.touched[world, row] = touched
+        if wp.max(before, touched) == IDLE:
+            return  # what it has written before is nothing too
+        energy = wp.vec2d()
+        for q in range(facets.points):
             state = at.state[world, first + q]
-            touched = wp.max(touched, state)
             if state != IDLE:
                 energy += at.energy[world, first + q]
             if state != STIFF:
@@ -332,7 +337,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                     if at.state[world, first + q] != IDLE:
                         f += facets.shape[q, i, item] * vec3(at.force[world, first + q])
             pool[world, facets.pool + i * facets.count + item] = f
-        at.touched[world, row] = touched
         if touched != IDLE:
             wp.atomic_max(touching, world, 1)
         rows[0, world, row] = energy[0]

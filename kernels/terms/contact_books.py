@@ -212,47 +212,45 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         out: wp.array4d(dtype=f64),
     ):  # fmt: skip
         """Sums over the facets of a contact, by lanes; [world, contact, RECORD, lane]."""
-        world, c, lane = wp.tid()
+        world, c, j, lane = wp.tid()
         if accepted[world] == 0:
             return
-        for j in range(SUMS + 1):
-            total = f64(0.0)
-            for row in range(rows_of[c] + lane, rows_of[c + 1], LANES):
-                value = at.rows[j, world, row]
-                if j == SUMS:
-                    total = wp.max(total, value)
-                else:
-                    total += value
-            out[world, c, j, lane] = total
+        total = f64(0.0)
+        for row in range(rows_of[c] + lane, rows_of[c + 1], LANES):
+            value = at.rows[j, world, row]
+            if j == SUMS:
+                total = wp.max(total, value)
+            else:
+                total += value
+        out[world, c, j, lane] = total
 
     @wp.kernel(module=module)
     def total_records(
         clock: Clock, accepted: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=f64), at: Attempt
     ):  # fmt: skip
         """The record of the step so far: forces averaged over time, work added up."""
-        world, c = wp.tid()
+        world, c, j = wp.tid()
         if accepted[world] == 0:
             return
         h = clock.h[world]
         past = at.elapsed[world]
-        for j in range(SUMS + 1):
-            total = f64(0.0)
-            for lane in range(LANES):
-                if j == SUMS:
-                    total = wp.max(total, parts[world, c, j, lane])
-                else:
-                    total += parts[world, c, j, lane]
-            old = at.total[world, c, j]
-            if past == f64(0.0):
-                old = f64(0.0)
-            if j < FORCES:
-                if clock.still == 0:
-                    total = (past * old + h * total) / (past + h)
-            elif j == SUMS:
-                total = wp.max(total, old)
-            elif j == 7 or j > 10:
-                total += old
-            at.total[world, c, j] = total
+        total = f64(0.0)
+        for lane in range(LANES):
+            if j == SUMS:
+                total = wp.max(total, parts[world, c, j, lane])
+            else:
+                total += parts[world, c, j, lane]
+        old = at.total[world, c, j]
+        if past == f64(0.0):
+            old = f64(0.0)
+        if j < FORCES:
+            if clock.still == 0:
+                total = (past * old + h * total) / (past + h)
+        elif j == SUMS:
+            total = wp.max(total, old)
+        elif j == 7 or j > 10:
+            total += old
+        at.total[world, c, j] = total
 
     @wp.kernel(module=module)
     def keep_poses(

@@ -24,7 +24,8 @@ examples:
   warpfea info hook                                     what a scene costs, before running it
   warpfea info part.msh                                 groups and size of a mesh
 
-exit codes: 0 done, 2 bad input or usage, 3 a step was refused, 4 output failed, 130 interrupted (files are valid)
+exit codes: 0 done, 1 a defect of warpfea, 2 bad input or usage, 3 a step was refused or joints were not held,
+    4 output failed, 130 interrupted (files are valid)
 """
 
 RUN_EXAMPLES = """\
@@ -165,6 +166,11 @@ def _add_run(commands: Any) -> None:
         metavar="N",
         help="of --static (default 10); auto: the whole load at once, halved where it is refused",
     )
+    to.add_argument(
+        "--stabilise",
+        action="store_true",
+        help="of --static: springs that fade with the load, for bodies that only contact holds",
+    )
     out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
     out.add_argument(
         "--usd", action=Once, metavar="FILE", help="animation (.usdc, .usda) with stress and displacement; validated"
@@ -193,7 +199,11 @@ def _add_run(commands: Any) -> None:
 
 def _add_look(to: Any) -> None:
     """What pictures show."""
-    to.add_argument("--field", metavar="NAME", help="field in colour: von_mises (default), displacement, or none")
+    to.add_argument(
+        "--field",
+        metavar="NAME",
+        help="field in colour: von_mises (default), displacement, contact_pressure, gap, or none",
+    )
     to.add_argument("--view", type=pair, metavar="AZIMUTH,ELEVATION", help="of the camera, degrees")
     to.add_argument("--range", type=color_range, metavar="LOW,HIGH", help="of the colours, SI units")
 

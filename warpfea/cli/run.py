@@ -130,6 +130,8 @@ def _check_kind(options: argparse.Namespace) -> None:
     if not options.static:
         if options.load_steps:
             raise UsageError("--load-steps is for --static")
+        if options.stabilise:
+            raise UsageError("--stabilise is for --static")
         return
     given = [name for name in FOR_MOTION if getattr(options, name) is not None]
     if given:

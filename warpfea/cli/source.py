@@ -35,7 +35,7 @@ class Source:
         scene: the scene. values: what it is called with.
         parameters: what a summary says.
         dt, integrator, dtype, device, tol, solver, inversion: of the run.
-        load_steps, static_tol: of statics; None: a motion, the solver's default.
+        load_steps, static_tol: of statics; None: a motion, the solver's default. stabilise: of statics.
     """
 
     label: str
@@ -51,6 +51,7 @@ class Source:
     inversion: str
     load_steps: int | None = None
     static_tol: float | None = None
+    stabilise: bool = False
 
     def model(self) -> Model:
         """Call the scene and finalize; an error of the scene's own code is a ModelError with file and line."""
@@ -70,7 +71,12 @@ class Source:
         if self.load_steps is not None:
             with compile_bar(show) as bar:
                 return begin_static(
-                    model, load_steps=self.load_steps, tol=self.static_tol, inversion=self.inversion, on_compile=bar
+                    model,
+                    load_steps=self.load_steps,
+                    tol=self.static_tol,
+                    inversion=self.inversion,
+                    stabilise=self.stabilise,
+                    on_compile=bar,
                 )
         solver = SOLVERS[self.solver](tol=self.tol)
         with compile_bar(show) as bar:
@@ -158,4 +164,5 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         inversion=options.inversion,
         load_steps=(options.load_steps or 10) if getattr(options, "static", False) else None,
         static_tol=options.tol,
+        stabilise=getattr(options, "stabilise", False),
     )

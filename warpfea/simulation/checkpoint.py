@@ -158,7 +158,8 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
             continue
         if key == "fingerprint":
             raise CheckpointError(
-                f"{file}: the checkpoint is of another model: mesh, materials, supports or loads differ"
+                f"{file}: the checkpoint is of another model: "
+                "mesh, materials, supports, loads, joints or contacts differ"
             )
         hint = "; the model or its parameters differ" if key == "slots" else ""
         raise CheckpointError(

@@ -93,7 +93,8 @@ class Stepper:
         if not integrator.static and isinstance(solver, NewtonPCG):
             self.newton.candidates = [partial(self._candidate, kind) for kind in CANDIDATES]
         self.opening = Opening(self.at, self.newton.residual, integrator) if integrator.accelerated else None
-        self.running = self.work.any_flag[2:3]
+        flags = self.work.any_flag
+        self.running, self.refused, self.failed = flags[2:3], flags[3:4], flags[4:5]
         self._bind()
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
@@ -112,7 +113,7 @@ class Stepper:
         w.step.time = state.time
         w.step.status = state.status
         w.step.gravity = self.terms.dead.gravity
-        w.step.any_running = self.running
+        w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
         w.step.max_halvings = self.solver.max_halvings
         w.step.stabilise = self.integrator.stabilise
         w.step.parameter = self.integrator.parameter
@@ -255,7 +256,7 @@ class Stepper:
     def sequence(self) -> None:
         """All launches of a step."""
         m, w, launch = self.model, self.work, self.launch
-        self.running.zero_()
+        w.any_flag[2:5].zero_()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
         wp.capture_while(self.running, self._attempt)
         self._report()
@@ -264,15 +265,28 @@ class Stepper:
     def _report(self) -> None:
         """Undo a failed step, and tell of the step."""
         m, w, launch = self.model, self.work, self.launch
-        launch(self.kernels.failed_now, m.worlds, [w.step, w.newton, w.newton.active])
-        if self.backup is not None:
-            self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
-        self.newton.forget(w.newton.active)
+        with launch.rare():
+            wp.capture_if(self.failed, self._undo)
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
             self._probe()
         for term in self.terms:
             term.report(self.at)
+
+    @labelled("commit")
+    def _undo(self) -> None:
+        """The worlds whose step failed for good have their state of before it again."""
+        m, w, launch = self.model, self.work, self.launch
+        launch(self.kernels.failed_now, m.worlds, [w.step, w.newton, w.newton.active])
+        if self.backup is not None:
+            self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
+        self.newton.forget(w.newton.active)
+
+    @labelled("commit")
+    def _keep(self) -> None:
+        """Before the first halving the state is still that of the step's start: keep it."""
+        assert self.backup is not None
+        self.backup.copy_rows(self.launch, self.work.step.first_refusal, self.state)
 
     def _attempt(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
@@ -309,8 +323,8 @@ class Stepper:
         """Take over an accepted attempt."""
         w, launch, state = self.work, self.launch, self.state
         if self.backup is not None:
-            # before the first halving the state is still that of the step's start: keep it
-            self.backup.copy_rows(launch, w.step.first_refusal, state)
+            with launch.rare():
+                wp.capture_if(self.refused, self._keep)
         if self.ledger:
             self._book()
         if self.predictor:

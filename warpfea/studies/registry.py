@@ -118,18 +118,21 @@ _ENTRIES = (
     Entry(
         name="contact",
         module="reports.contact",
-        summary="contact with obstacles beside Hertz, Mindlin and finer runs",
+        summary="contact with obstacles beside Hertz, Mindlin and finer runs, and at rest",
         about="A rigid sphere pressed into a deep block and moved sideways: contact radius, peak pressure, stiffnesses "
         "and full slip beside the closed forms. An elastic ball thrown at a plane beside a quarter of the step and "
-        "half the mesh size.",
+        "half the mesh size. A cube pressed to a wall, and one on a plate that turns: how far they move where "
+        "friction holds them.",
         parts=(
             ("hertz", "contact radius and peak pressure"),
             ("mindlin", "tangential stiffness and full slip"),
             ("rebound", "restitution and duration of an impact"),
+            ("wall", "no creep in 10 s"),
+            ("turntable", "no walk in ten turns"),
         ),
         options=("device", "only"),
         example="--out tests/results/contact_hertz_cpu.json",
-        results=("contact_hertz_cpu.json",),
+        results=("contact_hertz_cpu.json", "contact_rest_cpu.json"),
     ),
     Entry(
         name="jacobi",

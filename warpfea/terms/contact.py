@@ -277,8 +277,8 @@ class Contact(Term):
             args = [self.tables.data, group.data, s["history"], s["clock"], w.u, accepted, s["attempt"]]
             at.launch(k.finish, (m.worlds, group.count), [*args, s["booked"]])
         args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
-        at.launch(k.partial_records, (m.worlds, C, LANES), args)
-        at.launch(k.total_records, (m.worlds, C), [s["clock"], accepted, s["parts"], s["attempt"]])
+        at.launch(k.partial_records, (m.worlds, C, len(RECORD), LANES), args)
+        at.launch(k.total_records, (m.worlds, C, len(RECORD)), [s["clock"], accepted, s["parts"], s["attempt"]])
 
     @part("contact")
     def commit(self, at: At, accepted: wp.array) -> None:

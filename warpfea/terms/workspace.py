@@ -106,7 +106,7 @@ class Workspace:
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative = self.pcg.negative
-        self.step = self.struct(step_struct(), B, skip=("b", "q_a", "stretch"))
+        self.step = self.struct(step_struct(), B, skip=("b", "q_a", "stretch", "any_refused"))
         self.balance = balance_struct(model.dtype)()
         for name in balance_struct(model.dtype).vars:
             of_step = name in ("mass_factor", "dq_dv")

@@ -7,7 +7,8 @@ apart: hung by its upper face, with a floor declared 1 m below its lower one; be
 resting: let go in exact touch with a floor of mu = 0.5; beside the block whose lower face is clamped.
 sliding: at 20 m/s over a floor of mu = 0.3, from 1 s on (reached with h = 10 ms); beside the same.
 
-The simulations of a size take turns, `--steps` steps each, `--repeat` times; the median step counts.
+The simulations of a size take turns, `--steps` steps each, `--repeat` times; the median step counts. Where they end,
+single linear solves are counted (contact_solves.py).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import time as clock
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import warp as wp
@@ -27,6 +28,7 @@ from ...materials import SVK
 from ...model.shapes import HalfSpace
 from ...simulation.simulation import Simulation
 from ...terms.contact import Contact
+from .contact_solves import SOLVES, SolveRow, solve_rows
 from .measure import solver, write
 
 __all__ = ["BARS", "SCENES", "ContactRow", "contact"]
@@ -35,7 +37,8 @@ SIZE = (1.0, 1.0, 0.5)
 LAW = SVK(E=1e7, nu=0.3, density=1000.0)
 WEIGHT = 9.81 * 1000.0 * SIZE[0] * SIZE[1] * SIZE[2]
 DT, LONG_DT = 1e-3, 1e-2
-SPEED, UNTIL = 20.0, 1.0
+SPEED, UNTIL, RUBBING = 20.0, 1.0, 0.3
+MOVING = ("sliding", "guided")
 STEPS, REPEAT, WARM_UP = 10, 3, 10
 BESIDE = {"none": None, "clamped": None, "apart": "none", "resting": "clamped", "sliding": "clamped"}
 SCENES = tuple(BESIDE)
@@ -106,8 +109,8 @@ def cells_for(unknowns: int) -> int:
     return min(range(2, 400), key=lambda n: abs(3 * (2 * n + 1) ** 2 * (2 * (n // 2) + 1) - unknowns))
 
 
-def build(scene: str, cells: int) -> ModelBuilder:
-    """A scene with so many cells along the block's length."""
+def build(scene: str, cells: int, stiffness: float = 1.0) -> ModelBuilder:
+    """A scene with so many cells along the block's length, and so many times the contact's own stiffness."""
     b = ModelBuilder()
     block = b.add_solid(meshes.box(SIZE, cells=(cells, cells, cells // 2)), material=LAW, element="T10", name="block")
     low = block.surface("z-")
@@ -115,22 +118,28 @@ def build(scene: str, cells: int) -> ModelBuilder:
         b.clamp(block.nodes("z+"))
     if scene == "clamped":
         b.clamp(block.nodes("z-"))
+    if scene == "guided":
+        b.clamp(block.nodes("z-"), components="z")
+        b.add_traction(low, (-RUBBING * WEIGHT / (SIZE[0] * SIZE[1]), 0.0, 0.0))
     if scene == "apart":
         b.add_contact(low, b.add_collider(HalfSpace((0, 0, 1), -1.0)), mu=0.5)
     if scene in ("resting", "sliding"):
-        mu = 0.5 if scene == "resting" else 0.3
-        b.add_contact(low, b.add_collider(HalfSpace((0, 0, 1), 0.0)), mu=mu)
-    if scene == "sliding":
+        mu = 0.5 if scene == "resting" else RUBBING
+        b.add_contact(low, b.add_collider(HalfSpace((0, 0, 1), 0.0)), mu=mu, stiffness=stiffness)
+    if scene in MOVING:
         b.set_initial(block, velocity=(SPEED, 0.0, 0.0))
     return b
 
 
-def _start(scene: str, cells: int, dtype: str, device: Any, tol: float | None) -> _Runner:
-    model = build(scene, cells).finalize(device=device, dtype=dtype)
+def start(
+    scene: str, cells: int, dtype: str, device: Any, tol: float | None, stiffness: float = 1.0
+) -> _Runner:  # fmt: skip
+    """A scene, stepped to where it counts."""
+    model = build(scene, cells, stiffness).finalize(device=device, dtype=dtype)
     term = next((term for term in model.terms if isinstance(term, Contact)), None)
     sim = Simulation(model, dt=DT, solver=solver(tol), ledger=False)
     out = _Runner(sim, term, [])
-    if scene == "sliding":
+    if scene in MOVING:
         sim.dt = LONG_DT
         out.step(round(UNTIL / LONG_DT), counted=False)
         sim.dt = DT
@@ -140,10 +149,10 @@ def _start(scene: str, cells: int, dtype: str, device: Any, tol: float | None) -
 
 def measure(
     unknowns: int, dtype: str, *, device: Any, steps: int, repeat: int, tol: float | None
-) -> list[ContactRow]:  # fmt: skip
-    """Rows of one size and precision, one per scene."""
+) -> tuple[list[ContactRow], list[SolveRow]]:  # fmt: skip
+    """Rows of one size and precision, one per scene; and those of single solves."""
     cells = cells_for(unknowns)
-    runners = {scene: _start(scene, cells, dtype, device, tol) for scene in SCENES}
+    runners = {scene: start(scene, cells, dtype, device, tol) for scene in SCENES}
     for _ in range(repeat):
         for runner in runners.values():
             runner.step(steps)
@@ -175,7 +184,11 @@ def measure(
                 r.carried / n,
             )
         )
-    return rows
+    sims = {(scene, 1.0): runner.sim for scene, runner in runners.items()}
+    for scene, stiffness in SOLVES:
+        if (scene, stiffness) not in sims:
+            sims[scene, stiffness] = start(scene, cells, dtype, device, tol, stiffness).sim
+    return rows, solve_rows(sims)
 
 
 def contact(options: argparse.Namespace) -> None:
@@ -190,27 +203,40 @@ def contact(options: argparse.Namespace) -> None:
         "warm_up_steps": WARM_UP, "time": "median step", "sliding_from_s": UNTIL, "bars": BARS,
     }  # fmt: skip
     rows: list[ContactRow] = []
-    print(HEADER, flush=True)
+    solved: list[SolveRow] = []
     for unknowns in sizes:
         for dtype in dtypes:
-            found = measure(unknowns, dtype, device=device, steps=steps, repeat=repeat, tol=options.tol)
+            found, counted = measure(unknowns, dtype, device=device, steps=steps, repeat=repeat, tol=options.tol)
             rows += found
-            print("\n".join(map(_line, found)), flush=True)
-            write(options, settings, rows)
+            solved += counted
+            print("\n".join([HEADER, *map(_line, found), SOLVE_HEADER, *map(_solve_line, counted)]), flush=True)
+            write(options, settings, rows, solves=list(map(asdict, solved)))
 
 
 HEADER = (
     f"{'scene':8} {'dtype':8} {'unknowns':>8} {'points':>7} {'ms/step':>9} {'Newton':>6} {'PCG':>6} {'launches':>8} "
     f"{'beside':>8} {'ratio':>6} {'bar':>4} {'per Newton':>10} {'N / m g':>7}"
 )
+SOLVE_HEADER = (
+    f"{'solves':8} {'dtype':8} {'unknowns':>8} {'levels':>7} {'stiffness':>9} {'PCG: most':>9} {'mean':>6} "
+    f"{'beside':>8} {'ratio':>6} {'bar':>4}"
+)
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _solve_line(r: SolveRow) -> str:
+    return (
+        f"{r.scene:8} {r.dtype:8} {r.unknowns:8d} {r.levels:7d} {r.stiffness:9g} {max(r.pcg):9d} {r.per_solve:6.1f} "
+        f"{r.beside or '-':>8} {_text(r.ratio):>6} {_text(r.bar):>4}"
+    )
 
 
 def _line(r: ContactRow) -> str:
-    def text(value: float | None) -> str:
-        return "-" if value is None else f"{value:.2f}"
-
     return (
         f"{r.scene:8} {r.dtype:8} {r.unknowns:8d} {r.points:7d} {r.ms_per_step:9.2f} {r.newton_per_step:6.2f} "
-        f"{r.pcg_per_step:6.1f} {r.launches:8d} {r.beside or '-':>8} {text(r.ratio):>6} {text(r.bar):>4} "
-        f"{text(r.ratio_per_newton):>10} {r.carried:7.3f}"
+        f"{r.pcg_per_step:6.1f} {r.launches:8d} {r.beside or '-':>8} {_text(r.ratio):>6} {_text(r.bar):>4} "
+        f"{_text(r.ratio_per_newton):>10} {r.carried:7.3f}"
     )

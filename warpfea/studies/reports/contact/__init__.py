@@ -1,11 +1,15 @@
-"""`warpfea study contact`: deformable bodies on rigid obstacles beside Hertz and Mindlin, and a ball beside finer runs.
+"""`warpfea study contact`: deformable bodies on rigid obstacles beside Hertz and Mindlin, a ball beside finer runs, and
+bodies that friction holds for long.
 
-hertz    a rigid sphere on a quarter block 60 contact radii deep: contact radius and peak pressure, from a line through
-         the squares of the points' pressures, beside those of the force.
-mindlin  the same on a half block with friction, then sideways: stiffness ratio, and where all slips.
-rebound  an elastic ball on a plane: restitution and duration, and those of a quarter of the step and half the mesh.
+hertz      a rigid sphere on a quarter block 60 contact radii deep: contact radius and peak pressure, from a line
+           through the squares of the points' pressures, beside those of the force.
+mindlin    the same on a half block with friction, then sideways: stiffness ratio, and where all slips.
+rebound    an elastic ball on a plane: restitution and duration, and those of a quarter of the step and half the mesh.
+wall       a cube pressed to a wall: how far it moves in 10 s, after 10 s of settling.
+turntable  a cube on a plate that turns: how far it moves on it in ten turns; the paper's law walks.
 
-Each row has its iterations and time. tests/results/contact_hertz_cpu.json is the committed result.
+Each row has its iterations and time. tests/results/contact_hertz_cpu.json and contact_rest_cpu.json (the last two)
+are the committed results.
 """
 
 from __future__ import annotations
@@ -18,8 +22,9 @@ from ..parts import Part, run_tables
 from .ball import DENSITY, NU, RADIUS, SPEED, rebound_case
 from .ball import E as BALL_E
 from .block import WIDTH, A, E, hertz_case, mindlin_case
+from .rest import CUBE, turntable_case, wall_case
 
-__all__ = ["PARTS", "hertz", "mindlin", "rebound", "run"]
+__all__ = ["PARTS", "hertz", "mindlin", "rebound", "run", "turntable", "wall"]
 
 
 def hertz(device: Any) -> Iterator[dict[str, Any]]:
@@ -41,7 +46,19 @@ def rebound(device: Any) -> Iterator[dict[str, Any]]:
             yield rebound_case(cells=8 * factor, steps=50 * factor**2, integrator=integrator, device=device)
 
 
-PARTS: dict[str, Part] = {f.__name__: f for f in (hertz, mindlin, rebound)}
+def wall(device: Any) -> Iterator[dict[str, Any]]:
+    """Both tetrahedra."""
+    for element in ("T4", "T10"):
+        yield wall_case(element, device=device)
+
+
+def turntable(device: Any) -> Iterator[dict[str, Any]]:
+    """The default law and the paper's."""
+    for law in ("default", "paper"):
+        yield turntable_case(law, device=device)
+
+
+PARTS: dict[str, Part] = {f.__name__: f for f in (hertz, mindlin, rebound, wall, turntable)}
 
 
 def run(options: argparse.Namespace) -> None:
@@ -50,5 +67,6 @@ def run(options: argparse.Namespace) -> None:
     settings = {
         "block": {"E": E, "sphere_radius": 1.0, "contact_radius": A, "even_zone_in_radii": WIDTH, "tol": 1e-8},
         "ball": {"E": BALL_E, "nu": NU, "density": DENSITY, "radius": RADIUS, "speed": SPEED, "tol": 1e-8},
+        "cube": CUBE,
     }
     run_tables(options, PARTS, settings, device=options.device)
