@@ -23,6 +23,8 @@ FLOOR = 16.0
 PREDICTED = 1.0e-3
 STALLED = 0.5
 """A reduction of the residual that is no better than this is none."""
+CLOSING = 8
+"""Iterations in which constraints are closed to what accelerations need, where `constraint_tol` asks for less."""
 NEAR = 1.0e3
 """Roundings of the positions, as they change the residual, within which a stall may be put down to rounding."""
 SETTLING = 10.0
@@ -71,8 +73,11 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def closure(ctl: Control, world: int, tol: f64) -> f64:
-        """Violation that is allowed, m: accelerations in the state are off by it over (dq/dv)^2."""
-        if ctl.constraint_pace > f64(0.0) and tol < f64(1.0e200):
+        """Violation that is allowed, m: accelerations in the state are off by it over (dq/dv)^2.
+
+        Far from the reference, where places are rounded by more, a few iterations look for it in vain.
+        """
+        if ctl.constraint_pace > f64(0.0) and tol < f64(1.0e200) and ctl.iterations[world] < CLOSING:
             pace = ctl.constraint_pace * ctl.dq_dv[world] * ctl.dq_dv[world]
             return wp.min(tol, wp.max(pace, ctl.constraint_least))
         return tol
