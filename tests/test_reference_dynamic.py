@@ -116,7 +116,9 @@ def tip_errors(model, exact, integrator, h, t_end, halved):
 
 
 @pytest.mark.parametrize("halved", [False, True], ids=["uniform", "halved"])
-@pytest.mark.parametrize(("integrator", "order", "slack"), [("backward_euler", 1, 0.05), ("bdf2", 2, 0.1), ("generalized_alpha", 2, 0.1)])
+@pytest.mark.parametrize(
+    ("integrator", "order", "slack"), [("backward_euler", 1, 0.05), ("bdf2", 2, 0.1), ("generalized_alpha", 2, 0.1)]
+)
 def test_order_of_convergence(cantilever, data, integrator, order, slack, halved):
     ref = data.json("S3_exact_svk_q5")
     exact = np.array(ref["runs"]["reference"]["trajectory"]["tip_mean"])

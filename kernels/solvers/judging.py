@@ -238,6 +238,6 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             give_up(ctl, world, why)
 
     return _types.SimpleNamespace(
-        objective=objective, magnitude=magnitude, closure=closure, largest_violation=largest_violation, measure=measure, record=record,
-        accept=accept, ask=ask, patience=patience, give_up=give_up, settle=settle, fail=fail,
+        objective=objective, magnitude=magnitude, closure=closure, largest_violation=largest_violation, measure=measure,
+        record=record, accept=accept, ask=ask, patience=patience, give_up=give_up, settle=settle, fail=fail,
     )  # fmt: skip

@@ -176,7 +176,13 @@ class Opening:
         m, at, w = self.model, self.at, self.at.work
         every, active = np.ones(len(flags)), self._active(flags)
         # rates of strain are those of the state: E~ = E - (dq/dv) dE/dt
-        for array, value in ((w.step.ramp, 1.0), (w.step.h, dt), (w.step.dq_dv, dt), (w.step.b, -dt), (w.step.q_a, 0.0)):
+        for array, value in (
+            (w.step.ramp, 1.0),
+            (w.step.h, dt),
+            (w.step.dq_dv, dt),
+            (w.step.b, -dt),
+            (w.step.q_a, 0.0),
+        ):
             self._set(array, flags, value * every)
         self._set(w.step.mass_factor, flags, every / dt)
         self._law_values(flags, time)
@@ -247,7 +253,9 @@ class Opening:
         held, goal, rows = np.zeros_like(w), None, None
         for sign in (-0.5 / s, 0.5 / s):
             x = np.copysign(s, sign)
-            there = np.tensordot([[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]], laws, 1)
+            there = np.tensordot(
+                [[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]], laws, 1
+            )
             held += sign * self._held(there)[1]
             if self.model.constraints is not None:
                 J, _, second = self._rows(u + x * v + 0.5 * x**2 * w, v + x * w, there)
@@ -298,7 +306,9 @@ def slope_after(law: TimeLaw, time: float) -> np.ndarray:
     return (law.values[k + 1] - law.values[k]) / (law.times[k + 1] - law.times[k])
 
 
-def constraint_rates(tables: Any, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def constraint_rates(
+    tables: Any, u: np.ndarray, v: np.ndarray, laws: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gradients (rows, 3, 3), first rates c' (rows,) m/s, and second rates without J w, m/s^2, of one world's rows.
 
     u, v: (slots, 3); laws: (3 or 4, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
