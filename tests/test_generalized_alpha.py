@@ -1,4 +1,4 @@
-"""Generalized-alpha: its coefficients, dissipation, orders with joints and changing steps, start, books and refusals."""
+"""Generalized-alpha: its coefficients, dissipation, orders with joints and changing steps, start, refusals."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ EXACT = wf.NewtonPCG(tol=1e-12)
 
 
 def amplification(rho, omega, h):
-    """(q, v, a) of an oscillator q'' = -omega^2 q one step later, from the equations of Arnold and Bruels themselves."""
+    """(q, v, a) of q'' = -omega^2 q one step later, from the equations of Arnold and Bruels themselves."""
     am, af = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
     gamma = 0.5 - am + af
     beta = 0.25 * (gamma + 0.5) ** 2

@@ -31,7 +31,8 @@ REPORT = (
 class Coefficients:
     """Of a time discretisation.
 
-    q~ = a0 q_n - a1 q_{n-1} + b v_n + q_a a_n and v~ = a0 v_n - a1 v_{n-1} + v_a a_n + v_w w_n. a_n are algorithmic accelerations, a_{n+1} = a_v (v - v_n) - a_a a_n, and w_n those of the equilibrium, q''.
+    q~ = a0 q_n - a1 q_{n-1} + b v_n + q_a a_n and v~ = a0 v_n - a1 v_{n-1} + v_a a_n + v_w w_n; a_n are
+    algorithmic accelerations, a_{n+1} = a_v (v - v_n) - a_a a_n, and w_n those of the equilibrium, q''.
     """
 
     a0: wp.float64

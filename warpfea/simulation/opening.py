@@ -1,12 +1,12 @@
 """Consistent velocities and accelerations, from which schemes start that keep accelerations.
 
-At a state (q, v) at time t, with supports and constraints c(q, t) = 0 of which c' and c'' are derivatives along the motion,
+At a state (q, v) at time t, with supports and constraints c(q, t) = 0 whose derivatives along the motion are c' and c'',
 
     M dv + J^T L = 0,    J (v + dv) + c_t = 0,        M w + J^T m = f - f_int,    J w = -(c'' without J w)
 
 are solved on the host, by factors of the mass matrix and a dense matrix of the constraints. In the directions that
-supports and constraints prescribe, a_0 = w(t + (am - af) h), and v_0 is off by h^2 (1/6 - beta - (am - af)/2) w' (Arnold,
-Bruels and Cardona 2015): else the reactions of the first steps are of the first order.
+supports and constraints prescribe, a_0 = w(t + (am - af) h), and v_0 is off by h^2 (1/6 - beta - (am - af)/2) w', to
+which steps of one size lead (Arnold, Bruels and Cardona 2015): else the first reactions are of the first order.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from typing import Any
 
 from ...base.errors import ModelError
 from ...base.names import did_you_mean
@@ -48,8 +49,8 @@ def get(name: str | Integrator) -> Integrator:
 
 def _with_options(scheme: Integrator, text: str, inside: str) -> Integrator:
     """An integrator of the same kind with the options of `name(option=number, ...)`."""
-    own = type(scheme) is not Integrator
-    known = [p.name for p in inspect.signature(type(scheme)).parameters.values()] if own else []
+    kind: Any = type(scheme)
+    known = list(inspect.signature(kind).parameters) if kind is not Integrator else []
     options: dict[str, float] = {}
     for part in filter(None, (part.strip() for part in inside.split(","))):
         key, equals, value = (word.strip() for word in part.partition("="))
@@ -60,4 +61,4 @@ def _with_options(scheme: Integrator, text: str, inside: str) -> Integrator:
             options[key] = float(value)
         except ValueError:
             raise ModelError(f"integrator {text!r}: {key}={value} is not a number") from None
-    return type(scheme)(**options) if own else scheme
+    return kind(**options) if known else scheme

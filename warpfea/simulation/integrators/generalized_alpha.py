@@ -1,9 +1,12 @@
 """Generalized-alpha: Chung and Hulbert (1993), for constrained systems Arnold and Bruels (2007).
 
-    q_{n+1} = q_n + h v_n + h^2 (1/2 - beta) a_n + h^2 beta a_{n+1},    v_{n+1} = v_n + h (1 - gamma) a_n + h gamma a_{n+1},
-    (1 - am) a_{n+1} + am a_n = (1 - af) w_{n+1} + af w_n,              M w_{n+1} + f_int + J^T lambda = f at t_{n+1}
+    q_{n+1} = q_n + h v_n + h^2 (1/2 - beta) a_n + h^2 beta a_{n+1}
+    v_{n+1} = v_n + h (1 - gamma) a_n + h gamma a_{n+1}
+    (1 - am) a_{n+1} + am a_n = (1 - af) w_{n+1} + af w_n
+    M w_{n+1} + f_int + J^T lambda = f at t_{n+1}
 
-The forces are in equilibrium with w = q'' at the end of the step; a are averages of w, of the time t + (am - af) h.
+The forces are in equilibrium with w = q'' at the end of the step; a are averages of w, of the time t + (am - af) h:
+where the step changes, the next one takes w_n + (h / h_before) (a_n - w_n).
 """
 
 import math
