@@ -1,6 +1,6 @@
 """Consistent velocities and accelerations, from which schemes start that keep accelerations.
 
-At a state (q, v) at time t, with supports and constraints c(q, t) = 0 whose derivatives along the motion are c' and c'',
+At a state (q, v) at time t, with supports and constraints c(q, t) = 0, whose rates along the motion are c' and c'',
 
     M dv + J^T L = 0,    J (v + dv) + c_t = 0,        M w + J^T m = f - f_int,    J w = -(c'' without J w)
 
@@ -58,6 +58,7 @@ class Opening:
         supports = at.model.terms.supports
         self.driven = supports.moved is not None or supports.turned is not None
         self.count = 0
+        self._breaks: tuple[float, np.ndarray, np.ndarray] = (0.0, np.zeros(0), np.zeros((2, 0)))
         self._mass: list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]] = []
         refuse(at.model, integrator, self.driven)
 
@@ -72,17 +73,23 @@ class Opening:
 
     def _kinks(self, time: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (B,) just after a jump that the state is at, else its own; whether a kink lies in the step before."""
-        ahead, near = time.copy(), SAME * dt
-        found = np.zeros(len(time), dtype=bool)
-        drives = self._drive_laws()
-        for number, law in enumerate(self.model.terms.laws.laws):
-            for begin, end in jumps(law, dt):
-                found |= (begin > time - dt + near) & (begin <= time + near)
-                ahead = np.where((begin <= time + near) & (end > time), np.maximum(ahead, end), ahead)
-            if number in drives:  # forces with a kink leave accelerations continuous
-                for kink in kinks(law, dt):
-                    found |= (kink > time - dt + near) & (kink <= time + near)
-        return ahead, found
+        if self._breaks[0] != dt:
+            self._breaks = dt, *self._find_breaks(dt)
+        near = SAME * dt
+        _, times, (begins, ends) = self._breaks
+        there = time[:, None]
+        found = ((times > there - dt + near) & (times <= there + near)).any(axis=1)
+        steep = (begins <= there + near) & (ends > there)
+        ahead = np.where(steep, ends, there).max(axis=1, initial=-np.inf)
+        return np.maximum(ahead, time), found
+
+    def _find_breaks(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times of all kinks, and begins and ends of jumps (2, n), to a step dt, s."""
+        laws = self.model.terms.laws.laws
+        steep = np.concatenate([np.zeros((0, 2)), *(jumps(law, dt) for law in laws)])
+        # forces with a kink leave accelerations continuous
+        bent = [kinks(law, dt) for number, law in enumerate(laws) if number in self._drive_laws()]
+        return np.concatenate([steep[:, 0], *bent]), steep.T
 
     def _drive_laws(self) -> set[int]:
         """Numbers of the laws that prescribe places."""

@@ -30,9 +30,9 @@ EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
 FLOOR = {"float64": 1e-4, "float32": 2e-3}
 """Largest estimated error, relative and in the norm of energy, of a step whose residual is stopped by rounding."""
 FALL = 9.81
-"""m/s^2. With accelerations in the state constraint_tol shrinks with (dq/dv / the time of a fall through the model)^2,"""
+"""m/s^2. With accelerations in the state constraints are closed to constraint_tol FALL (dq/dv)^2, m, at least,"""
 CLOSED = 1e-14
-"""not below this over the model's size."""
+"""but to no less than this, over the model's size."""
 
 
 @dataclass(frozen=True)
