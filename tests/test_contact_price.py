@@ -13,7 +13,6 @@ from warpfea.studies.bench.contact_solves import BESIDE, SOLVES, solve_rows
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 FILES = {"contact_cpu.json": ("cpu", 8000, 1.3), "contact_h200.json": ("cuda", 100_000, 1.1)}
 """Device, unknowns at least, and most that a step may take over one without contact where the bodies are apart."""
-APART = pytest.mark.xfail(strict=True, reason="1.14 on the H200: a launch per product, and six small ones per iterate")
 
 
 def content_of(name):
@@ -45,7 +44,7 @@ def test_resting_and_sliding(name):
         assert rows[scene]["carried"] > 0.9, "it is not in touch"
 
 
-@pytest.mark.parametrize("name", ["contact_cpu.json", pytest.param("contact_h200.json", marks=APART)])
+@pytest.mark.parametrize("name", FILES)
 def test_apart(name):
     rows = rows_of(name)
     assert rows["apart"]["newton_per_step"] == rows["none"]["newton_per_step"]
@@ -62,9 +61,13 @@ def assert_solves(rows):
     assert all(row["levels"] >= 2 for row in rows)
 
 
-@pytest.mark.parametrize(("least", "most"), [(8e3, 2e4), (8e4, 2e5)], ids=["10k", "100k"])
-def test_solves_take_few_more_iterations_than_with_contact_nodes_clamped(least, most):
-    assert_solves([row for row in content_of("contact_cpu.json")["solves"] if least < row["unknowns"] < most])
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [("contact_cpu.json", 8e3, 2e4), ("contact_cpu.json", 8e4, 2e5), ("contact_h200.json", 8e4, 2e5)],
+    ids=["10k", "100k", "100k, H200"],
+)
+def test_solves_take_few_more_iterations_than_with_contact_nodes_clamped(name, least, most):
+    assert_solves([row for row in content_of(name)["solves"] if least < row["unknowns"] < most])
 
 
 def test_solves_of_a_small_block():

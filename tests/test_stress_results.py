@@ -18,8 +18,9 @@ from warpfea.studies.stress.suite import choose, load_cases
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 FILES = {"stress_cpu.json": "cpu", "stress_h200.json": "cuda:0"}
 SPEED = {"hard_steps_h200.json": ("--peer", 1.05, 13), "hard_steps_cpu.json": ("--cpu", 1.10, 12)}
-SLOWER = {("hard_steps_h200.json", "plate-16x8 plate float64 1836")}
-"""Rows beyond the bar: 9.5 % in three rounds, 3 % in an earlier run."""
+BEAMS = (("beam-30", 372), ("beam-300", 3612), ("beam-1000", 12012))
+SLOWER = {("hard_steps_h200.json", f"{beam} beam float64 {n}") for beam, n in BEAMS}
+"""Rows beyond the bar, by 1.2, 0.8 and 0.02 %: the first round was slow; the fastest rounds are 1.6 to 2.3 % apart."""
 
 
 def content(name):
@@ -84,5 +85,6 @@ def test_normal_steps_are_as_fast_as_before(name):
     assert len(found["rows"]) >= least
     assert {(name, row["label"]) for row in found["rows"] if row["ratio"] > bar} <= SLOWER
     for row in found["rows"]:
+        assert min(row["now_ms"]) <= bar * min(row["before_ms"]), row["label"]
         for count in ("newton_per_step", "pcg_per_step"):
             assert row[count][1] <= row[count][0], (row["label"], count)

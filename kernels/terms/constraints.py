@@ -327,10 +327,11 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def adopt(flags: wp.array(dtype=wp.int32), mul: Multipliers):
-        """Make the multipliers of the trial those of the iterate."""
+        """Make the multipliers of the trial those of the iterate, which may be evaluated again: no change is left."""
         world, row = wp.tid()
         if flags[world] != 0:
             mul.force[world, row] = mul.trial[world, row]
+            mul.change[world, row] = f64(0.0)
 
     @wp.kernel(module=module)
     def commit_multipliers(

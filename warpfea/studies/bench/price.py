@@ -84,7 +84,8 @@ class PriceRow:
 
     Attributes:
         forced: features that it leaves out and that were forced in. left: those that were not.
-        ratio: ms with all over ms as shipped; ratio_per_newton: the same of an iteration of Newton's method.
+        ratio: ms with all over ms as shipped; ratio_per_newton: the same of an iteration of Newton's method, None where
+            the scene as shipped takes none in these steps (its bodies fall).
         moved: largest distance of a probe from its place as shipped, over the travel of all.
     """
 
@@ -94,7 +95,7 @@ class PriceRow:
     forced: list[str]
     left: list[str]
     ratio: float
-    ratio_per_newton: float
+    ratio_per_newton: float | None
     moved: float
 
 
@@ -213,7 +214,7 @@ def measure(case: PriceCase, *, device: Any, steps: int, repeat: int) -> PriceRo
         [name for name in missing if name not in left],
         left,
         ratio,
-        ratio * own.newton_per_step / everything.newton_per_step,
+        ratio * own.newton_per_step / everything.newton_per_step if own.newton_per_step else None,
         float(np.abs(other - path).max() / np.abs(path).max()),
     )
 
@@ -239,10 +240,11 @@ HEADER = (
 
 def _line(r: PriceRow) -> str:
     a, z = r.shipped, r.all
+    each = "-" if r.ratio_per_newton is None else f"{r.ratio_per_newton:.2f}"
     left = f"  without {', '.join(r.left)}" if r.left else ""
     return (
         f"{r.scene:20} {a.ms_per_step:7.2f} {z.ms_per_step:7.2f} {r.ratio:6.2f} {a.newton_per_step:5.1f} "
-        f"{z.newton_per_step:5.1f} {r.ratio_per_newton:10.2f} {a.pcg_per_step:6.1f} {z.pcg_per_step:6.1f} "
+        f"{z.newton_per_step:5.1f} {each:>10} {a.pcg_per_step:6.1f} {z.pcg_per_step:6.1f} "
         f"{a.bytes / 1e6:6.2f} {z.bytes / 1e6:6.2f} {len(a.modules):4d} {len(z.modules):4d} {len(a.kernels):4d} "
         f"{len(z.kernels):4d} {a.launches:4d} {z.launches:4d} {len(r.forced):6d} {r.moved:8.1e}{left}"
     )

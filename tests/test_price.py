@@ -1,0 +1,65 @@
+"""The committed table of `warpfea bench --price`: what features that a scene does not use would cost it."""
+
+import json
+import pathlib
+
+import pytest
+
+from warpfea.builder.scene import names
+from warpfea.cli import main
+from warpfea.studies.bench.price import cases, measure
+
+RESULT = pathlib.Path(__file__).resolve().parent / "results" / "price_cpu.json"
+TRACES = {
+    "contact": "contact", "constraints": "constraints", "follower pressure": "pressure", "moments": "moment",
+    "body forces": "field", "controls": "controls", "driven nodes": "drive", "damping explicit": "explicit",
+    "damping rate": "rate", "damping incremental": "incremental", "table elements": "table",
+    "straight elements": "affine",
+}  # fmt: skip
+"""Of a feature: what modules of scenes that have it name, and no others."""
+
+
+def assert_priced(row):
+    own, full = row["shipped"], row["all"]
+    assert row["left"] == []
+    assert len(row["forced"]) >= 10
+    assert {"kernels", "modules"} <= set(own)
+    for what in ("kernels", "modules"):
+        assert len(own[what]) < 0.85 * len(full[what]), what
+    for feature in set(TRACES) & set(row["forced"]):
+        assert not [name for name in own["modules"] if TRACES[feature] in name], feature
+        assert [name for name in full["modules"] if TRACES[feature] in name], feature
+    for what in ("bytes", "launches", "unknowns"):
+        assert own[what] < full[what], what
+    assert row["moved"] < 1e-4  # both to the tolerance of the scene
+
+
+def test_no_scene_pays_for_what_it_does_not_use():
+    content = json.loads(RESULT.read_text())
+    assert content["command"] == "warpfea bench --price --device cpu --out tests/results/price_cpu.json"
+    assert len(content["commit"]) >= 40
+    assert content["versions"]["warp"]
+    assert content["settings"]["repeat"] >= 3
+    assert [row["scene"] for row in content["rows"]] == list(names())
+    for row in content["rows"]:
+        assert_priced(row)
+        own, full = row["shipped"]["ms_per_step"], row["all"]["ms_per_step"]
+        assert row["ratio"] == pytest.approx(full / own)
+        assert row["ratio"] > 1.0, row["scene"]
+
+
+def test_a_scene_is_priced_as_in_the_table(tmp_path, capfd):
+    out = tmp_path / "price.json"
+    words = ["--rows", "cantilever", "--steps", "2", "--repeat", "1", "--device", "cpu", "--out", str(out)]
+    assert main(["bench", "--price", *words]) == 0
+    assert "cantilever" in capfd.readouterr().out
+    (row,) = json.loads(out.read_text())["rows"]
+    assert_priced(row)
+
+
+def test_what_is_forced_in_is_all_that_the_scene_leaves_out():
+    (case,) = [case for case in cases() if case.label == "slider_crank"]
+    row = measure(case, device="cpu", steps=1, repeat=1)
+    missing = set(case.scene().finalize(device="cpu").info()["left_out"]) - {"materials per world"}
+    assert set(row.forced) == missing
+    assert row.left == []
