@@ -78,7 +78,7 @@ class Opening:
         near = SAME * dt
         _, times, (begins, ends) = self._breaks
         there = time[:, None]
-        found = ((times > there - dt + near) & (times <= there + near)).any(axis=1)
+        found = np.any((times > there - dt + near) & (times <= there + near), axis=1)
         steep = (begins <= there + near) & (ends > there)
         ahead = np.where(steep, ends, there).max(axis=1, initial=-np.inf)
         return np.maximum(ahead, time), found
