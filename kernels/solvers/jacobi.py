@@ -12,6 +12,7 @@ import warp as wp
 from ..common.traits import Traits
 from ..common.types import kernel_module, precision
 from .control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_NAN, control_struct
+from .judging import judging_functions
 from .newton import newton_kernels
 from .pcg import pcg_struct
 
@@ -52,7 +53,8 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     f64 = wp.float64
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
     shared = newton_kernels(dtype, traits)
-    measure, record, accept, closure = shared.measure, shared.record, shared.accept, shared.closure
+    measure, record, accept = shared.measure, shared.record, shared.accept
+    closure = judging_functions(traits).closure
     paired = acceleration in ("secants", "anderson")
     module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'gated', 'limited')}")
 

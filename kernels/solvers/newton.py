@@ -436,7 +436,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         **vars(outer),
         module=module,
         measure=measure,
-        closure=judging.closure,
         accept=accept,
         record=record,
         reset_min_J=reset_min_J,
