@@ -65,7 +65,7 @@ class Opening:
     def prepare(self, dt: float) -> None:
         """Before a step of size dt, s: start the worlds that need it."""
         state = self.at.state
-        time, known = state.time.numpy(), state.previous_end.numpy()  # type: ignore[attr-defined]
+        time, known = state.time.numpy(), state.acceleration_end.numpy()  # type: ignore[attr-defined]
         ahead, kinked = self._kinks(time, dt)
         flags = (state.status.numpy() == STATUS["running"]) & ((known != time) | kinked)  # type: ignore[attr-defined]
         if flags.any():
@@ -127,7 +127,7 @@ class Opening:
         self._set(state.acceleration, flags, w)
         self._set(state.algorithmic_acceleration, flags, a)
         self._set(state.previous_step, flags, np.full(len(time), dt))
-        self._set(state.previous_end, flags, time)
+        self._set(state.acceleration_end, flags, time)
         self.count += 1
 
     @staticmethod

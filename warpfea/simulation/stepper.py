@@ -73,7 +73,7 @@ class Stepper:
             state.register("algorithmic_acceleration", vec3, (model.slots,))
             state.register("acceleration", vec3, (model.slots,))
             state.register("previous_step", wp.float64)
-            state.register("previous_end", wp.float64, initial=np.nan)
+            state.register("acceleration_end", wp.float64, initial=np.nan)
         if ledger:
             state.register("ledger", wp.float64, (len(model.terms.ledger),))
             state.register("ledger_time", wp.float64)
@@ -124,7 +124,7 @@ class Stepper:
             w.step.stretch = w.array("stretch", (self.model.worlds,), wp.float64)
         if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
-            w.step.previous_end = state.previous_end
+            w.step.previous_end = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
             self.booked = self.terms.booked(w)
