@@ -229,7 +229,13 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def fail(ctl: Control, world: int, why: int):
         """No step was found. Where rounding alone may explain that, stand still and ask for the error that is left."""
         near = ctl.floor_excess[world] <= f64(NEAR) and ctl.iterations[world] > 0 and ctl.strict_count[world] < TRIES
-        if near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
+        enough = False
+        if wp.static(gated):  # only accelerations ask for more, and rounding does not give it
+            if ctl.constraint_pace > f64(0.0) and ctl.relative[world] <= ctl.tol + f64(FLOOR) * ctl.eps:
+                enough = largest_violation(ctl, world) <= ctl.constraint_tol
+        if enough and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
+            accept(ctl, world)
+        elif near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             ask(ctl, world)
             ctl.alpha[world] = f64(0.0)
         elif (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE) and ctl.eta[world] < f64(1.0e30):
