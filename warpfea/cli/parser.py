@@ -134,7 +134,12 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     how.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
     how.add_argument("--dt", type=positive, metavar="S", help="step, s")
-    how.add_argument("--integrator", metavar="NAME", help="backward_euler, bdf2 or energy_momentum")
+    how.add_argument(
+        "--integrator",
+        metavar="NAME",
+        help="backward_euler, bdf2, energy_momentum or generalized_alpha, also with its option: "
+        "generalized_alpha(rho_inf=0.5)",
+    )
     how.add_argument(
         "--solver",
         choices=tuple(SOLVERS),
