@@ -42,7 +42,7 @@ class Simulation(Records):
         dt: step, s. `sim.dt` may be set later.
         integrator: "backward_euler", "bdf2", "generalized_alpha", or wf.GeneralizedAlpha(rho_inf=...), as a text
             "generalized_alpha(rho_inf=0.5)".
-        solver: "newton-pcg" or "jacobi", or options: wf.NewtonPCG(...), wf.Jacobi(...).
+        solver: "newton-pcg", "jacobi" or "direct", or options: wf.NewtonPCG(...), wf.Jacobi(...).
         constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
             float64, 1e-5 in float32.
         ledger: keep the energy ledger.
