@@ -235,10 +235,7 @@ def test_default_law_always_finds_a_solution(e, per_contact):
     assert not sim.status.any()
 
 
-STANDS = pytest.mark.xfail(strict=True, reason="1 of 300 stands at 4e-10, tol 1e-10: the rounding of its gap")
-
-
-@pytest.mark.parametrize("per_contact", [pytest.param(3, marks=STANDS), 20])
+@pytest.mark.parametrize("per_contact", [3, 20])
 def test_paper_patch_ramped_in_always_finds_a_solution(per_contact):
     sim, without = impacts(300, 3, "paper", per_contact, smoothing=1e-3)
     assert without.any()

@@ -61,9 +61,13 @@ def assert_solves(rows):
     assert all(row["levels"] >= 2 for row in rows)
 
 
-@pytest.mark.parametrize(("least", "most"), [(8e3, 2e4), (8e4, 2e5)], ids=["10k", "100k"])
-def test_solves_take_few_more_iterations_than_with_contact_nodes_clamped(least, most):
-    assert_solves([row for row in content_of("contact_cpu.json")["solves"] if least < row["unknowns"] < most])
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [("contact_cpu.json", 8e3, 2e4), ("contact_cpu.json", 8e4, 2e5), ("contact_h200.json", 8e4, 2e5)],
+    ids=["10k", "100k", "100k, H200"],
+)
+def test_solves_take_few_more_iterations_than_with_contact_nodes_clamped(name, least, most):
+    assert_solves([row for row in content_of(name)["solves"] if least < row["unknowns"] < most])
 
 
 def test_solves_of_a_small_block():

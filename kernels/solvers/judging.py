@@ -42,10 +42,10 @@ TRIES = 3
 
 @functools.cache
 def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """The functions; of the traits "stored" and "gated" count."""
+    """The functions; of the traits "stored", "gated" and "midpoint" count."""
     f64 = wp.float64
     Control = control_struct()
-    stored, gated = traits.stored, traits.gated
+    stored, gated, midpoint = traits.stored, traits.gated, traits.midpoint
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
@@ -55,7 +55,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         is the residual, Eq. (17). Of the sums over a world: inertia and the forces held, f_held (dead loads, and forces
         without a potential as the search began), are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc, J, are
         elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is term_sums[0].
+        With the trait "midpoint" there is no Phi: half of the squared D^-1 norm of the residual stands in its place.
         """
+        if wp.static(midpoint):
+            return ctl.slot_sums[4, world]
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
         if wp.static(stored):
             energy += ctl.term_sums[0, world]

@@ -1,4 +1,4 @@
-"""What goes around Newton's iteration: multipliers of the classical method, and what terms hold while it solves."""
+"""What goes around Newton's iteration: multipliers of the classical method, what terms hold or limit."""
 
 import types as _types
 
@@ -84,4 +84,13 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         ctl.active[world] = 1
         ctl.stepped[world] = 1
 
-    return _types.SimpleNamespace(judge_outer=judge_outer, begin_refresh=begin_refresh, end_refresh=end_refresh)
+    @wp.kernel(module=module)
+    def free_step(ctl: Control):
+        """Before terms limit a step: the full one."""
+        world = wp.tid()
+        if ctl.active[world] != 0:
+            ctl.limit[world] = f64(1.0)
+
+    return _types.SimpleNamespace(
+        free_step=free_step, judge_outer=judge_outer, begin_refresh=begin_refresh, end_refresh=end_refresh
+    )

@@ -54,6 +54,7 @@ def step_struct():
         first_refusal: wp.array(dtype=wp.int32)
         time: wp.array(dtype=wp.float64)  # s, state
         new_time: wp.array(dtype=wp.float64)  # end of the attempt
+        stage_time: wp.array(dtype=wp.float64)  # its middle, of schemes that take forces there
         step_start: wp.array(dtype=wp.float64)
         h: wp.array(dtype=wp.float64)
         previous_h: wp.array(dtype=wp.float64)  # state of multistep schemes; 0 before the first step

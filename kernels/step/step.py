@@ -31,7 +31,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         dtype: precision of the vectors.
         scheme: the time discretisation, with `coefficients`, a wp.func (h, previous h, parameter) -> Coefficients, and
             what its kernels are specialised for: static (no inertia, v is the displacement increment), multistep (it
-            uses the step before the last), takes_velocity (q~ takes v_n), variant (their name).
+            uses the step before the last), takes_velocity (q~ takes v_n), midpoint (forces of the
+            middle), variant (their name).
         traits: of the model; "nonpotential" and "gated" count.
     """
     p = precision(dtype)
@@ -43,7 +44,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     nonpotential, gated = traits.nonpotential, traits.gated
     variant = traits.suffix("nonpotential", "gated")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
-    takes_velocity = scheme.takes_velocity
+    takes_velocity, midpoint = scheme.takes_velocity, scheme.midpoint
     module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
 
     @wp.kernel(module=module)
@@ -92,6 +93,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         h = step.dt[world] / parts
         step.h[world] = h
         step.new_time[world] = step.step_start[world] + step.dt[world] * (f64(step.part[world] + 1) / parts)
+        if wp.static(midpoint):
+            step.stage_time[world] = step.new_time[world] - f64(0.5) * h
         previous = f64(0.0)
         if wp.static(multistep):
             # a state that was set, reset or advanced by another scheme since has no past
@@ -149,7 +152,10 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         first = vec3()
         dq = T(step.dq_dv[world])
         if wp.static(not static):
-            first = w + (dq * is_position[slot]) * vec3(step.gravity[world])
+            fall = dq
+            if wp.static(midpoint):
+                fall = T(f64(1.0) / step.mass_factor[world])
+            first = w + (fall * is_position[slot]) * vec3(step.gravity[world])
             if wp.static(multistep):
                 if step.a1[world] > f64(0.0):  # goes on as it went: exact for a constant acceleration too
                     ratio = T(step.h[world] / step.previous_h[world])
@@ -181,7 +187,10 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         dq = T(step.dq_dv[world])
         new = v_n[world, slot]
         if kind == 0:
-            new = v_tilde[world, slot] + (dq * is_position[slot]) * vec3(step.gravity[world])
+            fall = dq
+            if wp.static(midpoint):
+                fall = T(f64(1.0) / step.mass_factor[world])
+            new = v_tilde[world, slot] + (fall * is_position[slot]) * vec3(step.gravity[world])
         elif kind == 2:
             new = (T(1.0) / dq) * (u_n[world, slot] - q_tilde[world, slot])
         f = free[slot]
@@ -326,7 +335,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         end_attempt=end_attempt,
         failed_now=failed_now,
         commit=commit,
-        **vars(ledger_kernels(dtype, multistep, nonpotential, module)),
+        **vars(ledger_kernels(dtype, multistep or midpoint, nonpotential, module)),
         write_report=write_report,
         probe_values=probe_values,
     )

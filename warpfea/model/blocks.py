@@ -14,7 +14,8 @@ from ..kernels.elements.element import element_kernels
 from ..kernels.elements.materials import ANY_J, NCOEF
 from ..kernels.elements.mixed import mixed_product
 from ..kernels.elements.points import block_struct
-from ..kernels.elements.tied import tied_kernels, tied_struct
+from ..kernels.elements.tied import tied_kernels
+from ..kernels.elements.tied_block import tied_struct
 from ..kernels.elements.with_mass import with_mass_kernel
 from . import assembly
 
@@ -48,11 +49,17 @@ class Block:
         """Whether the mass of an element is one table times a number."""
         return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
 
-    def kernels_for(self, dtype: str, damping: str | None) -> Any:
-        """The kernels of this kind of element with another form of damping."""
+    def kernels_for(self, dtype: str, damping: str | None, midpoint: bool = False) -> Any:
+        """The kernels of this kind of element with another form of damping; `midpoint`: of the conserving scheme."""
         k = self.key
+        if k.tying and midpoint:
+            return tied_kernels(dtype, self.slots, self.points, k.tying.width, midpoint)
         if k.tying:
             return self.kernels
+        if midpoint:
+            return element_kernels(
+                dtype, k.law, self.slots, self.points, k.affine, mean_damping(damping), k.framed, midpoint
+            )
         return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
 
     def mixed_product(self, dtype: str) -> wp.Kernel:
@@ -62,10 +69,18 @@ class Block:
             return self.kernels.mixed_product
         return mixed_product(dtype, k.law, self.slots, self.points, k.affine, k.framed)
 
-    def with_mass_product(self, dtype: str, damping: str | None) -> wp.Kernel:
-        """The kernel of the product of a with_mass block, with a form of damping."""
+    def with_mass_product(self, dtype: str, damping: str | None, midpoint: bool = False) -> wp.Kernel:
+        """The kernel of the product of a with_mass block, with a form of damping; `midpoint`: see `kernels_for`."""
         k = self.key
+        if midpoint:
+            damping = mean_damping(damping)
+            return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster, midpoint)
         return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster)
+
+
+def mean_damping(damping: str | None) -> str | None:
+    """Damping over a step of the conserving scheme: (E1 - E0)/h, where the incremental form and that of rates meet."""
+    return "rate" if damping == "incremental" else damping
 
 
 def build_block(

@@ -59,6 +59,10 @@ class Stepper:
         self.launch = Launcher(model.device)
         self.terms = model.terms
         self.launch.parts |= model.terms.parts
+        if integrator.midpoint and isinstance(solver, Jacobi):
+            raise ModelError(
+                f"integrator {integrator.name!r} needs Newton's method: solver=NewtonPCG(...) in the place of Jacobi"
+            )
         self.kernels = step_kernels(model.dtype, integrator, model.terms.traits)
         vec3 = model.types.vec3
         state.sealed = False
@@ -74,8 +78,10 @@ class Stepper:
         state.register("status", wp.int32)
         self.u_before = state.previous_displacement if integrator.multistep else state.displacement
         self.v_before = state.previous_velocity if integrator.multistep else state.velocity
-        self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger)
-        self.at = At(model, self.work, self.launch, state, self.u_before, inertia=not integrator.static)
+        midpoint = integrator.midpoint
+        self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint)
+        dynamic = not integrator.static
+        self.at = At(model, self.work, self.launch, state, self.u_before, inertia=dynamic, midpoint=midpoint)
         self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
@@ -129,6 +135,7 @@ class Stepper:
         flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
         active: wp.array = wp.array(flags, dtype=wp.int32, device=m.device)
         w.step.new_time.assign(state.time)
+        w.stage_time.assign(state.time)
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
         self._laws(active)
         w.u.assign(state.displacement)
@@ -169,7 +176,9 @@ class Stepper:
         m, w = self.model, self.work
         flags = np.ones(m.worlds, dtype=np.int32) if flags is None else flags
         active: wp.array = wp.array(flags, dtype=wp.int32, device=m.device)
-        w.u.assign(self.state.displacement)
+        w.u_stage.assign(self.state.displacement)
+        if self.at.midpoint:
+            w.v_stage.zero_()
         residual = self.newton.residual
         with self.launch.rare():
             residual.elements.force(self.at, active)
@@ -327,8 +336,11 @@ class Stepper:
     def _laws(self, active: wp.array) -> None:
         """Values of the time laws at the end of the attempt."""
         w = self.work
-        self.terms.laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
-        self.terms.dead.take_gravity(self.launch, w.law_value, active)
+        laws = self.terms.laws
+        laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
+        if self.at.midpoint:
+            laws.evaluate(self.launch, self.state, w.stage_time, w.step.ramp, active, w.law_stage)
+        self.terms.dead.take_gravity(self.launch, w.law_stage, active)
 
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or part of the load (B, laws, 3); the step's own stay."""

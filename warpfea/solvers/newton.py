@@ -145,7 +145,7 @@ class NewtonLoop:
         model, work, launch, inertia = at.model, at.work, at.launch, at.inertia
         self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
         self.constraint_tol = constraint_tol
-        traits = model.terms.traits
+        traits = at.traits
         self.kernels = newton_kernels(model.dtype, traits)
         self.limited = traits.limited
         self.classical = traits.gated and options.multipliers == "outer"
@@ -240,9 +240,8 @@ class NewtonLoop:
 
     def _open(self, flags: wp.array) -> None:
         """Evaluate the first iterate."""
-        w = self.work
         # D is needed to judge it, so the blocks come first
-        self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, flags, w.u])
+        self.residual.place(flags)
         self._each("prepare", flags)
         self.preconditioner.start(flags)
         self._each("scale", flags)

@@ -59,7 +59,8 @@ class Evaluation:
         none: Any = None
         work: Any = SimpleNamespace(
             u=u,
-            v=u,
+            u_stage=u,
+            v_stage=u,
             history=self._zeros((1, 1), m.types.sym),
             step=SimpleNamespace(dq_dv=wp.ones(B, dtype=wp.float64, device=m.device)),
             contribution=self._zeros((B, m.contributions), m.types.vec3),

@@ -13,19 +13,18 @@ from ...base.errors import ModelError
 from ...base.names import did_you_mean
 from .backward_euler import BACKWARD_EULER, STATIC
 from .bdf2 import BDF2
+from .energy_momentum import ENERGY_MOMENTUM
 from .scheme import Integrator
 
 __all__ = ["INTEGRATORS", "Integrator", "get"]
 
-INTEGRATORS = {scheme.name: scheme for scheme in (BACKWARD_EULER, BDF2, STATIC)}
+INTEGRATORS = {scheme.name: scheme for scheme in (BACKWARD_EULER, BDF2, ENERGY_MOMENTUM, STATIC)}
 
 
 def get(name: str | Integrator) -> Integrator:
     """The integrator `name`, or the one that is given. Raises ModelError listing the names."""
     if isinstance(name, Integrator):
         return name
-    if name == "energy_momentum":
-        raise NotImplementedError("integrator 'energy_momentum' is not part of this version")
     if name not in INTEGRATORS or name == "static":
         names = [n for n in INTEGRATORS if n != "static"]
         raise ModelError(f"integrator {name!r} is unknown; there are {', '.join(names)}{did_you_mean(name, names)}")

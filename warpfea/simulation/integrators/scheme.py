@@ -18,6 +18,7 @@ class Integrator:
         order: order of convergence in h.
         multistep: keeps the state before the last, q_{n-1} and v_{n-1}.
         takes_velocity: q~ takes v_n.
+        midpoint: forces are those of the middle of the step, and conserve energy and momenta.
         static: no inertia; v is the displacement increment of a load step.
         parameter: the number that `coefficients` gets, such as a spectral radius.
         stabilise: N/m per kg, of statics: springs from the last equilibrium to the next, fading with the load.
@@ -28,6 +29,7 @@ class Integrator:
     order: int
     multistep: bool = False
     takes_velocity: bool = False
+    midpoint: bool = False
     static: bool = False
     # kernels don't depend on these
     parameter: float = field(default=0.0, compare=False)
@@ -36,5 +38,5 @@ class Integrator:
     @property
     def variant(self) -> str:
         """Name of its kernels."""
-        flags = [name for name in ("multistep", "takes_velocity", "static") if getattr(self, name)]
+        flags = [name for name in ("multistep", "takes_velocity", "midpoint", "static") if getattr(self, name)]
         return "_".join([self.coefficients.key, *flags])
