@@ -615,9 +615,8 @@ BAD = {
     "render a wrong size": (["render", "bad.usdc", "-o", "o.png", "--size", "big"], ["--size", "'big'"]),
     "bench too small": (["bench", "--unknowns", "10"], ["--unknowns 10", "270"]),
     "bench text": (["bench", "--unknowns", "many"], ["--unknowns", "'many'"]),
-    "later command": (["study", "hook"], ["study", "not part of this version"]),
-    "no such study": (["study", "hook"], ["'hook'", "ancf-tets"]),
-    "later command with options": (["sweep", "--set", "E=1"], ["sweep", "not part of this version"]),
+    "no such study": (["study", "hok"], ["'hok'", "ancf-tets", "did you mean 'hook'"]),
+    "later command": (["sweep", "--set", "E=1"], ["sweep", "not part of this version"]),
 }
 
 

@@ -26,7 +26,7 @@ def totals(e, flip=None):
     return gain - sum(sign[n] * e[n] for n in ("work_loads", "work_supports", "work_fields"))
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"])
 @pytest.mark.parametrize("damping", [None, "incremental", "rate", "explicit"])
 def test_ledger_residual_is_the_unbalanced_work(damping, integrator):
     b, body = scene(damping)

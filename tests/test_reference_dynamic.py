@@ -121,6 +121,8 @@ def tip_errors(model, exact, integrator, h, t_end, halved):
     [
         ("backward_euler", (5e-4, 1.25e-4), 1, 0.05),
         ("bdf2", (5e-4, 1.25e-4), 2, 0.1),
+        # between neighbouring steps its order scatters by 0.3, for high modes that gravity strikes are damped by little
+        ("generalized_alpha", (1e-3, 1.25e-4), 2, 0.1),
         # it damps nothing: steps must resolve all that moves before errors fall evenly
         pytest.param("energy_momentum", (6.25e-5, 3.125e-5), 2, 0.1, marks=slow),
     ],
@@ -152,7 +154,10 @@ def test_order_of_convergence_over_a_longer_time(cantilever, data, integrator, h
     assert np.log(worst[0] / worst[1]) / np.log(hs[0] / hs[1]) == pytest.approx(order, abs=slack)
 
 
-@pytest.mark.parametrize(("integrator", "dt"), [("backward_euler", 1e-3), ("bdf2", 1e-3), ("energy_momentum", 1.6e-3)])
+@pytest.mark.parametrize(
+    ("integrator", "dt"),
+    [("backward_euler", 1e-3), ("bdf2", 1e-3), ("generalized_alpha", 1e-3), ("energy_momentum", 1.6e-3)],
+)
 def test_a_refused_step_equals_two_of_half_the_size(cantilever, data, integrator, dt):
     _, model = cantilever(data.json("S3_BE_svk_q4"))
     options = {"integrator": integrator, "ledger": False}

@@ -5,9 +5,11 @@ b = wf.ModelBuilder(); body = b.add_solid(...); model = b.finalize(); sim = wf.S
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import pathlib
 import sys
+from typing import Any
 
 
 def _map_checkout() -> None:
@@ -48,6 +50,7 @@ from .base.version import __version__  # noqa: E402
 from .builder.beams import spline  # noqa: E402
 from .builder.builder import ModelBuilder  # noqa: E402
 from .builder.joints import GROUND  # noqa: E402
+from .builder.reference import Reference  # noqa: E402
 from .builder.scene import scene  # noqa: E402
 from .elements.sections import Rectangle  # noqa: E402
 from .laws import Control  # noqa: E402
@@ -63,6 +66,7 @@ from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
 from .simulation.checkpoint import Checkpoint  # noqa: E402
+from .simulation.integrators import GeneralizedAlpha  # noqa: E402
 from .simulation.simulation import Simulation, StepReport  # noqa: E402
 from .simulation.statics import solve_static  # noqa: E402
 from .solvers import Jacobi, NewtonPCG  # noqa: E402
@@ -83,6 +87,7 @@ __all__ = [
     "ElementSet",
     "Error",
     "GIFWriter",
+    "GeneralizedAlpha",
     "HalfSpace",
     "Jacobi",
     "Joint",
@@ -101,6 +106,7 @@ __all__ = [
     "PNGWriter",
     "PenetrationError",
     "Rectangle",
+    "Reference",
     "Rotation",
     "Simulation",
     "Sphere",
@@ -114,16 +120,18 @@ __all__ = [
     "scene",
     "solve_static",
     "spline",
+    "study",
 ]
 
 
 _LATER = {
     "TriMesh": "rigid triangle meshes",
-    "GeneralizedAlpha": "generalised-alpha steps",
 }
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
+    if name == "study":  # by name: no scene, which imports this, is to depend on studies
+        return importlib.import_module(f"{__name__}.studies.accuracy").study
     if name in _LATER:
         raise NotImplementedError(f"warpfea.{name}: {_LATER[name]} are not part of this version")
     raise AttributeError(f"module 'warpfea' has no attribute {name!r}")

@@ -1,8 +1,8 @@
-"""Elements with assumed natural shear strain (Dvorkin and Bathe 1984): force, energy, tangent product and matrices.
+"""Elements with assumed natural strain (Dvorkin and Bathe 1984): force, energy, tangent product and matrices.
 
-Covariant shears e_t = 2 E_ab = x_a . x_b - X_a . X_b are taken at tying points ("ties") t, where x_a and x_b are the
-derivatives of the position along two parent directions. Interpolation, metric and quadrature are one symmetric matrix A
-per element, made on the host: the energy is (mu/2) e.A e, J.
+Strains e_t = 2 E_ab = x_a . x_b - X_a . X_b, mostly shears, are taken at tying points ("ties") t, where x_a and x_b are
+the derivatives of the position along two parent directions or two axes of the element. Interpolation, metric and
+quadrature are one symmetric matrix A per element, made on the host: the energy is (mu/2) e.A e, J.
 """
 
 import functools

@@ -22,6 +22,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     f64 = wp.float64
     Control = control_struct()
     judging = judging_functions(traits)
+    closure = judging.closure
     objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
     measure, settle, record, give_up = judging.measure, judging.settle, judging.record, judging.give_up
 
@@ -72,7 +73,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         ctl.stepped[world] = 0
         if running[world] == 0 or ctl.failed[world] != 0:
             return
-        if largest_violation(ctl, world) <= tol:
+        if largest_violation(ctl, world) <= closure(ctl, world, tol):
             return
         if ctl.outer[world] >= limit:
             ctl.failed[world] = FAIL_CONSTRAINT

@@ -58,14 +58,16 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return s
 
     @wp.func
-    def spread(u: vec3, v: vec3, free: vec3, D: vec3, dq: f64) -> f64:
+    def spread(balance: Balance, free: vec3, D: vec3, world: int, slot: int) -> f64:
         """Squared D norm of the velocity that makes all of u: times eps^2, what its rounding does to the residual.
 
         Where u = q~ + (dq/dv) v is a small difference, that of its parts.
         """
+        u = balance.u[world, slot]
+        v = balance.v[world, slot]
         s = f64(0.0)
         for k in range(3):
-            x = wp.max(wp.abs(f64(u[k])) / dq, wp.abs(f64(v[k])))
+            x = wp.max(wp.abs(f64(u[k])) / balance.dq_dv[world], wp.abs(f64(v[k])))
             s += f64(free[k]) * f64(D[k]) * x * x
         return s
 
@@ -202,9 +204,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             balance.rows[7, world, slot] = f64(
                 wp.dot(balance.nonpotential_held[world, slot] - balance.nonpotential[world, slot], vs)
             )
-        balance.rows[8, world, slot] = spread(
-            balance.u[world, slot], balance.v[world, slot], free, D, balance.dq_dv[world]
-        )
+        balance.rows[8, world, slot] = spread(balance, free, D, world, slot)
         balance.rows[9, world, slot] = square(wp.cw_mul(residual_force, free))
         motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
         balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)

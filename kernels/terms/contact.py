@@ -26,8 +26,6 @@ MOST_TURN = 1.0
 RELAX_LANES = 128
 SHRINKS = 0.35
 """Caps that come closer by less than this per change are relaxed."""
-PICKS = 4
-"""Choices of the deepest point in an attempt."""
 
 
 @functools.cache
@@ -41,7 +39,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     f = touch_functions(dtype)
     along, plane, record_of, reach, acts = f.along, f.plane, f.record_of, f.reach, f.acts
     tangent_damping, touch, in_plane, hold = f.tangent_damping, f.touch, f.in_plane, f.hold
-    coefficient = f.coefficient
+    coefficient, shape_of = f.coefficient, f.shape_of
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
     distance, elastic = shape_functions().distance, law_functions().elastic
@@ -183,56 +181,6 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         at.dead_spring[world, point] = s
         at.dead[world, point] = force * n + pulled
 
-    @wp.kernel(module=module)
-    def levels(
-        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32), at: Attempt,
-    ):  # fmt: skip
-        """Depths of the points of lumped contacts."""
-        world, item, q = wp.tid()
-        if active[world] == 0:
-            return
-        c = facets.contact[item]
-        if con.lumped[c] == 0:
-            return
-        point = facets.point + item * facets.points + q
-        depth = f64(-1.0e300)
-        if facets.share[q, item] > f64(0.0):
-            k = con.collider[c]
-            x = facets.X[q, item] + along(facets, u, world, q, item)
-            y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
-            d = distance(con.kind[k], con.size[k], y, -1)
-            depth = reach(con, his, world, c, point, time[world], con.grow[world, k]) - d[3]
-            if con.dead[c] != 0:  # its force is that of the last state
-                depth = at.depth[world, point]
-        at.level[world, point] = depth
-
-    @wp.kernel(module=module)
-    def pick_deepest(
-        con: Contacts, active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, changed: wp.array(dtype=wp.int32)
-    ):  # fmt: skip
-        """The deepest point of each lumped contact, of equals the first; it may change a few times per attempt.
-
-        Where two points are as deep there is no equilibrium with either alone: the last choice stays.
-        """
-        world, c = wp.tid()
-        if active[world] == 0 or con.lumped[c] == 0:
-            return
-        if fresh != 0:
-            at.picks[world, c] = 0
-        elif at.picks[world, c] >= PICKS:
-            return
-        best = con.first[c]
-        deepest = at.level[world, best]
-        for point in range(con.first[c] + 1, con.first[c + 1]):
-            if at.level[world, point] > deepest:
-                deepest = at.level[world, point]
-                best = point
-        if fresh != 0 or best != at.pick[world, c]:
-            at.picks[world, c] = at.picks[world, c] + 1
-            changed[world] = 1
-        at.pick[world, c] = best
-
     @wp.func
     def dead_work(
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
@@ -335,7 +283,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             if touched != IDLE:
                 for q in range(facets.points):
                     if at.state[world, first + q] != IDLE:
-                        f += facets.shape[q, i, item] * vec3(at.force[world, first + q])
+                        f += shape_of(facets, at, world, q, i, item) * vec3(at.force[world, first + q])
             pool[world, facets.pool + i * facets.count + item] = f
         if touched != IDLE:
             wp.atomic_max(touching, world, 1)
@@ -414,11 +362,11 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
                 stiff = at.stiffness[world, point]
                 d = vec3()
                 for i in range(facets.conn.shape[0]):
-                    d += facets.shape[q, i, item] * p[world, facets.conn[i, item]]
+                    d += shape_of(facets, at, world, q, i, item) * p[world, facets.conn[i, item]]
                 f = times(stiff, d)
                 for i in range(facets.conn.shape[0]):
                     e = facets.pool + i * facets.count + item
-                    pool[world, e] = pool[world, e] + facets.shape[q, i, item] * f
+                    pool[world, e] = pool[world, e] + shape_of(facets, at, world, q, i, item) * f
 
     @wp.kernel(module=module)
     def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=sym)):
@@ -429,12 +377,12 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         out = sym()
         if at.touched[world, facets.row + item] == STIFF:
             for q in range(facets.points):
-                s = facets.shape[q, i, item]
+                s = shape_of(facets, at, world, q, i, item)
                 out += s * s * at.stiffness[world, facets.point + item * facets.points + q]
         pool[world, facets.pool + i * facets.count + item] = out
 
     return _types.SimpleNamespace(
         module=module, poses=poses, begin_points=begin_points, settle=settle, explicit_forces=explicit_forces,
-        levels=levels, pick_deepest=pick_deepest, forces=forces, gather_points=gather_points,
+        forces=forces, gather_points=gather_points,
         partial_asked=partial_asked, relax=relax, refresh=refresh, product=product, diagonal=diagonal,
     )  # fmt: skip

@@ -33,7 +33,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     k = touch_functions(dtype)
     touch, in_plane, hold, pull, acts, Touch = k.touch, k.in_plane, k.hold, k.pull, k.acts, k.Touch
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
-    coefficient = k.coefficient
+    coefficient, lagrange = k.coefficient, k.lagrange
     elastic = law_functions().elastic
     module = kernel_module(f"contact_{dtype}", max_unroll=SMALL)
 
@@ -117,10 +117,11 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         out.force = normal * t.n - pulled
         out.stored = spring[1] + f64(0.5) * held[1] * wp.dot(out.kept, out.kept)
         gain = out.stored - his.stored[world, rec]
-        out.loss = (normal - spring[0]) * change
+        out.loss = (normal - spring[0]) * t.rise
         out.slid = t.slip - (out.kept - base)
         out.rubbed = wp.dot(pulled - held[1] * out.kept, out.kept - base) + wp.dot(pulled, out.slid)
         chord = spring[0] * change + held[1] * wp.dot(out.kept, out.kept - base) - gain
+        chord += (normal - spring[0]) * (change - t.rise)  # of a place that moves
         x = at.turn[world, kc] * t.y + at.place[world, kc]
         carried = at.shift[world, kc]  # of the collider's material at the point, by its last velocity
         if con.spin[kc] >= 0:
@@ -134,9 +135,14 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def remember(con: Contacts, his: History, clock: Clock, at: Attempt, world: int, c: int, point: int, o: Outcome):
+    def remember(
+        con: Contacts, facets: Facets, his: History, clock: Clock, at: Attempt, world: int, c: int, point: int,
+        o: Outcome,
+    ):  # fmt: skip
         """Keep the history of a point."""
         rec = record_of(con, c, point)
+        if facets.moving != 0:
+            his.lead[world, rec] = o.touch.depth
         if o.touch.depth <= f64(0.0):
             his.spring[world, rec] = vec3d()
             his.stored[world, rec] = f64(0.0)
@@ -146,7 +152,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         speed = at.speed[world, point]
         if clock.still == 0:
-            speed = wp.max(speed, (o.touch.depth - at.depth[world, point]) / clock.h[world])
+            speed = wp.max(speed, o.touch.rise / clock.h[world])
         kept = o.kept
         if con.law[c] != PAPER:
             kept = wp.transpose(at.turn[world, con.collider[c]]) * kept
@@ -204,7 +210,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
                 for j in range(4):
                     at.rows[10 + j, world, row] = booked[j, world, row]
                 at.rows[14, world, row] = wp.max(at.rows[14, world, row], o.touch.depth)
-                remember(con, his, clock, at, world, c, point, o)
+                remember(con, facets, his, clock, at, world, c, point, o)
 
     @wp.kernel(module=module)
     def partial_records(
@@ -284,19 +290,33 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def at_points(
         con: Contacts, facets: Facets, his: History, u: wp.array2d(dtype=vec3), time: wp.array(dtype=f64),
-        at: Attempt, gap: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
+        at: Attempt, places: int, gap: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """At a state, without rates: gap, m, and the elastic force on the point, N."""
+        """At a state, without rates: gap, m, and the elastic force on the point, N; with `places` the gap of a place
+        that acts is at the point next to it."""
         world, item, q = wp.tid()
         point = facets.point + item * facets.points + q
         if facets.share[q, item] == f64(0.0):
             gap[world, point] = f64(1.0e30)
             return
         c = facets.contact[item]
-        t = touch(con, facets, his, at, world, c, q, item, point, u, time[world], f64(0.0), f64(1.0))
-        held = hold(con, his, at, world, c, point, t)
-        gap[world, point] = -t.depth
         share = facets.share[q, item] * acts(con, at, world, c, point)
+        acting = point
+        if facets.moving != 0:  # the force at the place is one on the points of its facet
+            gap[world, point] = -at.level[world, point]
+            row = facets.row + item
+            share = f64(0.0)
+            acting = at.pick[world, c]
+            if at.moves[world, c] == row:
+                share = lagrange(facets, q, at.spot[world, row])
+                if wp.length_sq(at.spot[world, row] - facets.coords[acting - (point - q)]) == f64(0.0):
+                    share = wp.where(acting == point, f64(1.0), f64(0.0))
+            if share == f64(0.0) and acting != point:
+                return
+        t = touch(con, facets, his, at, world, c, q, item, acting, u, time[world], f64(0.0), f64(1.0))
+        held = hold(con, his, at, world, c, acting, t)
+        if acting == point and (facets.moving == 0 or places != 0):
+            gap[world, point] = -t.depth
         force[world, point] = share * (t.law[0] * t.n - friction_force(con, world, c, t, held, f64(0.0)))
 
     return _types.SimpleNamespace(
@@ -320,6 +340,7 @@ def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
     def add_contact(
         topo: Topology, pattern: Pattern, facets: Facets, entry: wp.array(dtype=wp.int32),
         start: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3i), stiffness: wp.array2d(dtype=sym),
+        weight: wp.array3d(dtype=T),
         dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), value: wp.array2d(dtype=mat33),
     ):  # fmt: skip
         """value += (dq/dv) sum over points of s_a s_b K; `source`: facet and two of its slots."""
@@ -331,6 +352,9 @@ def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
             at = source[e]
             for q in range(facets.points):
                 s = facets.shape[q, at[1], at[0]] * facets.shape[q, at[2], at[0]]
+                if facets.moving != 0:
+                    c = facets.contact[at[0]]
+                    s = weight[world, c, at[1]] * weight[world, c, at[2]]
                 k6 += s * stiffness[world, facets.point + at[0] * facets.points + q]
         k6 = T(dq_dv[world]) * k6
         A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])

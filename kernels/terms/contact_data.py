@@ -69,6 +69,11 @@ def facet_struct(dtype: str):
         point: wp.int32  # first point: [facet, point] are numbered in this order
         count: wp.int32
         points: wp.int32  # of a facet
+        moving: wp.int32  # one point acts, where `Attempt.weight` says
+        corners: wp.int32
+        coords: wp.array(dtype=wp.vec2d)  # [point] on the unit triangle or square; of lumped contacts, as what follows
+        basis: wp.array2d(dtype=wp.float64)  # [point, monomial] Lagrange's polynomials of the points
+        power: wp.array(dtype=wp.vec2i)  # [monomial] exponents
 
     return Facets
 
@@ -87,6 +92,7 @@ def history_struct():
         overlap: wp.array2d(dtype=wp.float64)  # stored at the start, m
         cap: wp.array2d(dtype=wp.float64)  # mu F_n of the last step, N over the point's share
         stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's share
+        lead: wp.array2d(dtype=wp.float64)  # of contacts whose place moves: depth at the end of the last step, m
         born: wp.array(dtype=wp.float64)  # [world] time that overlaps were stored at
         posed: wp.array(dtype=wp.float64)  # [world] time that the colliders are at
         place: wp.array2d(dtype=wp.vec3d)  # of colliders
@@ -98,7 +104,7 @@ def history_struct():
 @functools.cache
 def attempt_struct(dtype: str):
     """What an attempt at a step makes."""
-    sym = precision(dtype).sym
+    T, sym = precision(dtype).T, precision(dtype).sym
 
     @wp.struct
     class Attempt:
@@ -129,7 +135,13 @@ def attempt_struct(dtype: str):
         dead: wp.array2d(dtype=wp.vec3d)  # [world, point] explicit force
         dead_spring: wp.array2d(dtype=wp.vec3d)
         level: wp.array2d(dtype=wp.float64)  # [world, point] depth; with lumped contacts
-        pick: wp.array2d(dtype=wp.int32)  # [world, contact] deepest point
+        near: wp.array2d(dtype=wp.int32)  # [world, facet row] deepest point of the facet
+        spot: wp.array2d(dtype=wp.vec2d)  # its deepest place
+        best: wp.array2d(dtype=wp.float64)  # how deep that is
+        pick: wp.array2d(dtype=wp.int32)  # [world, contact] point next to the deepest place, whose entries that uses
+        moves: wp.array2d(dtype=wp.int32)  # facet row of a place that has just been chosen, or -1
+        weight: wp.array3d(dtype=T)  # [world, contact, local] functions of the place
+        middle: wp.array2d(dtype=wp.vec3d)  # [world, contact] its reference place
         picks: wp.array2d(dtype=wp.int32)  # how often it was chosen in the attempt
         through: wp.array(dtype=wp.int32)  # [world] a point that went through a shape, + 1
         rows: wp.array3d(dtype=wp.float64)  # [RECORD, world, facet row]

@@ -19,7 +19,7 @@ SLIPS = 16
 @functools.cache
 def touch_functions(dtype: str) -> _types.SimpleNamespace:
     """Device functions in one precision of the displacements; all but these is float64."""
-    vec3 = precision(dtype).vec3
+    T, vec3 = precision(dtype).T, precision(dtype).vec3
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
     Contacts, Facets = contact_struct(), facet_struct(dtype)
     History, Attempt = history_struct(), attempt_struct(dtype)
@@ -33,6 +33,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
 
         n: vec3d  # outward normal of the shape
         depth: f64
+        rise: f64  # by which it has grown in the step; of a place that moves, from that of the place before
         side: wp.int32
         law: wp.vec4d  # normal force, its derivative, its potential, the size of the potential's parts
         m: vec3d  # normal of the plane of friction
@@ -48,6 +49,48 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         out = vec3d()
         for i in range(facets.conn.shape[0]):
             out += f64(facets.shape[point, i, item]) * vec3d(field[world, facets.conn[i, item]])
+        return out
+
+    @wp.func
+    def shape_of(facets: Facets, at: Attempt, world: int, point: int, i: int, item: int) -> T:
+        """Function of slot i of a facet where a point, or a lumped contact, acts."""
+        if facets.moving != 0:
+            return at.weight[world, facets.contact[item], i]
+        return facets.shape[point, i, item]
+
+    @wp.func
+    def acting(facets: Facets, at: Attempt, field: wp.array2d(dtype=vec3), world: int, point: int, item: int) -> vec3d:
+        """sum_i s_i field_i where a point, or a lumped contact, acts."""
+        if facets.moving == 0:
+            return along(facets, field, world, point, item)
+        out = vec3d()
+        for i in range(facets.conn.shape[0]):
+            out += f64(shape_of(facets, at, world, point, i, item)) * vec3d(field[world, facets.conn[i, item]])
+        return out
+
+    @wp.func
+    def reference(facets: Facets, at: Attempt, world: int, point: int, item: int) -> vec3d:
+        """Where that is in the reference, m."""
+        if facets.moving != 0:
+            return at.middle[world, facets.contact[item]]
+        return facets.X[point, item]
+
+    @wp.func
+    def monomial(x: f64, power: int, derivative: int) -> f64:
+        """A derivative of x^power."""
+        out = f64(1.0)
+        for j in range(derivative):
+            out *= f64(power - j)
+        for _ in range(power - derivative):
+            out *= x
+        return out
+
+    @wp.func
+    def lagrange(facets: Facets, q: int, s: wp.vec2d) -> f64:
+        """The polynomial that is 1 at point q and 0 at the others of a facet."""
+        out = f64(0.0)
+        for m in range(facets.power.shape[0]):
+            out += facets.basis[q, m] * (monomial(s[0], facets.power[m][0], 0) * monomial(s[1], facets.power[m][1], 0))
         return out
 
     @wp.func
@@ -99,6 +142,15 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return wp.vec2d()
 
     @wp.func
+    def depth_before(con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, point: int) -> f64:
+        """Depth as the step began: of a live contact whose place moves, of the deepest place then."""
+        if facets.moving != 0:
+            rec = record_of(con, c, point)
+            if his.speed[world, rec] > f64(0.0):
+                return his.lead[world, rec]
+        return at.depth[world, point]
+
+    @wp.func
     def rate_of(con: Contacts, at: Attempt, world: int, c: int, point: int, inv_h: f64) -> f64:
         """Damping per depth of the normal law: chi/h, or gamma_n/h."""
         if con.law[c] == DEFAULT:
@@ -129,7 +181,8 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         out = Touch()
         k = con.collider[c]
         rec = record_of(con, c, point)
-        x = facets.X[q, item] + along(facets, u, world, q, item)
+        moved = acting(facets, at, u, world, q, item)
+        x = reference(facets, at, world, q, item) + moved
         turn = at.turn[world, k]
         out.y = wp.transpose(turn) * (x - at.place[world, k])
         side = wp.int32(-1)
@@ -141,7 +194,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         out.n = turn * vec3d(d[0], d[1], d[2])
         shape = con.grow[world, k]
         out.depth = reach(con, his, world, c, point, time, shape) - d[3]
-        motion = along(facets, u, world, q, item) - at.origin[world, point] - at.shift[world, k]
+        motion = moved - at.origin[world, point] - at.shift[world, k]
         if con.spin[k] >= 0:
             motion -= at.spin[world, k] * (his.turn[world, k] * at.start[world, point])
         before = at.depth[world, point]
@@ -151,8 +204,10 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
             out.depth = before + change[0] + (reach(con, his, world, c, point, time, shape) - at.reach[world, point])
         rate = rate_of(con, at, world, c, point, inv_h)
         k_n = con.scale[world, c] * con.normal[c]
+        led = depth_before(con, facets, his, at, world, c, point)
         out.law = normal_law(con.law[c], con.lumped[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
-                             before)  # fmt: skip
+                             led)  # fmt: skip
+        out.rise = out.depth - led
         out.motion = motion
         spring = vec3d()
         if live:
@@ -181,7 +236,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         if con.lumped[c] != 0:
             depth = wp.max(t.depth, f64(0.0))
             stiffness *= wp.sqrt(depth)
-            before = at.depth[world, point]
+            before = t.depth - t.rise
             if live and depth < before and con.law[c] == DEFAULT:
                 shrink = wp.sqrt(depth / before)
         return vec3d(mu * t.law[0], stiffness, shrink)
@@ -248,7 +303,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, tangent_damping=tangent_damping,
-        touch=touch, in_plane=in_plane, coefficient=coefficient, hold=hold, pull=pull,
+        depth_before=depth_before, touch=touch, in_plane=in_plane, coefficient=coefficient, hold=hold, pull=pull,
         friction_potential=friction_potential, friction_force=friction_force, point_stiffness=point_stiffness,
-        acts=acts,
+        acts=acts, shape_of=shape_of, lagrange=lagrange, monomial=monomial,
     )  # fmt: skip

@@ -381,7 +381,7 @@ class ModelBuilder:
             law: "default", "paper" (Paper I, Eqs. 72-83) or "smooth".
             treatment: "implicit", or "explicit" with the paper's law.
             stiffness: factor on the normal and the tangential stiffness; None: 1.
-            model: "patch", spread over the surface, or "sphere", one contact at the deepest point, by Hertz.
+            model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
             radius: m; "patch": of the disc whose area counts instead of the surface's; "sphere": of the body there.
             offset: gap at which contact begins, m.
             points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4.

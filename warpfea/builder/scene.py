@@ -31,11 +31,12 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
+from ..base.usercode import user_code
 
 if TYPE_CHECKING:
     from .builder import ModelBuilder
 
-__all__ = ["Parameter", "Scene", "find", "load_file", "names", "scene"]
+__all__ = ["Parameter", "Scene", "find", "load_file", "locate", "names", "scene", "split_name"]
 
 P = ParamSpec("P")
 REQUIRED = inspect.Parameter.empty
@@ -75,6 +76,7 @@ class Scene(Generic[P]):
         fps: frames of a USD file per simulated second.
         speed: simulated seconds per second of an animation.
         picture: time of a picture, s, or None for the end.
+        reference, field: what `warpfea study` compares with, see `scene`.
         description: first line of the docstring.
         parameters: by name.
     """
@@ -90,6 +92,8 @@ class Scene(Generic[P]):
         fps: float = 60.0,
         speed: float = 1.0,
         picture: float | None = None,
+        reference: Any = None,
+        field: Callable[[Any], Any] | None = None,
     ) -> None:
         for what, value in (("dt", dt), ("t_end", t_end), ("fps", fps), ("speed", speed)):
             if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
@@ -99,6 +103,7 @@ class Scene(Generic[P]):
         self.name = function.__name__
         self.dt, self.t_end, self.fps, self.speed = float(dt), float(t_end), float(fps), float(speed)
         self.integrator, self.tol, self.picture = integrator, tol, picture
+        self.reference, self.field = reference, field
         text = inspect.getdoc(function) or ""
         self.description = text.split("\n\n")[0].replace("\n", " ").strip()
         self.details = text.partition("\n\n")[2].partition("Args:")[0].strip()
@@ -144,10 +149,15 @@ class Scene(Generic[P]):
         return out
 
     def build(self, given: dict[str, Any]) -> ModelBuilder:
-        """Call the scene with the given parameters. ModelError if it returns no ModelBuilder."""
+        """Call the scene with the given parameters.
+
+        Raises:
+            ModelError: it returns no ModelBuilder, or its own code fails, with file and line.
+        """
         from .builder import ModelBuilder
 
-        out = self.function(**given)  # type: ignore[call-arg]
+        with user_code(f"scene {self.name!r}"):
+            out = self.function(**given)  # type: ignore[call-arg]
         if not isinstance(out, ModelBuilder):
             raise ModelError(f"scene {self.name!r} must return a ModelBuilder, it returned {type(out).__name__}")
         return out
@@ -168,6 +178,8 @@ def scene(
     fps: float = 60.0,
     speed: float = 1.0,
     picture: float | None = None,
+    reference: Any = None,
+    field: Callable[[Any], Any] | None = None,
 ) -> Callable[[Callable[P, ModelBuilder]], Scene[P]]:
     """Make a function that returns a ModelBuilder a scene.
 
@@ -179,6 +191,10 @@ def scene(
         fps: frames per simulated second in a USD file.
         speed: simulated seconds per second of a GIF; less than 1 is slow motion.
         picture: time that a PNG shows, s; None: the end.
+        reference: the motion, where it is known, for `warpfea study`: a dict from names of probes to functions of times
+            (n,) that give positions (n, 3); a wf.Reference; or a function of parameters of the scene that gives one.
+        field: a function of the simulation at its end that gives an array whose shape is the same for every mesh, such
+            as displacements at fixed places; `warpfea study` takes the norm of its error.
 
     Raises:
         ModelError: a number that is not positive.
@@ -186,8 +202,9 @@ def scene(
 
     def decorate(function: Callable[P, ModelBuilder]) -> Scene[P]:
         return Scene(
-            function, dt=dt, t_end=t_end, integrator=integrator, tol=tol, fps=fps, speed=speed, picture=picture
-        )
+            function, dt=dt, t_end=t_end, integrator=integrator, tol=tol, fps=fps, speed=speed, picture=picture,
+            reference=reference, field=field,
+        )  # fmt: skip
 
     return decorate
 
@@ -212,6 +229,30 @@ def find(name: str) -> Scene[Any]:
     if not isinstance(found, Scene):
         raise ModelError(f"module warpfea.scenes.{name} does not define the scene {name!r}")
     return found
+
+
+def split_name(what: str) -> tuple[str | None, str]:
+    """File and scene of NAME, file.py or file.py:NAME; None where there is no file, "" where there is no name."""
+    file, colon, name = what.rpartition(":")
+    if colon and file.endswith(".py"):
+        return file, name
+    return (what, "") if what.endswith(".py") else (None, what)
+
+
+def locate(what: str) -> Scene[Any]:
+    """The scene NAME, file.py or file.py:NAME. ModelError lists what there is."""
+    file, name = split_name(what)
+    if file is None:
+        return find(name)
+    # absolute: Python knows the file's code by that path, and so its lines are found
+    found = load_file(pathlib.Path(file).absolute())
+    if not name:
+        if len(found) > 1:
+            raise ModelError(f"{file} holds several scenes, give {file}:NAME with one of {', '.join(found)}")
+        return next(iter(found.values()))
+    if name not in found:
+        raise ModelError(f"{file} has no scene {name!r}; it has {', '.join(found)}{did_you_mean(name, found)}")
+    return found[name]
 
 
 _loaded = itertools.count()

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import pathlib
 import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
+from .accuracy import SCENE, add_accuracy
 from .arguments import Once, Parser, add_general, call, count, counts, positive
 
-__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "check_study"]
+__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "with_scene"]
 
 PROFILE_EXAMPLES = """\
 examples:
@@ -153,13 +155,16 @@ def add_study(commands: Any) -> None:
 
     to = commands.add_parser(
         "study",
-        help="repeat the measurements behind the tables: accuracy, agreement, cost",
-        description="Repeat a measurement: its rows are printed, and written with --out. The committed results lie in "
+        help="error against run time of a scene; the measurements behind the tables",
+        description="Measure error against run time of a scene or a file of your own (warpfea study SCENE --help), or "
+        "repeat a measurement: its rows are printed, and written with --out. The committed results lie in "
         "tests/results.",
-        epilog="examples:\n  warpfea study ancf-tets --quick\n  warpfea study joints --help\n"
+        epilog="examples:\n  warpfea study cantilever --over dt=1e-2,5e-3 --methods backward_euler,bdf2 --target 1e-2\n"
+        "  warpfea study my_scene.py --help\n  warpfea study ancf-tets --quick\n  warpfea study joints --help\n"
         "  warpfea study mechanisms --only free_fall --out mechanisms.json",
     )
     names = to.add_subparsers(title="studies", metavar="STUDY", dest="study", required=True, parser_class=Parser)
+    add_accuracy(names)
     for entry in STUDIES.values():
         lines = ["parts:", *_columns(entry.parts), ""] if entry.parts else []
         lines += [f"takes {entry.takes} on two cores", "", "example:"]
@@ -202,13 +207,25 @@ def add_stress(commands: Any) -> None:
     to.set_defaults(command=call("stress", "stress"))
 
 
-def check_study(words: Sequence[str]) -> None:
-    """Refuse a study that is not there, scenes among them, in words of our own. UsageError."""
+def with_scene(words: Sequence[str]) -> list[str]:
+    """The words of `warpfea study NAME` with what says that NAME is a scene, where it is no study.
+
+    Raises:
+        UsageError: NAME is neither a study, a scene nor a file; in words of our own.
+    """
+    from ..builder.scene import names
+    from ..studies.accuracy.problems import problem_names
     from ..studies.registry import STUDIES
 
-    if len(words) > 1 and words[0] == "study" and not words[1].startswith("-") and words[1] not in STUDIES:
-        hint = did_you_mean(words[1], STUDIES)
-        raise UsageError(f"study {words[1]!r} is not part of this version; there are {', '.join(STUDIES)}{hint}")
+    if len(words) < 2 or words[0] != "study" or words[1].startswith("-") or words[1] in (*STUDIES, SCENE):
+        return list(words)
+    scenes = [*names(), *problem_names()]
+    if not pathlib.Path(words[1]).suffix and words[1] not in scenes:
+        raise UsageError(
+            f"study {words[1]!r} is neither a study ({', '.join(STUDIES)}) nor a scene ({', '.join(scenes)}) nor a "
+            f"file{did_you_mean(words[1], [*STUDIES, *scenes])}"
+        )
+    return [words[0], SCENE, *words[1:]]
 
 
 def _columns(rows: Sequence[tuple[str, str]]) -> list[str]:

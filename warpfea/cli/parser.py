@@ -9,8 +9,9 @@ from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
+from ..solvers import SOLVERS
 from .arguments import Once, Parser, add_general, call, color_range, count, load_steps, pair, positive, size, vector
-from .measuring import add_bench, add_profile, add_stress, add_study, check_study
+from .measuring import add_bench, add_profile, add_stress, add_study, with_scene
 
 __all__ = ["parse"]
 
@@ -84,8 +85,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     add_profile(commands, _add_model)
     if words and words[0] in LATER:
         raise UsageError(f"{words[0]}: {LATER[words[0]]} is not part of this version")
-    check_study(words)
-    arguments, rest = top.parse_known_args(_join_negative(words))
+    arguments, rest = top.parse_known_args(_join_negative(with_scene(words)))
     if rest:
         known = commands.choices[words[0]]._option_string_actions if words[0] in commands.choices else ()
         hint = did_you_mean(rest[0].partition("=")[0], known) if rest[0].startswith("-") else ""
@@ -134,12 +134,17 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     how.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
     how.add_argument("--dt", type=positive, metavar="S", help="step, s")
-    how.add_argument("--integrator", metavar="NAME", help="backward_euler, bdf2 or energy_momentum")
+    how.add_argument(
+        "--integrator",
+        metavar="NAME",
+        help="backward_euler, bdf2, energy_momentum or generalized_alpha, also with its option: "
+        "generalized_alpha(rho_inf=0.5)",
+    )
     how.add_argument(
         "--solver",
-        choices=("newton-pcg", "jacobi"),
+        choices=tuple(SOLVERS),
         default="newton-pcg",
-        help="of a step, by default newton-pcg; jacobi: few cheap iterations, what is left is told",
+        help="of a step, by default newton-pcg; jacobi: few cheap iterations, what is left is told; direct: SuperLU",
     )
     how.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
     how.add_argument(

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import argparse
 import pathlib
-import traceback
 from dataclasses import dataclass
 from typing import Any
 
 from ..base.console import compile_bar
-from ..base.errors import Error, ModelError, UsageError
-from ..base.names import did_you_mean
-from ..builder.scene import Scene, find, load_file
+from ..base.errors import UsageError
+from ..builder.scene import Scene, load_file, locate, split_name
 from ..mesh import FORMATS
 from ..model.model import Model
+from ..simulation.methods import method
 from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
+from ..studies.accuracy.problems import find_problem, problem_names
 from .arguments import existing
 from .part import OPTIONS, part_scene
 
@@ -54,17 +54,8 @@ class Source:
     stabilise: bool = False
 
     def model(self) -> Model:
-        """Call the scene and finalize; an error of the scene's own code is a ModelError with file and line."""
-        try:
-            builder = self.scene.build(self.values)
-        except (Error, NotImplementedError):
-            raise
-        except Exception as error:
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            raise ModelError(
-                f"scene {self.scene.name!r}: {type(error).__name__}: {error} ({last.filename}:{last.lineno})"
-            ) from error
-        return builder.finalize(device=self.device, dtype=self.dtype)
+        """Call the scene and finalize."""
+        return self.scene.build(self.values).finalize(device=self.device, dtype=self.dtype)
 
     def simulation(self, model: Model, show: bool | None) -> Simulation:
         """The simulation, or with load steps that of statics; shows a bar while kernels compile."""
@@ -83,7 +74,7 @@ class Source:
             return Simulation(
                 model,
                 dt=self.dt,
-                integrator=self.integrator,
+                integrator=method(self.integrator),
                 solver=solver,
                 inversion=self.inversion,
                 on_compile=bar,
@@ -107,21 +98,15 @@ def load(file: str) -> dict[str, Scene[Any]]:
 
 
 def find_scene(what: str) -> Scene[Any]:
-    """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
-    file, colon, name = what.rpartition(":")
-    if not (colon and file.endswith(".py")):
-        file, name = what, ""
-    if not file.endswith(".py"):
+    """The scene NAME, of studies too, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
+    if what in problem_names():
+        return find_problem(what)
+    file, _ = split_name(what)
+    if file is None:
         _check_suffix(what)
-        return find(what)
-    found = load(file)
-    if not name:
-        if len(found) > 1:
-            raise UsageError(f"{file} holds several scenes, give {file}:NAME with one of {', '.join(found)}")
-        return next(iter(found.values()))
-    if name not in found:
-        raise UsageError(f"{file} has no scene {name!r}; it has {', '.join(found)}{did_you_mean(name, found)}")
-    return found[name]
+    else:
+        existing(file)
+    return locate(what)
 
 
 def _check_suffix(what: str) -> None:

@@ -1,14 +1,17 @@
-"""`warpfea study`: the studies of the registry."""
+"""`warpfea study`: the studies of the registry, and those of scenes."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 
+from ..studies.accuracy.settings import parse_over
+from ..studies.accuracy.study import study as measure
 from ..studies.registry import STUDIES
-from . import DONE
+from . import DONE, NOT_CONVERGED
+from .source import find_scene, progress
 
-__all__ = ["study"]
+__all__ = ["accuracy", "study"]
 
 
 def study(options: argparse.Namespace) -> int:
@@ -16,3 +19,40 @@ def study(options: argparse.Namespace) -> int:
     with contextlib.redirect_stdout(None) if options.quiet else contextlib.nullcontext():
         STUDIES[options.study].run(options)
     return DONE
+
+
+def accuracy(options: argparse.Namespace) -> int:
+    """Do `warpfea study SCENE`: 3 where nothing reaches the target."""
+    scene = find_scene(options.what)
+    texts = list(options.over)
+    texts += [f"method={options.methods}"] if options.methods else []
+    texts += [f"error={options.error}"] if options.error else []
+    finer = {name: values[0] for name, values in parse_over(scene, options.finer, "--finer").items()}
+    result = measure(
+        scene,
+        over=parse_over(scene, texts),
+        parameters=scene.parse(options.set),
+        dt=options.dt,
+        t_end=options.t_end,
+        solver=options.solver,
+        tol=options.tol,
+        dtype=options.dtype,
+        device=options.device,
+        probes=options.probe,
+        reference=options.reference,
+        finer=finer,
+        mesh=options.mesh,
+        measure=options.measure,
+        target=options.target,
+        split=options.split,
+        repeat=options.repeat,
+        limit=options.limit,
+        out=options.out,
+        name=options.name,
+        progress=progress(options),
+        what=options.what,
+        words=options.words,
+    )
+    if not options.quiet:
+        print(result.table(), flush=True)
+    return NOT_CONVERGED if options.target is not None and result.answer is None else DONE

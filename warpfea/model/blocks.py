@@ -19,7 +19,7 @@ from ..kernels.elements.tied_block import tied_struct
 from ..kernels.elements.with_mass import with_mass_kernel
 from . import assembly
 
-__all__ = ["Block", "build_block", "shear_block"]
+__all__ = ["Block", "build_block", "output_block"]
 
 
 @dataclass(eq=False)
@@ -37,7 +37,7 @@ class Block:
     element_offset: int
     cluster: int
     field_rule: Any = None
-    shear: Any = None
+    output: Any = None
 
     @property
     def connectivity(self) -> np.ndarray:
@@ -110,11 +110,10 @@ def build_block(
     return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element, cluster)
 
 
-def shear_block(model: Any, block: Block) -> Block:
-    """Elements of a tied block with their shears at points, for output."""
-    name = "shear stress"
-    key = replace(block.key, scheme=name, part=0, law="orthotropic", framed=True)
-    (part,) = key.output_scheme(name) or ()
+def output_block(model: Any, block: Block, scheme: str) -> Block:
+    """Elements of a tied block with their strains at the points of an output scheme."""
+    key = replace(block.key, scheme=scheme, part=0, law="orthotropic", framed=True)
+    part = key.integral
     assert part.law is not None
     parts, rows = [], []
     for host in block.parts:
@@ -133,7 +132,7 @@ def shear_block(model: Any, block: Block) -> Block:
 
 
 def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
-    """Tables of elements with tied shears."""
+    """Tables of elements with tied strains."""
     T, vec3 = model.types.T, model.types.vec3
     tables = [
         assembly.tied_tables(part, members)

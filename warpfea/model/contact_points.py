@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,15 @@ from . import assembly
 from .discretisation import Discretisation
 from .handles import SurfaceSet
 
-__all__ = ["ContactPoints", "body_mass_total", "check_points", "contact_points", "effective_modulus"]
+__all__ = [
+    "RULES",
+    "ContactPoints",
+    "body_mass_total",
+    "check_points",
+    "contact_points",
+    "effective_modulus",
+    "lagrange_basis",
+]
 
 RULES: Mapping[int, Mapping[int, Rule]] = {
     3: {3: triangle_3(), 7: triangle_7()},
@@ -74,6 +83,30 @@ def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoi
     length = np.linalg.norm(cross, axis=2, keepdims=True)
     normal = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0)
     return ContactPoints(t.conn, t.shape, area, X, normal, surface.faces)
+
+
+def lagrange_basis(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lagrange's polynomials of the points of a rule in `RULES`, which two faces share on a common edge.
+
+    Returns:
+        Coefficients (P, M), and the exponents (M, 2) of the monomials; of 7 points all of degree 2 and the bubble
+        ab - a^2 b - a b^2.
+    """
+    side = math.isqrt(len(points))
+    if len(points) == 3:
+        power = [(0, 0), (1, 0), (0, 1)]
+    elif len(points) == 7:
+        power = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (2, 1), (1, 2)]
+    else:
+        power = [(j, k) for j in range(side) for k in range(side)]
+    exponents = np.array(power)
+    values = np.prod(points[:, None, :] ** exponents, axis=2)
+    if len(points) != 7:
+        return np.linalg.inv(values).T, exponents
+    functions = np.eye(8)[:7]
+    functions[6] = 0.0
+    functions[6, [4, 6, 7]] = 1.0, -1.0, -1.0
+    return np.linalg.solve((values @ functions.T).T, functions), exponents
 
 
 def check_points(surface: SurfaceSet, points: Any) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from ..base.errors import ModelError
@@ -12,8 +14,12 @@ from .newton import NewtonLoop, NewtonPCG
 
 __all__ = ["SOLVERS", "Jacobi", "NewtonPCG", "get", "make_loop"]
 
-SOLVERS: dict[str, type[NewtonPCG] | type[Jacobi]] = {"newton-pcg": NewtonPCG, "jacobi": Jacobi}
-"""Solvers by name."""
+SOLVERS: dict[str, Callable[..., NewtonPCG | Jacobi]] = {
+    "newton-pcg": NewtonPCG,
+    "jacobi": Jacobi,
+    "direct": partial(NewtonPCG, linear="direct"),
+}
+"""Solvers by name: what makes their options."""
 
 
 def get(solver: Any) -> NewtonPCG | Jacobi:

@@ -213,9 +213,14 @@ class Residual:
     @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
         """q, forces, g and all sums at the iterate v; `hold`: Phi holds the non-potential forces of this iterate."""
-        m, w, launch = self.model, self.work, self.launch
-        launch(self.newton.reset_min_J, m.worlds, [w.newton, active])
+        w, launch = self.work, self.launch
+        launch(self.newton.reset_min_J, self.model.worlds, [w.newton, active])
         self.place(active)
+        self.balance(active, hold=hold)
+
+    def balance(self, active: wp.array, *, hold: bool = False) -> None:
+        """Forces, g and all sums at work.u and work.v."""
+        m, w, launch = self.model, self.work, self.launch
         for term in self.terms:
             term.force(self.at, active)
         if self.terms.traits.nonpotential:

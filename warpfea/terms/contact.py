@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError, PenetrationError
-from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
 from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
@@ -18,6 +17,7 @@ from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, h
 from ..model.state import State
 from .contact_fields import contact_field, nodal_force
 from .contact_parameters import contact_parameters
+from .contact_places import Places, at_points
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
 from .time_laws import TimeLaws
@@ -58,6 +58,7 @@ class Contact(Term):
         self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
         self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        self.places = Places(self.tables) if self.tables.lumped else None
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -79,30 +80,36 @@ class Contact(Term):
 
     # for one simulation
 
-    def _attempt(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
+    def attempt_of(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
         """The struct of an attempt, with arrays from make(name, shape, dtype)."""
         t, B = self.tables, worlds
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
         shapes: dict[str, tuple[int, ...]] = {
             "through": (B,), "elapsed": (B,), "omega": (B,), "changes": (B,), "asked_size": (B,),
             "asked_sums": (B, RELAX_LANES), "pick": (B, C), "picks": (B, C), "total": (B, C, len(RECORD)),
-            "touched": (B, R),
+            "touched": (B, R), "near": (B, R), "spot": (B, R), "best": (B, R), "moves": (B, C), "middle": (B, C),
+            "weight": (B, C, max(group.conn.shape[1] for group in t.groups)),
             "rows": (len(RECORD), B, R),
         }  # fmt: skip
         shapes |= dict.fromkeys(("place", "turn", "shift", "spin", "angle"), (B, K))
-        shapes |= {} if t.lumped else {"level": (1, 1)}
+        if not t.lumped:
+            shapes |= dict.fromkeys(("level", "near", "spot", "best", "moves", "middle"), (1, 1)) | {
+                "weight": (1, 1, 1)
+            }
         shapes |= {} if t.explicit else dict.fromkeys(("dead", "dead_spring"), (1, 1))
         out = attempt_struct(self.model.dtype)()
         for name, var in attempt_struct(self.model.dtype).vars.items():
             setattr(out, name, make(name, shapes.get(name, (B, P)), var.type.dtype))
         return out
 
-    def _history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+    def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
         """The struct of the history, with arrays from make(name, dtype, shape of a world)."""
         out = history_struct()()
         shapes: dict[str, tuple[int, ...]] = {"born": (), "posed": ()}
         shapes |= dict.fromkeys(("place", "turn", "angle", "grown"), (len(self.tables.colliders),))
         for name, var in history_struct().vars.items():
+            if name == "lead" and not self.tables.moving:
+                continue
             shape = shapes.get(name, (self.tables.points,))
             setattr(out, name, make(f"contact_{name}", var.type.dtype, shape))
         return out
@@ -110,7 +117,7 @@ class Contact(Term):
     def allocate(self, work: Workspace, at: At) -> None:
         t, B = self.tables, self.model.worlds
         C, R = len(t.contacts), t.rows
-        attempt = self._attempt(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
+        attempt = self.attempt_of(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
         attempt.omega.fill_(1.0)
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "part"):
@@ -128,10 +135,10 @@ class Contact(Term):
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
     def register(self, at: At) -> None:
-        at.scratch[self.name] = {"history": self._history(at.state.register)}
+        at.scratch[self.name] = {"history": self.history_of(at.state.register)}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
-        return [self.kernels.module]
+        return [self.kernels.module] + ([self.places.kernels.module] if self.places else [])
 
     def start(self, at: At, active: wp.array) -> None:
         """Colliders at the state's time, and what overlaps there.
@@ -160,7 +167,7 @@ class Contact(Term):
         history.posed.assign(posed)
         history.overlap.assign(overlap)
         history.born.assign(born)
-        gap, _ = self.at_points(state, history)
+        gap, _ = self.at_points(state, history, places=False)
         u = state.displacement.numpy()
         touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
         for k, contact in enumerate(self.tables.contacts):
@@ -177,7 +184,8 @@ class Contact(Term):
                     f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
                     "overlap='offset', which stores the overlap and lets it decay"
                 )
-            overlap[deep, first:last] = np.maximum(depth[deep], 0.0)
+            depth = np.maximum(depth[deep], 0.0)
+            overlap[deep, first:last] = depth.max(axis=1, keepdims=True) if contact.model == "sphere" else depth
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
@@ -232,14 +240,12 @@ class Contact(Term):
 
     def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
         """Choose the point of each lumped contact, at work.u."""
-        if not self.tables.lumped:
+        if not self.places:
             return
-        s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], w.step.new_time, w.u, active, s["attempt"]]
-            at.launch(k.levels, (m.worlds, group.count, group.data.points), args)
-        args = [self.tables.data, active, fresh, s["attempt"], w.newton.new_walls]
-        at.launch(k.pick_deepest, (m.worlds, len(self.tables.contacts)), args)
+        s, w = at.scratch[self.name], at.work
+        state = (at.state.displacement, at.state.velocity)
+        place = self.places.choose
+        place(at.launch, s, w.step.new_time, w.u, state, active, w.newton.new_walls, fresh=fresh)
 
     @part("contact")
     def refresh(self, at: At, flags: wp.array) -> None:
@@ -309,7 +315,8 @@ class Contact(Term):
     # in a linear solve
 
     def keep(self, at: At) -> list[tuple[str, wp.array]]:
-        return [("stiffness", at.scratch[self.name]["attempt"].stiffness)]
+        attempt = at.scratch[self.name]["attempt"]
+        return [("stiffness", attempt.stiffness)] + ([("weight", attempt.weight)] if self.tables.moving else [])
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
         if "contact blocks" not in self.model.cache:
@@ -338,8 +345,9 @@ class Contact(Term):
         """The points' stiffness, which is positive."""
         m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
-            args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0], dq_dv, active, out]
-            at.launch(kernel, (m.worlds, count), args)
+            args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0]]
+            weight = kept[1] if self.tables.moving else at.scratch[self.name]["attempt"].weight
+            at.launch(kernel, (m.worlds, count), [*args, weight, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:
         return {contact_block_kernels(self.model.dtype).module}
@@ -410,41 +418,7 @@ class Contact(Term):
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         return contact_field(self.tables, field, body, state.worlds, lambda: self.at_points(state))
 
-    def at_points(self, state: State, history: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state."""
-        m, t, B = self.model, self.tables, state.worlds
-        launch, laws = Launcher(m.device), m.terms.laws
-        K, P, C = len(t.colliders), t.points, len(t.contacts)
-
-        def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=m.device)
-
-        every = wp.ones(B, dtype=wp.int32, device=m.device)
-        value = zeros((B, max(laws.count, 1)), wp.vec3d)
-        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
-        if history is None:
-
-            def take(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
-                return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
-
-            history = self._history(take)
-        attempt = self._attempt(B, lambda _, shape, dtype: zeros(shape, dtype))
-        attempt.speed.fill_(1.0)
-        if "contact_place" in state.specs:  # statics puts its time back to 0
-            attempt.place, attempt.turn = history.place, history.turn
-        else:
-            launch(self.kernels.poses, (B, K), [t.data, history, value, every, attempt])
-            attempt.shift.zero_()
-            attempt.spin.zero_()
-        gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
-        for group in t.groups:
-            dim = (B, group.count, group.data.points)
-            launch(self.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
-            args = [t.data, group.data, history, state.time, state.displacement, every, attempt]
-            launch(self.kernels.levels, dim, args)
-        launch(self.kernels.pick_deepest, (B, C), [t.data, every, 1, attempt, zeros((B,), wp.int32)])
-        for group in t.groups:
-            dim = (B, group.count, group.data.points)
-            args = [t.data, group.data, history, state.displacement, state.time, attempt, gap, force]
-            launch(self.books.at_points, dim, args)
-        return gap.numpy(), force.numpy()
+    def at_points(self, state: State, history: Any = None, *, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; with `places`
+        the gap of a lumped contact's deepest place is that of the point next to it."""
+        return at_points(self, state, history, places)

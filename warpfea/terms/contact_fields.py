@@ -49,7 +49,8 @@ def _normal_force(t: ContactTables, k: int, gap: np.ndarray, force: np.ndarray) 
     share = t.shares[k].ravel()
     depth = np.where(share > 0.0, -gap, 0.0)
     if contact.model == "sphere":
-        return np.where(force.any(axis=2), stiffness * np.maximum(depth, 0.0) ** 1.5, 0.0)
+        deepest = np.arange(depth.shape[1]) == depth.argmax(axis=1)[:, None]
+        return np.where(deepest & force.any(axis=2), stiffness * np.maximum(depth, 0.0) ** 1.5, 0.0)
     if LAWS[contact.law] == SMOOTH:
         y = stiffness * depth
         return share * 0.5 * (y + np.hypot(y, t.data.force_eps.numpy()[k]))

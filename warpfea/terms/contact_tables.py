@@ -13,7 +13,14 @@ from scipy.optimize import brentq
 from ..base.errors import ModelError
 from ..kernels.terms.contact_data import contact_struct, facet_struct
 from ..kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH
-from ..model.contact_points import ContactPoints, body_mass_total, contact_points, effective_modulus
+from ..model.contact_points import (
+    RULES,
+    ContactPoints,
+    body_mass_total,
+    contact_points,
+    effective_modulus,
+    lagrange_basis,
+)
 from ..model.contacts import Collider, Contact
 from .time_laws import TimeLaws
 
@@ -27,6 +34,8 @@ SMOOTHING = (1e-3, 1e-4)
 """Of the smooth law where none is given: eps, N, and v_eps, m/s."""
 PER_WORLD = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
 """What Model.set_parameter sets of a contact, and the arrays with it; the restitution is in `beta` too."""
+PATCH, LUMPED, MOVING = range(3)
+"""What acts on a facet: all of its points, at most one of them, at most one place of it."""
 CONSTANT = 2.0 * math.sqrt(5.0 / 6.0)
 
 
@@ -67,10 +76,12 @@ class FacetGroup:
         conn: (F, L) slots of the model.
         points: (F, P) numbers of the points.
         data: the device struct.
+        lumped: whether at most one of its places acts.
     """
 
     conn: np.ndarray
     data: Any
+    lumped: bool
 
     @property
     def count(self) -> int:
@@ -93,8 +104,8 @@ class ContactTables:
         self.model = model
         self.colliders: list[Collider] = list(model.description.colliders)
         found = [(contact, contact_points(contact.surface, contact.points)) for contact in model.description.contacts]
-        kinds = sorted({(p.conn.shape[1], p.area.shape[1]) for _, p in found})
-        order = sorted(range(len(found)), key=lambda k: (kinds.index(_kind(found[k][1])), k))
+        kinds = sorted({_kind(contact, p) for contact, p in found})
+        order = sorted(range(len(found)), key=lambda k: (kinds.index(_kind(*found[k])), k))
         self.contacts: list[Contact] = [found[k][0] for k in order]
         self.host: list[ContactPoints] = [found[k][1] for k in order]
         self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
@@ -109,6 +120,11 @@ class ContactTables:
     def lumped(self) -> bool:
         """Whether a contact acts at its deepest point alone."""
         return any(contact.model == "sphere" for contact in self.contacts)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a contact acts at its deepest place, wherever that is on its facets."""
+        return any(group.data.moving for group in self.groups)
 
     @property
     def explicit(self) -> bool:
@@ -145,7 +161,7 @@ class ContactTables:
         first = np.zeros(len(self.contacts) + 1, dtype=np.int64)
         self.row_start = np.zeros(len(self.contacts) + 1, dtype=np.int64)
         for kind in self.kinds:
-            chosen = [k for k, p in enumerate(self.host) if _kind(p) == kind]
+            chosen = [k for k, pair in enumerate(zip(self.contacts, self.host)) if _kind(*pair) == kind]
             for k in chosen:
                 first[k + 1] = first[k] + self.host[k].area.size
                 self.row_start[k + 1] = self.row_start[k] + len(self.host[k].conn)
@@ -175,7 +191,15 @@ class ContactTables:
         put("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
         data.pool, data.row, data.point = pool, self.rows, self.points
         data.count, data.points = len(conn), parts[0].area.shape[1]
-        return FacetGroup(conn, data)
+        kind = _kind(self.contacts[chosen[0]], parts[0])[2]
+        data.moving, data.corners = int(kind == MOVING), 3 if data.points in RULES[3] else 4
+        if kind != PATCH:
+            points = RULES[data.corners][data.points].points
+            basis, power = lagrange_basis(points)
+            put("coords", points, wp.vec2d)
+            put("basis", basis, wp.float64)
+            put("power", power, wp.vec2i)
+        return FacetGroup(conn, data, kind != PATCH)
 
     def _contacts(self, laws: TimeLaws) -> Any:
         m, C, K = self.model, self.contacts, self.colliders
@@ -232,8 +256,10 @@ class ContactTables:
             h.update(getattr(self.data, name).numpy().tobytes())
 
 
-def _kind(p: ContactPoints) -> tuple[int, int]:
-    return p.conn.shape[1], p.area.shape[1]
+def _kind(contact: Contact, p: ContactPoints) -> tuple[int, int, int]:
+    """Slots and points of a facet, and what acts: PATCH, LUMPED or MOVING."""
+    lumped = LUMPED if contact.treatment == "explicit" else MOVING
+    return p.conn.shape[1], p.area.shape[1], PATCH if contact.model == "patch" else lumped
 
 
 def law_numbers(contact: Contact) -> dict[str, float]:

@@ -56,7 +56,8 @@ class Damping(Term):
             return set()
         out = {b.kernels.viscous_force.module for b in self.model.blocks if b.key.damping == "explicit"}
         if not at.midpoint:  # it has the strains of both ends at hand
-            out |= {b.kernels.strain_history.module for b in self.model.blocks if b.key.damping == "incremental"}
+            name = "moving_history" if at.accelerated else "strain_history"
+            out |= {getattr(b.kernels, name).module for b in self.model.blocks if b.key.damping == "incremental"}
         return out | ({self.kernels.add_explicit.module} if self.explicit else set())
 
     @part("loads")
@@ -69,7 +70,10 @@ class Damping(Term):
             w.contribution.zero_()  # the gather below sums the entries of all blocks
         for block in m.blocks:
             dim = (m.worlds, block.count)
-            if block.key.damping == "incremental" and not at.midpoint:
+            if block.key.damping == "incremental" and at.accelerated:
+                args = [block.data, state.displacement, state.velocity, at.u_before, w.step.b, w.step.q_a, active]
+                launch(block.kernels.moving_history, dim, [*args, w.history])
+            elif block.key.damping == "incremental" and not at.midpoint:
                 args = [block.data, state.displacement, at.u_before, w.step.a0, w.step.a1, active, w.history]
                 launch(block.kernels.strain_history, dim, args)
             elif block.key.damping == "explicit":

@@ -49,9 +49,11 @@ class At:
 
     Attributes:
         model, work, launch, state: of the simulation.
-        u_before: [world, slot] displacements of the step before the last, of multistep schemes.
+        u_before: [world, slot] displacements of the step before the last, of multistep schemes; the algorithmic
+            accelerations of schemes that keep them.
         inertia: the step is dynamic; in statics there are no rates.
         midpoint: forces are those of the middle of a step, at work.u_stage and work.stage_time.
+        accelerated: the scheme keeps accelerations.
         options: of the solver.
         scratch: what terms allocated, by their names.
     """
@@ -63,6 +65,7 @@ class At:
     u_before: wp.array
     inertia: bool
     midpoint: bool = False
+    accelerated: bool = False
     options: Any = None
     scratch: dict[str, Any] = field(default_factory=dict)
 

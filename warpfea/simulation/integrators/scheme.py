@@ -19,6 +19,7 @@ class Integrator:
         multistep: keeps the state before the last, q_{n-1} and v_{n-1}.
         takes_velocity: q~ takes v_n.
         midpoint: forces are those of the middle of the step, and conserve energy and momenta.
+        accelerated: keeps accelerations, algorithmic ones a_n and those of the equilibrium w_n, and so needs a start.
         static: no inertia; v is the displacement increment of a load step.
         parameter: the number that `coefficients` gets, such as a spectral radius.
         stabilise: N/m per kg, of statics: springs from the last equilibrium to the next, fading with the load.
@@ -30,13 +31,27 @@ class Integrator:
     multistep: bool = False
     takes_velocity: bool = False
     midpoint: bool = False
+    accelerated: bool = False
     static: bool = False
     # kernels don't depend on these
     parameter: float = field(default=0.0, compare=False)
     stabilise: float = field(default=0.0, compare=False)
 
     @property
+    def label(self) -> str:
+        """Its name with the options that results depend on, as users may give it."""
+        return self.name
+
+    @property
+    def kept(self) -> tuple[str, str]:
+        """Arrays of the state beside q_n and v_n that it takes: those of the step before, or accelerations."""
+        if self.accelerated:
+            return "algorithmic_acceleration", "acceleration"
+        return ("previous_displacement", "previous_velocity") if self.multistep else ("displacement", "velocity")
+
+    @property
     def variant(self) -> str:
         """Name of its kernels."""
-        flags = [name for name in ("multistep", "takes_velocity", "midpoint", "static") if getattr(self, name)]
+        flags = ("multistep", "takes_velocity", "midpoint", "accelerated", "static")
+        flags = [name for name in flags if getattr(self, name)]
         return "_".join([self.coefficients.key, *flags])

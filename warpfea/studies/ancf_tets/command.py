@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 
 from ...base.console import quiet_warp
+from ..files import prepare
 from ..plots import require_matplotlib
 from .comparison import ancf_tets
-from .report import prepare
 
 __all__ = ["run"]
 

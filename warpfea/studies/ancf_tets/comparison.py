@@ -9,7 +9,7 @@ import math
 import statistics
 import time as clock
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from ...model.model import Model
 from ...simulation.simulation import Simulation
 from ...simulation.statics import solve_static
 from ...solvers import NewtonPCG
+from ..timing import NOT_REPEATED, repeated
 from . import problems as bars
 from .problems import (
     ELEMENTS,
@@ -41,7 +42,6 @@ QUICK_STEPS = 10
 TOL = {"rigid": 1e-6, "large": 1e-7, "sudden": 1e-6}
 DYNAMIC_UP_TO, QUICK_DYNAMIC_UP_TO = 1500, 500  # wanted unknowns
 START = np.array([LENGTH, 0.5 * bars.SIDE, 0.5 * bars.SIDE])  # m, of the tip
-LONG = 2.0  # s; a run longer than this is not repeated
 REFERENCE = "H3843"  # it comes closest, and is none of the tetrahedra
 ASSUMED_ORDER = 3.5  # where three meshes do not tell
 
@@ -81,30 +81,25 @@ class Runner:
         self.notify(f"{problem} {element} {'x'.join(map(str, cells_of(level)))}")
         began = clock.perf_counter()
         model = build(problem, element, level).finalize(device=self.device)
-        times: list[float] = []
-        while True:
-            tip, sim, seconds = self._once(problem, model)
-            if not times:
-                setup = clock.perf_counter() - began - seconds
-            times.append(seconds)
-            if len(times) >= self.repeat or seconds > LONG:
-                break
-        newton, pcg = int(sim.totals["newton"][0]), int(sim.totals["pcg"][0])
-        return Run(tip, model, statistics.median(times), len(times), setup, newton, pcg)
+        made = clock.perf_counter() - began
+        runs = repeated(lambda: self._once(problem, model), lambda run: run.seconds, self.repeat)
+        first, median = runs[0], statistics.median(run.seconds for run in runs)
+        return replace(first, seconds=median, repeats=len(runs), setup_s=made + first.setup_s)
 
-    def _once(self, problem: str, model: Model) -> tuple[np.ndarray, Simulation, float]:
-        """Tip, the simulation, and its seconds without set-up."""
+    def _once(self, problem: str, model: Model) -> Run:
         solver = NewtonPCG(tol=TOL[problem], max_pcg=20000, max_newton=50)
         began = clock.perf_counter()
         if problem == "large":
             static = solve_static(model, load_steps=1, solver=solver)
-            seconds = clock.perf_counter() - began - static.simulation.compile_s
-            return static.probe("tip").displacement[0, -1:], static.simulation, seconds
-        sim = Simulation(model, dt=DT[problem], integrator="bdf2", solver=solver, ledger=False)
-        began = clock.perf_counter()
-        sim.step(self.steps[problem])
-        seconds = clock.perf_counter() - began
-        return sim.probe("tip").displacement[0], sim, seconds
+            whole, sim = clock.perf_counter() - began, static.simulation
+            setup, tip = sim.compile_s, static.probe("tip").displacement[0, -1:]
+        else:
+            sim = Simulation(model, dt=DT[problem], integrator="bdf2", solver=solver, ledger=False)
+            setup = clock.perf_counter() - began
+            sim.step(self.steps[problem])
+            whole, tip = clock.perf_counter() - began, sim.probe("tip").displacement[0]
+        newton, pcg = int(sim.totals["newton"][0]), int(sim.totals["pcg"][0])
+        return Run(tip, model, whole - setup, 1, setup, newton, pcg)
 
 
 def ancf_tets(
@@ -259,7 +254,7 @@ def _settings(sizes: Sequence[int], run: Runner, quick: bool) -> dict[str, Any]:
         "dynamic_up_to": QUICK_DYNAMIC_UP_TO if quick else DYNAMIC_UP_TO,
         "quick": quick,
         "repeat": run.repeat,
-        "not_repeated_beyond_s": LONG,
+        "not_repeated_beyond_s": NOT_REPEATED,
         "bar": [LENGTH, bars.SIDE, bars.SIDE],
         "nu": bars.NU,
         "density": bars.DENSITY,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import pathlib
 from collections.abc import Sequence
@@ -13,7 +12,8 @@ import numpy as np
 
 from ...base.console import plain, write_json
 from ...base.provenance import origin
-from ...base.writer import check_folder, write_whole
+from ...base.writer import write_whole
+from ..files import prepare, write_csv
 
 __all__ = ["Row", "Study"]
 
@@ -128,27 +128,9 @@ class Study:
         out = prepare(folder)
         paths = [out / f"{self.name}.{suffix}" for suffix in ("json", "csv", "png")]
         write_json(str(paths[0]), self.content(words, device))
-        write_whole(paths[1], self._write_csv)
+        write_csv(paths[1], [f.name for f in fields(Row)], [asdict(row) for row in self.rows])
         write_whole(paths[2], lambda path: draw(self, path))
         return paths
-
-    def _write_csv(self, path: pathlib.Path) -> None:
-        with open(path, "w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow([f.name for f in fields(Row)])
-            for row in self.rows:
-                values = [" ".join(map(repr, v)) if isinstance(v, tuple) else v for v in asdict(row).values()]
-                writer.writerow(["" if v is None else v for v in values])
-
-
-def prepare(folder: str | pathlib.Path) -> pathlib.Path:
-    """Make the folder if it is not there. OutputError for one that can't be written."""
-    path = pathlib.Path(folder)
-    if not path.exists():
-        check_folder(path.absolute().parent, path)
-        path.mkdir()
-    check_folder(path, path)
-    return path
 
 
 COLUMNS = {

@@ -18,7 +18,7 @@ LINKS = (0.5, 0.5)
 WIDTH = 0.05
 
 
-def double_pendulum_links(device, *, kind, E, dt, angle):
+def double_pendulum_links(*, kind: str, E: float, angle: float) -> wf.ModelBuilder:
     """Two links 0.5 x 0.05 x 0.05 m with revolute joints in the middle of their end faces, at rest at `angle`."""
     b = wf.ModelBuilder()
     law = wf.SVK(E=E, nu=0.3, density=STEEL)
@@ -42,7 +42,7 @@ def double_pendulum_links(device, *, kind, E, dt, angle):
         b.add_joint("revolute", parent=above, child=top, axis=-Y)
         b.add_probe(("elbow", "tip")[k], low)
         at, above = at + length * along, low
-    return wf.Simulation(b.finalize(device=device), dt=dt, integrator="bdf2")
+    return b
 
 
 def double_pendulum(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
@@ -58,7 +58,8 @@ def double_pendulum(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
     mass = [STEEL * WIDTH**2 * length for length in LINKS]
     inertia = [m * (length**2 + WIDTH**2) / 12.0 for m, length in zip(mass, LINKS)]
     for series, kind, E, dt, angle in [("quick", "3243", 2e11, 1e-3, low)] if quick else cases:
-        sim = double_pendulum_links(device, kind=kind, E=E, dt=dt, angle=angle)
+        model = double_pendulum_links(kind=kind, E=E, angle=angle).finalize(device=device)
+        sim = wf.Simulation(model, dt=dt, integrator="bdf2")
         seconds = timed(sim, round((0.5 if quick else 2.0) / dt))
         times = np.concatenate([[0.0], sim.probe("tip").time])
         angles, _ = double_pendulum_motion(times, masses=mass, lengths=LINKS, centers=[length / 2 for length in LINKS],

@@ -1,0 +1,23 @@
+"""Code that a user wrote: what goes wrong there is told with its file and line."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from .errors import Error, ModelError
+
+__all__ = ["user_code"]
+
+
+@contextmanager
+def user_code(what: str) -> Iterator[None]:
+    """Turn an error of the code within into a ModelError about `what`; those of warpfea pass."""
+    try:
+        yield
+    except (Error, NotImplementedError):
+        raise
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        raise ModelError(f"{what}: {type(error).__name__}: {error} ({last.filename}:{last.lineno})") from error

@@ -1,0 +1,86 @@
+"""The options of `warpfea study SCENE`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .arguments import Once, add_general, call, count, positive
+
+__all__ = ["SCENE", "add_accuracy"]
+
+SCENE = "SCENE"
+"""The word of the command line in place of a study's name; put in before the name of a scene."""
+
+EXAMPLES = """\
+examples:
+  warpfea study cantilever --over dt=1e-2,5e-3,2.5e-3 --methods backward_euler,bdf2 --out results
+  warpfea study cantilever --over cells=4,8,16 --over element=T4,T10 --target 1e-3
+  warpfea study pendulum --over dt=5e-3,2.5e-3 --over dtype=float64,float32 --over tol=1e-4,1e-6,1e-8
+  warpfea study my_scene.py --over solver=newton-pcg,jacobi,direct --over device=cpu,cuda:0 --repeat 5
+  warpfea study my_scene.py:swing --over dt=1e-3,5e-4 --reference tip.csv --probe tip
+
+what is swept:
+  --over NAME=V1,V2,... for dt, tol, solver, dtype, device, and every parameter of the scene; --methods for integrators;
+  --error for steps that adapt. All combinations are run. Parameters that are whole numbers named cells, elements or
+  across refine the mesh (--mesh names others); names and switches, such as an element, are choices for the same
+  problem; other parameters change the problem, and each of their values has its own reference. 6x2x1 is a tuple.
+
+what errors are measured against, by the first of these that is there:
+  --reference FILE  .csv with the columns t,x,y,z (and probe), or .json {"t": [...], "probes": {"tip": [[x,y,z], ...]},
+                    "about": "...", "error": metres}
+  the scene's own   @wf.scene(dt=..., t_end=..., reference={"tip": f}) with f(t) -> positions (n, 3) at times t (n,)
+  a finer run       an eighth of the smallest step, twice the finest of a swept mesh (--finer chooses), whose own error
+                    is estimated from coarser ones. --reference run takes it in any case.
+  Errors below ten times that of the reference are marked: "not resolved".
+
+how to read it:
+  Errors are of the probes' positions over their largest travel: the root of the mean square over time (l2), and at the
+  end. energy is the drift of the balance over the largest energy exchanged. "s" is the median time of all steps, with
+  compilation and set-up apart; digits are -log10(error x s); Pareto marks rows that no other beats in both. Parts of
+  the error (space, time, algebra, rounding) are differences to a run that is finer in one of them.
+
+With --out a study that was stopped by Ctrl-C goes on where it was: the same command again runs what is missing.
+exit codes: 0 done, 3 nothing reaches --target or the reference was refused, 2 bad usage, 130 interrupted
+"""
+
+
+def add_accuracy(names: Any) -> None:
+    """The parser of `warpfea study SCENE`."""
+    to = names.add_parser(
+        SCENE,
+        help="error against run time of a scene, or of file.py[:NAME]: any sweep, with orders and a plot",
+        description="Run a scene with every combination of settings, and tell error and run time of each: a table, and "
+        "with --out CSV, JSON and a plot. A file of one's own needs a function decorated with @wf.scene, and a probe.",
+        epilog=EXAMPLES,
+    )
+    to.add_argument("what", metavar=SCENE, help="a scene, file.py or file.py:scene")
+    sweep = to.add_argument_group("the sweep")
+    sweep.add_argument("--over", action="append", default=[], metavar="NAME=V1,V2", help="repeatable")
+    sweep.add_argument("--methods", metavar="NAME,NAME", help="integrators, with options as name(option=value)")
+    sweep.add_argument("--error", metavar="X,X", help="steps that adapt, to each of these errors")
+    fixed = to.add_argument_group("for all runs (defaults are the scene's)")
+    fixed.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the scene")
+    fixed.add_argument("--dt", type=positive, metavar="S", help="step, s, where it is not swept")
+    fixed.add_argument("--t-end", type=positive, metavar="S", help="end time, s")
+    fixed.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
+    fixed.add_argument("--solver", default="newton-pcg", metavar="NAME", help="newton-pcg (default), jacobi, direct")
+    fixed.add_argument("--dtype", default="float64", metavar="NAME", help="float64 (default) or float32")
+    fixed.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
+    judge = to.add_argument_group("errors")
+    judge.add_argument("--probe", action="append", metavar="NAME", help="whose error counts; repeatable (default: all)")
+    judge.add_argument("--reference", metavar="FILE", help="a file of positions, or run for a finer run")
+    judge.add_argument("--finer", action="append", default=[], metavar="NAME=VALUE", help="of the finer run")
+    judge.add_argument("--mesh", action="append", metavar="NAME", help="a parameter that refines the mesh; repeatable")
+    judge.add_argument(
+        "--measure", default="l2", metavar="NAME", help="error that counts: l2 (default), end, energy, field"
+    )
+    judge.add_argument("--target", type=positive, metavar="X", help="name the cheapest setting with at most this error")
+    judge.add_argument(
+        "--split", default="best", metavar="ROWS", help="parts of the error of the best row (default), of all, or none"
+    )
+    to.add_argument("--repeat", type=count, default=3, metavar="N", help="runs for the times (default 3)")
+    to.add_argument("--limit", type=positive, metavar="S", help="s, after which a run is given up")
+    to.add_argument("--out", action=Once, metavar="FOLDER", help="NAME.csv, .json, .png, and what is needed to go on")
+    to.add_argument("--name", metavar="NAME", help="of the files (default: the scene's)")
+    add_general(to, "no bars, no table")
+    to.set_defaults(command=call("study", "accuracy"))

@@ -1,0 +1,6 @@
+"""Error against run time of any scene: `wf.study`, `warpfea study SCENE`."""
+
+from .report import Row, Study
+from .study import study
+
+__all__ = ["Row", "Study", "study"]

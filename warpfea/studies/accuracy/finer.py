@@ -1,0 +1,129 @@
+"""The finer run that errors are measured against where no motion is known, and the estimate of its own error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ...base.console import number
+from ...base.errors import ConvergenceError, ModelError
+from .measure import DONE, REFUSED, Outcome
+from .motion import Motion, distances, observed, run_motion
+from .settings import Axes, Setting, check_steps, order_of
+
+__all__ = ["finer_motion", "finer_setting"]
+
+STEP, MESH, TOL = 8.0, 2, 100.0
+"""By how much finer than the finest run: step, cells along an edge, tolerance."""
+SECOND_ORDER = "bdf2"
+TIGHTEST = 1e-11
+"""Tolerance of the reference at the least; below, rounding decides."""
+DEFAULT_TOL = 1e-8
+LOWEST_TIME, LOWEST_MESH, HIGHEST_MESH = 0.5, 1.0, 6.0
+"""Bounds of the orders that the estimates believe."""
+MEASURES = ("l2", "end", "field")
+
+
+def scaled(value: Any, factor: float) -> Any:
+    """Whole numbers, also in a tuple, times a factor; None where they would not be whole."""
+    if isinstance(value, tuple):
+        parts = tuple(scaled(part, factor) for part in value)
+        return None if None in parts else parts
+    out = value * factor
+    return int(out) if out == int(out) and out >= 1 else None
+
+
+def finer_setting(group: Sequence[Setting], axes: Axes, given: Mapping[str, Any], default_dt: float) -> Setting:
+    """The reference of settings that share a problem: in every swept direction finer than all of them.
+
+    The step is an eighth of the smallest, with a method of order 2; swept meshes are twice as fine as the finest; of
+    swept names (element, integration) the last one counts; float64, and a hundredth of the smallest tolerance. `given`
+    options and parameters go before these.
+    """
+    first = group[0]
+    methods = [first.method, *(s.method for s in group)]
+    steps = [s.dt for s in group if s.dt is not None] or [default_dt]
+    tols = [s.tol for s in group if s.tol is not None and s.dtype == "float64"]
+    changes: dict[str, Any] = {
+        "method": next((m for m in methods if order_of(m) >= 2), SECOND_ORDER),
+        "dt": min(steps) / STEP,
+        "tol": max(TIGHTEST, min([*tols, DEFAULT_TOL]) / TOL),
+        "dtype": "float64",
+        "solver": next((s.solver for s in group if s.solver != "jacobi"), "newton-pcg"),
+    }
+    for name in axes.over:
+        if name in axes.mesh:
+            finest = max((s.values[name] for s in group), key=_size)
+            changes[name] = scaled(finest, MESH)
+        elif name in axes.choices:
+            changes[name] = axes.over[name][-1]
+    return first.changed(changes | dict(given))
+
+
+def _size(value: Any) -> float:
+    return float(sum(value)) if isinstance(value, tuple) else float(value)
+
+
+def finer_motion(
+    setting: Setting, axes: Axes, chosen: Sequence[str] | None, run: Callable[[Setting], Outcome]
+) -> Motion:
+    """Run the reference, and runs that differ from it, for its own error.
+
+    In time: runs with 2 and 4 times its step and 10 and 100 times its tolerance, compared at order
+    p = log2(|u4 - u2| / |u2 - u1|), at most that of the method and at least 0.5: |u2 - u1| / (2^p - 1). In space, where
+    a mesh is swept: the same with a half and a quarter of the cells (p from 1 to 6; with a half alone p = 1). The
+    estimates are added.
+
+    Raises:
+        ConvergenceError: one of them failed.
+    """
+    assert setting.dt is not None
+    assert setting.tol is not None
+    coarser = [setting.changed({"dt": k * setting.dt, "tol": f * setting.tol}) for k, f in ((2, 10.0), (4, 100.0))]
+    for one in (setting, *coarser):
+        check_steps(one.dt or 0.0, one.t_end)
+    best = _done(run, setting)
+    names = list(chosen) if chosen is not None else list(best.probes)
+    about = f"a run with {setting.method}, dt = {number(setting.dt or 0.0)} s, tol = {number(setting.tol or 0.0)}"
+    swept = [name for name in axes.mesh if name in axes.over]
+    about += "".join(f", {name} = {setting.values[name]}" for name in (*swept, *axes.choices))
+    motion = run_motion(best, names, about)
+    own = dict.fromkeys(MEASURES, 0.0)
+    told: dict[str, Any] = {}
+
+    def add(label: str, settings: list[Setting], low: float, high: float) -> None:
+        """Add the error in one direction, from runs that are coarser in it, the nearest first."""
+        runs = [_done(run, s) for s in settings]
+        near = distances(runs[0], motion)
+        far = distances(runs[1], run_motion(runs[0], names, "")) if len(runs) > 1 else None
+        told[label] = {}
+        for what in MEASURES:
+            if near[what] is None:
+                continue
+            p = low if far is None else observed(far[what], near[what], 2.0, low, high)
+            own[what] += near[what] / (2.0**p - 1.0)
+            told[label][what] = {"order": p, "difference": near[what]}
+
+    add("time", coarser, LOWEST_TIME, float(order_of(setting.method)))
+    if swept:
+        meshes = []
+        for factor in (0.5, 0.25):
+            values = {name: scaled(setting.values[name], factor) for name in swept}
+            if None in values.values():
+                break
+            meshes.append(setting.changed(values))
+        if not meshes:
+            raise ModelError(f"study: the reference has {', '.join(swept)} that can't be halved; give an even --finer")
+        add("space", meshes, LOWEST_MESH, HIGHEST_MESH)
+    if motion.field is None:
+        del own["field"]
+    return replace(motion, own=own, runs=told)
+
+
+def _done(run: Callable[[Setting], Outcome], setting: Setting) -> Outcome:
+    out = run(setting)
+    if out.status == DONE:
+        return out
+    text = f"study: the reference run ({setting.method}, dt = {setting.dt:g} s) {out.status}: {out.why}"
+    raise ModelError(text) if out.status == REFUSED else ConvergenceError(text)

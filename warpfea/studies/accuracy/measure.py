@@ -1,0 +1,198 @@
+"""One point of a study: a run with one setting, what it took and where its probes went."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import inspect
+import time as clock
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...base.errors import CapacityError, ConstraintError, ConvergenceError, Error
+from ...base.usercode import user_code
+from ...builder.scene import Scene
+from ...model.model import Model
+from ...simulation.methods import method
+from ...simulation.simulation import Simulation
+from ...solvers import SOLVERS
+from ..timing import repeated
+from .settings import Setting
+
+__all__ = ["DONE", "FAILED", "LONG", "REFUSED", "Outcome", "measure", "step_options"]
+
+DONE, FAILED, LONG, REFUSED = "done", "failed", "too long", "refused"
+HELD = ("kinetic", "strain", "contact")
+CHANGES = ("potential", "work", "viscous", "contact_loss", "friction", "collider_work")
+"""Columns of the energy ledger that say how much energy there is to exchange: their size, or their change."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of a run.
+
+    Attributes:
+        status: done; failed: a step was not accepted; too long; refused: this scene can't be run so.
+        why: of the others than done.
+        numbers: what it took, see `_numbers`; empty where nothing was run.
+        times: (n,), s. probes: by name position and velocity (n, 3) each, m and m/s. starts: by name (3,), m.
+        field: what the scene's `field` gave, or None.
+    """
+
+    status: str
+    why: str = ""
+    numbers: dict[str, Any] = dataclasses.field(default_factory=dict)
+    times: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    probes: dict[str, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+    starts: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    field: np.ndarray | None = None
+
+    def packed(self) -> dict[str, Any]:
+        """As JSON can hold it, with all digits."""
+        return {
+            "status": self.status,
+            "why": self.why,
+            "numbers": self.numbers,
+            "times": _pack(self.times),
+            "probes": {name: [_pack(x), _pack(v)] for name, (x, v) in self.probes.items()},
+            "starts": {name: _pack(x) for name, x in self.starts.items()},
+            "field": None if self.field is None else _pack(self.field),
+        }
+
+    @staticmethod
+    def unpacked(data: dict[str, Any]) -> Outcome:
+        """The outcome that `packed` gave."""
+        return Outcome(
+            data["status"],
+            data["why"],
+            data["numbers"],
+            _unpack(data["times"]),
+            {name: (_unpack(x), _unpack(v)) for name, (x, v) in data["probes"].items()},
+            {name: _unpack(x) for name, x in data["starts"].items()},
+            None if data["field"] is None else _unpack(data["field"]),
+        )
+
+
+def _pack(values: np.ndarray) -> list[Any]:
+    return [list(values.shape), base64.b64encode(zlib.compress(np.ascontiguousarray(values, float).tobytes())).decode()]
+
+
+def _unpack(data: list[Any]) -> np.ndarray:
+    shape, text = data
+    return np.frombuffer(zlib.decompress(base64.b64decode(text)), float).reshape(shape).copy()
+
+
+def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | None) -> Outcome:
+    """Run a setting `repeat` times; the results are of the first run, the times of all.
+
+    Only steps are timed: making the model and the simulation, which compiles kernels, stand apart. A run that takes
+    more than `limit` seconds is given up.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, once the step in hand is done.
+    """
+    began = clock.perf_counter()
+    try:
+        model = scene.build(setting.values).finalize(device=setting.device, dtype=setting.dtype)
+        setup = clock.perf_counter() - began
+        runs = repeated(lambda: _Run(model, setting, limit), lambda run: run.seconds, repeat)
+    except (ConvergenceError, ConstraintError, CapacityError) as error:  # before the first step
+        return Outcome(FAILED, _line(error))
+    except (Error, NotImplementedError) as error:
+        return Outcome(REFUSED, _line(error))
+    first = runs[0]
+    numbers = first.numbers() | {"setup_s": setup, "seconds": [run.seconds for run in runs]}
+    numbers |= {"asked": repeat, "limit": limit}
+    if first.status != DONE:
+        return Outcome(first.status, first.why, numbers)
+    probes = {p.name: first.sim.probe(p.name) for p in model.probes}
+    times = next(iter(probes.values())).time
+    values = None
+    if scene.field is not None:
+        with user_code(f"field of scene {scene.name!r}"):
+            values = np.asarray(scene.field(first.sim), dtype=float)
+    return Outcome(
+        DONE,
+        "",
+        numbers,
+        np.ravel(times),
+        {name: (record.position[0], record.velocity[0]) for name, record in probes.items()},
+        _starts(model),
+        values,
+    )
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _starts(model: Model) -> dict[str, np.ndarray]:
+    """Places of the probes at t = 0, m."""
+    u = model.state().displacement.numpy()[0].astype(float)
+    return {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.probes}
+
+
+def step_options(setting: Setting) -> dict[str, Any]:
+    """Arguments of Simulation for the step. NotImplementedError where steps can't adapt."""
+    if setting.error is None:
+        return {"dt": setting.dt}
+    if "error" not in inspect.signature(Simulation).parameters:
+        raise NotImplementedError('steps that adapt (dt="auto", error=) are not part of this version')
+    return {"dt": "auto", "error": setting.error}
+
+
+class _Run:
+    """A simulation that is run to its end as it is made, with the clock on its steps."""
+
+    def __init__(self, model: Model, setting: Setting, limit: float | None) -> None:
+        self.status, self.why, self.seconds = DONE, "", 0.0
+        self.sim = Simulation(
+            model,
+            solver=SOLVERS[setting.solver](tol=setting.tol),
+            integrator=method(setting.method),
+            **step_options(setting),
+        )
+        self.energies = [self.sim.energies()]
+        self.limit = limit
+        self.mark = clock.perf_counter()
+        try:
+            self.sim.run(setting.t_end, on_step=self._after_step, progress=False)
+        except (ConvergenceError, ConstraintError) as error:
+            self.seconds += clock.perf_counter() - self.mark
+            self.status, self.why = FAILED, _line(error)
+
+    def _after_step(self, sim: Simulation) -> bool:
+        self.seconds += clock.perf_counter() - self.mark
+        self.energies.append(sim.energies())
+        if self.limit is not None and self.seconds > self.limit:
+            self.status, self.why = LONG, f"more than {self.limit:g} s"
+            return False
+        self.mark = clock.perf_counter()
+        return True
+
+    def numbers(self) -> dict[str, Any]:
+        """What the run took and lost: counts over all steps, bytes on the device, energies in J.
+
+        drift: largest of |change of energy + losses of the model - work|, which is what the steps lost or won, with
+        what the solver left; exchanged: the most that one kind of energy held (kinetic, strain), or changed by.
+        """
+        sim, info = self.sim, self.sim.model.info()
+        table = {name: np.array([float(e[name][0]) for e in self.energies]) for name in self.energies[0]}
+        kinds = [np.abs(table[name] - (name in CHANGES) * table[name][0]).max() for name in (*HELD, *CHANGES)]
+        drift = np.abs(table["ledger_residual"] - table["integrator"])
+        return {
+            "time": float(sim.time[0]),
+            "steps": sim.steps,
+            "newton": int(sim.totals["newton"][0]),
+            "pcg": int(sim.totals["pcg"][0]),
+            "rough": int(sim.totals["rough"][0]),
+            "bytes": sum(sim.bytes().values()),
+            "unknowns": int(info["unknowns"]),
+            "elements": int(info["elements"]),
+            "drift": float(drift.max()),
+            "exchanged": float(max(kinds)),
+            "compile_s": sim.compile_s,
+        }

@@ -1,0 +1,324 @@
+"""What a study of error against run time found: rows, and their table, CSV, JSON and plot."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import pathlib
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, overload
+
+import numpy as np
+
+from ...base.console import number, plain, size, table, write_json
+from ...base.errors import OutputError
+from ...base.provenance import machine, origin, versions
+from ...base.writer import write_whole
+from ..files import prepare, write_csv
+from .measure import DONE
+from .motion import RESOLVED
+from .settings import Axes, Setting, word
+
+__all__ = ["Row", "Study", "with_orders", "with_pareto"]
+
+SCHEMA = 1
+MEASURES = ("l2", "end", "energy", "field")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One setting.
+
+    Attributes:
+        setting: all that it was run with. swept: what varies of it, by name.
+        status, why: "done"; or "failed", "too long" and "refused", with the reason.
+        error: by the study's measure, one of the next four. None where there is none.
+        l2, end: root of the mean square over time, and at the end, over the largest travel; largest of the probes.
+        energy: largest drift of the energy balance over the largest energy exchanged.
+        field: of the scene's field at the end, over its norm.
+        probes: l2 and end of each probe.
+        resolved: the error is at least ten times that of the reference.
+        own_error: that of the reference, in the same measure.
+        orders: observed, from the next coarser row, by swept size.
+        seconds, seconds_min: of all steps, median and minimum of `repeats` runs, without compilation and set-up.
+        compile_s, setup_s: making the simulation (kernels, graphs), and making the model, in the first run.
+        steps, newton, pcg: counts over the run. rough: steps that were accepted above the tolerance (wf.Jacobi).
+        bytes: of the simulation on its device. unknowns, elements: of the model.
+        efficacy: digits, -log10(error x seconds).
+        pareto: no other row has a smaller error in less time.
+        split: parts of the error, see split.py; None where it was not asked for.
+    """
+
+    setting: Setting
+    swept: dict[str, Any]
+    status: str
+    why: str = ""
+    error: float | None = None
+    l2: float | None = None
+    end: float | None = None
+    energy: float | None = None
+    field: float | None = None
+    probes: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
+    resolved: bool = False
+    own_error: float = 0.0
+    orders: dict[str, float] = dataclasses.field(default_factory=dict)
+    seconds: float | None = None
+    seconds_min: float | None = None
+    repeats: int = 0
+    compile_s: float | None = None
+    setup_s: float | None = None
+    steps: int | None = None
+    newton: int | None = None
+    pcg: int | None = None
+    rough: int | None = None
+    bytes: int | None = None
+    unknowns: int | None = None
+    elements: int | None = None
+    efficacy: float | None = None
+    pareto: bool = False
+    split: dict[str, float | None] | None = None
+
+    @property
+    def reaches(self) -> float:
+        """What the error is certainly not beyond: with that of the reference. inf where there is none."""
+        return math.inf if self.error is None else self.error + self.own_error
+
+    def curve(self, axes: Axes) -> tuple[tuple[str, Any], ...]:
+        """What the rows of one curve share."""
+        along = ("dt", "error") if axes.along == "step" else (axes.along,)
+        first = {"method": self.setting.method} | {k: v for k, v in self.swept.items() if k not in along}
+        if axes.along == "step" and self.setting.error is not None:
+            first["steps"] = "adaptive"
+        return tuple(first.items())
+
+
+def mean_size(value: Any) -> float:
+    """A size as one number: of a tuple the geometric mean."""
+    return float(np.exp(np.mean(np.log(value)))) if isinstance(value, tuple) else float(value)
+
+
+def with_orders(rows: Sequence[Row], axes: Axes) -> list[Row]:
+    """The rows with orders observed from the next coarser one, where both errors are resolved.
+
+    For a step p = log(e1/e2) / log(h1/h2), for a mesh with the numbers of cells turned round, and for steps that adapt
+    with the errors that were asked for.
+    """
+    out = list(rows)
+    for name in axes.sizes:
+        groups: dict[str, list[int]] = {}
+        for k, row in enumerate(rows):
+            if row.status == DONE and row.swept.get(name) is not None:
+                groups.setdefault(repr({key: v for key, v in row.swept.items() if key != name}), []).append(k)
+        for group in groups.values():
+            inverse = name in axes.mesh
+            sizes = {k: mean_size(rows[k].swept[name]) ** (-1.0 if inverse else 1.0) for k in group}
+            group.sort(key=lambda k: -sizes[k])
+            for coarse, fine in itertools.pairwise(group):
+                a, b = rows[coarse], rows[fine]
+                if a.resolved and b.resolved and a.error and b.error:
+                    order = math.log(a.error / b.error) / math.log(sizes[coarse] / sizes[fine])
+                    out[fine] = replace(out[fine], orders=out[fine].orders | {name: order})
+    return out
+
+
+def with_pareto(rows: Sequence[Row]) -> list[Row]:
+    """The rows, marked where no other has a smaller error in at most the same time, or the same in less."""
+
+    def beaten(row: Row) -> bool:
+        assert row.error is not None
+        assert row.seconds is not None
+        return any(
+            o.error <= row.error and o.seconds <= row.seconds and (o.error < row.error or o.seconds < row.seconds)
+            for o in rows
+            if o.error is not None and o.seconds is not None
+        )
+
+    return [replace(r, pareto=r.error is not None and r.seconds is not None and not beaten(r)) for r in rows]
+
+
+@dataclass(frozen=True)
+class Study(Sequence[Row]):
+    """A study: a sequence of its rows.
+
+    Attributes:
+        name: of the scene, and of the files. what: as the command line names the scene.
+        rows: in the order of the sweep.
+        axes: what was swept. measure: which error counts. target: that was asked for, or None.
+        references: what errors are measured against, for each problem: about, own error, travel, values.
+        settings: all else that the numbers depend on.
+        answer: the cheapest row that reaches the target; None. command: that runs it.
+    """
+
+    name: str
+    what: str
+    rows: list[Row] = dataclasses.field(repr=False)
+    axes: Axes = dataclasses.field(repr=False)
+    measure: str
+    target: float | None
+    references: list[dict[str, Any]] = dataclasses.field(repr=False)
+    settings: dict[str, Any] = dataclasses.field(repr=False)
+    answer: Row | None = dataclasses.field(repr=False)
+    command: str | None
+
+    @overload
+    def __getitem__(self, index: int) -> Row: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Row]: ...
+    def __getitem__(self, index: int | slice) -> Row | list[Row]:
+        return self.rows[index]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Row]:
+        return iter(self.rows)
+
+    def __repr__(self) -> str:
+        found = "" if self.target is None else f", target {self.target:g} {'reached' if self.answer else 'not reached'}"
+        return f"Study({self.name!r}, {len(self.rows)} rows{found})"
+
+    def curves(self) -> dict[str, list[Row]]:
+        """Rows by curve, in words."""
+        out: dict[str, list[Row]] = {}
+        for row in self.rows:
+            texts = [word(v) if k == "method" else f"{k}={word(v)}" for k, v in row.curve(self.axes)]
+            out.setdefault(" ".join(texts), []).append(row)
+        return out
+
+    def fits(self) -> list[dict[str, Any]]:
+        """Order of each curve along its own size, by least squares over the rows that are resolved."""
+        out: list[dict[str, Any]] = []
+        for label, rows in self.curves().items():
+            along = self.axes.along
+            if along == "step":
+                along = "dt" if rows[0].setting.error is None else "error"
+            good = [r for r in rows if r.resolved and r.error and r.swept.get(along or "") is not None]
+            if along in self.axes.sizes and len(good) > 1:
+                sizes = np.log([mean_size(r.swept[along]) for r in good])
+                slope = float(np.polyfit(sizes, np.log([r.error or 1.0 for r in good]), 1)[0])
+                slope = -slope if along in self.axes.mesh else slope
+                out.append({"curve": label, "size": along, "order": slope, "rows": len(good)})
+        return out
+
+    def omissions(self) -> list[str]:
+        """What the picture can't show, in words."""
+        out = [f"{self.label(r)}: {r.status}: {r.why}" for r in self.rows if r.status != DONE]
+        near = [self.label(r) for r in self.rows if r.status == DONE and not r.resolved]
+        if near:
+            out.append(f"not resolved (within {RESOLVED:g} times the error of the reference): {'; '.join(near)}")
+        return out
+
+    def label(self, row: Row) -> str:
+        """A row in words."""
+        given = {"method": row.setting.method} | row.swept
+        return ", ".join(word(v) if k == "method" else f"{k}={word(v)}" for k, v in given.items() if v is not None)
+
+    def table(self) -> str:
+        """All of it for reading."""
+        head = ["method", *(k for k in self.axes.over if k != "method"), self.measure, *(f"order {s}" for s in
+                self.axes.sizes), "end" if self.measure != "end" else "l2", "energy"]  # fmt: skip
+        head += ["s", "s min", "digits", "steps", "Newton", "PCG", "memory", ""]
+        lines = [head, *([*self._cells(row, head)] for row in self.rows)]
+        text = [table(lines, right=range(1, len(head) - 1)), ""]
+        for ref in self.references:
+            at = ", ".join(f"{k} = {word(v)}" for k, v in ref["values"].items())
+            own = ", ".join(f"{k} {number(v, 2)}" for k, v in ref["own_error"].items())
+            text.append(f"reference{f' at {at}' if at else ''}: {ref['about']}; its own error: {own or 'none'}")
+        text.append(f"errors over the largest travel, {', '.join(number(r['travel']) for r in self.references)} m")
+        text += [f"order {f['order']:.2f} in {f['size']} of {f['curve']}, {f['rows']} rows" for f in self.fits()]
+        for row in self.rows:
+            if row.split is not None:
+                parts = ", ".join(f"{k} {'-' if v is None else number(v, 2)}" for k, v in row.split.items())
+                text.append(f"parts of the error of {self.label(row)}: {parts}")
+        text += [f"left out: {line}" for line in self.omissions()]
+        done = [r for r in self.rows if r.compile_s is not None]
+        if done:
+            compiled, made = (max(getattr(r, k) for r in done) for k in ("compile_s", "setup_s"))
+            text.append(f"apart from that, at most {compiled:.1f} s to compile and record, {made:.1f} s for the model")
+        where = machine(self.rows[0].setting.device)
+        known = versions()
+        text.append(f"{where.get('gpu', where['cpu'])}, warpfea {known['warpfea']}, Warp {known['warp']}")
+        if self.target is not None:
+            text += ["", self.verdict()]
+        return "\n".join(text)
+
+    def verdict(self) -> str:
+        """The answer to the target."""
+        if self.answer is not None:
+            r = self.answer
+            found = f"error {number(r.error or 0.0, 3)} in {number(r.seconds or 0.0, 3)} s"
+            return f"cheapest that reaches {self.target:g}: {self.label(r)}: {found}\n  {self.command}"
+        near = min(self.rows, key=lambda r: r.reaches)
+        if near.error is None:
+            return f"no setting was measured to reach {self.target:g}"
+        own = f" (and {number(near.own_error, 2)} of the reference)" if near.own_error else ""
+        return f"no setting was measured to reach {self.target:g}; nearest: {self.label(near)}: {near.error:.3g}{own}"
+
+    def _cells(self, row: Row, head: Sequence[str]) -> Iterator[str]:
+        other = "end" if self.measure != "end" else "l2"
+        values: dict[str, str] = {"method": row.setting.method}
+        values |= {k: "-" if row.swept.get(k) is None else word(row.swept[k]) for k in self.axes.over if k != "method"}
+        for name in {self.measure, other, "energy"}:
+            value = getattr(row, name)
+            values[name] = "-" if value is None else f"{value:.2e}"
+        values |= {f"order {s}": f"{row.orders[s]:.2f}" if s in row.orders else "-" for s in self.axes.sizes}
+        for name, key in (("s", "seconds"), ("s min", "seconds_min")):
+            value = getattr(row, key)
+            values[name] = "-" if value is None else f"{value:.3g}"
+        values["digits"] = "-" if row.efficacy is None else f"{row.efficacy:.2f}"
+        values |= {k: "-" if v is None else str(v) for k, v in
+                   (("steps", row.steps), ("Newton", row.newton), ("PCG", row.pcg))}  # fmt: skip
+        values["memory"] = "-" if row.bytes is None else size(row.bytes)
+        marks = ["Pareto"] * row.pareto + ["not resolved"] * (row.status == DONE and not row.resolved)
+        marks += [] if row.status == DONE else [row.status.upper()]
+        values[""] = ", ".join(marks + ["target"] * (row is self.answer))
+        return (values[name] for name in head)
+
+    def content(self, words: Sequence[str]) -> dict[str, Any]:
+        """What the JSON file holds."""
+        return {
+            "schema": SCHEMA,
+            **origin(words, self.rows[0].setting.device),
+            "scene": self.what,
+            "measure": self.measure,
+            "target": self.target,
+            "settings": plain(self.settings),
+            "over": plain(self.axes.over),
+            "references": plain(self.references),
+            "orders": self.fits(),
+            "answer": None if self.answer is None else {"row": self.rows.index(self.answer), "command": self.command},
+            "rows": [plain(asdict(row)) for row in self.rows],
+        }
+
+    def write(self, folder: str | pathlib.Path, words: Sequence[str] = ("study",)) -> list[pathlib.Path]:
+        """Write NAME.json, NAME.csv and, where matplotlib is installed, NAME.png into a folder; gives their paths.
+
+        words: of the command line, without "warpfea".
+
+        Raises:
+            OutputError: the folder can't be made or written.
+        """
+        from ..plots import require_matplotlib
+        from .plot import draw
+
+        out = prepare(folder)
+        paths = [out / f"{self.name}.{suffix}" for suffix in ("json", "csv", "png")]
+        write_json(str(paths[0]), self.content(words))
+        rows = [self._flat(row) for row in self.rows]
+        write_csv(paths[1], list(dict.fromkeys(key for row in rows for key in row)), rows)
+        try:
+            require_matplotlib()
+        except OutputError:
+            return paths[:2]
+        write_whole(paths[2], lambda path: draw(self, path))
+        return paths
+
+    def _flat(self, row: Row) -> dict[str, Any]:
+        """A row without nesting, for the CSV."""
+        out = {k: v for k, v in plain(asdict(row)).items() if not isinstance(v, dict)}
+        out = {k: v for k, v in plain(asdict(row.setting)).items() if k != "values"} | out
+        out = {f"set {k}": v for k, v in row.setting.values.items()} | out
+        out |= {f"order {k}": v for k, v in row.orders.items()}
+        return out | {f"{name} {k}": v for name, p in row.probes.items() for k, v in p.items()}

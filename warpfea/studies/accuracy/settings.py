@@ -1,0 +1,248 @@
+"""What a study sweeps: settings of a run, the axes over which they vary, and their product."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import shlex
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from ...base.console import plain
+from ...base.errors import ModelError
+from ...base.names import did_you_mean
+from ...builder.scene import Scene
+from ...simulation import integrators
+from ...simulation.methods import method, split_methods
+from ...solvers import SOLVERS
+
+__all__ = ["OPTIONS", "Axes", "Setting", "check_steps", "make_axes", "order_of", "parse_over", "product"]
+
+OPTIONS = ("method", "dt", "error", "solver", "tol", "dtype", "device")
+"""What can be swept besides the parameters of the scene."""
+NAMES = {"methods": "method", "integrator": "method"}
+"""Other names of options."""
+MESH = ("cells", "elements", "across")
+"""Parameters of scenes, whole numbers, whose growth refines the mesh."""
+DTYPES = ("float64", "float32")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a scene is run.
+
+    Attributes:
+        method: integrator, as text. dt: step, s, None where it adapts to `error`, the error that is asked for.
+        solver: name. tol: relative residual; None: the solver's own. dtype, device: of the model.
+        t_end: s. values: all parameters of the scene.
+    """
+
+    method: str
+    dt: float | None
+    error: float | None
+    solver: str
+    tol: float | None
+    dtype: str
+    device: str
+    t_end: float
+    values: dict[str, Any]
+
+    def get(self, name: str) -> Any:
+        """Value of an option or a parameter."""
+        return getattr(self, name) if name in OPTIONS else self.values[name]
+
+    def changed(self, changes: Mapping[str, Any]) -> Setting:
+        """The same with other options or parameters; a dt takes the place of an `error`, and the other way round."""
+        own = {name: value for name, value in changes.items() if name in OPTIONS}
+        if own.get("dt") is not None:
+            own.setdefault("error", None)
+        if own.get("error") is not None:
+            own.setdefault("dt", None)
+        values = self.values | {name: value for name, value in changes.items() if name not in OPTIONS}
+        return replace(self, **own, values=values)
+
+    def key(self, code: str) -> str:
+        """A name for the run: of the settings and of the version of the code."""
+        return hashlib.sha256(json.dumps([plain(asdict(self)), code], sort_keys=True).encode()).hexdigest()[:20]
+
+    def command(self, what: str, scene: Scene[Any]) -> str:
+        """The command line that runs it."""
+        words = ["warpfea", "run", what, "--integrator", self.method]
+        words += ["--dt", word(self.dt)] if self.error is None else ["--dt", "auto", "--error", word(self.error)]
+        if self.t_end != scene.t_end:
+            words += ["--t-end", word(self.t_end)]
+        if self.solver != "newton-pcg":
+            words += ["--solver", self.solver]
+        if self.tol is not None and self.tol != scene.tol:
+            words += ["--tol", word(self.tol)]
+        words += ["--dtype", self.dtype, "--device", self.device]
+        for name, value in self.values.items():
+            if value != scene.parameters[name].default:
+                words += ["--set", f"{name}={word(value)}"]
+        return shlex.join(words)
+
+
+@dataclass(frozen=True)
+class Axes:
+    """What varies.
+
+    Attributes:
+        over: values by name, in the order given.
+        mesh: parameters of the scene that refine the mesh, swept or not.
+        choices: swept parameters that say how the same problem is discretised: names and switches.
+        physical: swept parameters that change the problem; each of their values has its own reference.
+    """
+
+    over: dict[str, list[Any]]
+    mesh: tuple[str, ...]
+    choices: tuple[str, ...]
+    physical: tuple[str, ...]
+
+    @property
+    def sizes(self) -> list[str]:
+        """Swept sizes, in which orders are observed: steps and meshes."""
+        return [name for name in self.over if name in ("dt", "error", *self.mesh)]
+
+    @property
+    def along(self) -> str | None:
+        """The axis that a curve runs along; None where only names vary."""
+        for name in ("dt", "error", *self.mesh, "tol"):
+            if name in self.over:
+                return "step" if name in ("dt", "error") else name
+        return None
+
+
+def word(value: Any) -> str:
+    """A value as the command line reads it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.12g}"
+    if isinstance(value, (tuple, list)):
+        return ",".join(map(word, value))
+    return "none" if value is None else str(value)
+
+
+def order_of(text: str) -> int:
+    """Order of convergence of an integrator."""
+    return int(integrators.get(method(text)).order)
+
+
+def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") -> dict[str, list[Any]]:
+    """`NAME=V1,V2` as values. ModelError for a text without values, and for a name given twice."""
+    out: dict[str, list[Any]] = {}
+    for text in texts:
+        name, equals, values = text.partition("=")
+        name = NAMES.get(name.strip(), name.strip())
+        if not equals or not values.strip():
+            raise ModelError(f"{option} {text}: expected NAME=V1,V2,...")
+        if name in out:
+            raise ModelError(f"{option} {name}: given twice")
+        out[name] = split_methods(values) if name == "method" else [part.strip() for part in values.split(",")]
+        if name in ("dt", "error", "tol"):
+            out[name] = [_number(name, value) for value in out[name]]
+        elif name not in OPTIONS:
+            _check_names(scene, [name])
+            parts = out[name]
+            if typing.get_origin(scene.parameters[name].kind) is tuple:  # 6x2x1: commas separate values
+                parts = [part.replace("x", ",") for part in parts]
+            out[name] = [scene.parse([f"{name}={part}"])[name] for part in parts]
+    return out
+
+
+def _number(name: str, text: Any) -> float:
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise ModelError(f"{name} = {text!r} must be a positive finite number")
+    return value
+
+
+def _check_names(scene: Scene[Any], names: Iterable[str]) -> None:
+    """ModelError for what is neither an option nor a parameter of the scene."""
+    known = [*OPTIONS, *scene.parameters]
+    for name in names:
+        if name not in known:
+            raise ModelError(
+                f"study of {scene.name!r}: can't sweep {name!r}; there are {', '.join(OPTIONS)}, and of the scene "
+                f"{', '.join(scene.parameters) or 'no parameters'}{did_you_mean(name, known)}"
+            )
+
+
+def make_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequence[str] | None) -> Axes:
+    """Check what is swept.
+
+    Args:
+        scene: the scene.
+        over: values by name.
+        mesh: parameters that refine the mesh; None: those of MESH that are whole numbers.
+
+    Raises:
+        ModelError: an unknown name, no values, one twice, or a value that is none of the option.
+    """
+    chosen = {NAMES.get(name, name): values for name, values in over.items()}
+    if len(chosen) < len(over):
+        raise ModelError(f"study: {', '.join(over)} name the same thing twice")
+    _check_names(scene, chosen)
+    out: dict[str, list[Any]] = {}
+    for name, values in chosen.items():
+        if isinstance(values, (str, bytes)) or not isinstance(values, Iterable) or not list(values):
+            raise ModelError(f"study: over {name} = {values!r} must be a list of values, at least one")
+        out[name] = [_number(name, v) if name in ("dt", "error", "tol") else v for v in values]
+        if len({repr(value) for value in out[name]}) < len(out[name]):
+            raise ModelError(f"study: over {name} = {out[name]} holds a value twice")
+        known = {"solver": tuple(SOLVERS), "dtype": DTYPES}.get(name)
+        for value in out[name]:
+            if known and value not in known:
+                hint = did_you_mean(value, known)
+                raise ModelError(f"study: {name} {value!r} is unknown; there are {', '.join(known)}{hint}")
+            if name == "method":
+                method(value)
+    whole = {name for name, p in scene.parameters.items() if is_whole(p.default) and not isinstance(p.default, bool)}
+    for name in mesh or ():
+        if name not in whole:
+            hint = did_you_mean(name, whole)
+            raise ModelError(f"study: mesh {name!r} is no whole number of the scene; it has {sorted(whole)}{hint}")
+    refine = tuple(mesh) if mesh is not None else tuple(name for name in MESH if name in whole)
+    swept = [name for name in out if name not in (*OPTIONS, *refine)]
+    choices = tuple(name for name in swept if all(isinstance(v, (str, bool)) for v in out[name]))
+    return Axes(out, refine, choices, tuple(name for name in swept if name not in choices))
+
+
+def is_whole(value: Any) -> bool:
+    """Whether it is a whole number or a tuple of such."""
+    return isinstance(value, int) or (isinstance(value, tuple) and bool(value) and all(map(is_whole, value)))
+
+
+def product(base: Setting, axes: Axes) -> list[Setting]:
+    """Every combination; steps of fixed size and adaptive ones stand side by side.
+
+    Raises:
+        ModelError: a step that does not divide the duration.
+    """
+    steps = [{name: value} for name in ("dt", "error") for value in axes.over.get(name, ())] or [{}]
+    others = [[{name: v} for v in values] for name, values in axes.over.items() if name not in ("dt", "error")]
+    out = []
+    for *parts, step in itertools.product(*others, steps):
+        setting = base.changed({k: v for part in [*parts, step] for k, v in part.items()})
+        if setting.dt is not None:
+            check_steps(setting.dt, setting.t_end)
+        out.append(setting)
+    return out
+
+
+def check_steps(dt: float, t_end: float) -> None:
+    """ModelError unless whole steps end at t_end."""
+    count = t_end / dt
+    if count < 0.5 or abs(count - round(count)) > 1e-6 * max(1.0, count):
+        near = ", ".join(f"{t_end / n:.12g}" for n in (math.floor(count), math.ceil(count)) if n > 0)
+        raise ModelError(
+            f"study: dt = {dt:g} s does not divide the end time {t_end:g} s ({count:.6g} steps), and runs would end at "
+            f"different times; take {near} s or another end time"
+        )

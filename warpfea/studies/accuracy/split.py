@@ -1,0 +1,70 @@
+"""Parts of an error, by differences of runs.
+
+For a run u with the step h, cells of the size H, the tolerance tau and the precision of its dtype, |.| the distance of
+`motion.py` (l2, largest of the probes, over the reference's travel):
+
+    time      |u(h) - u(h/2)| 2^p / (2^p - 1), p the order of the method; where the step adapts to an asked error e
+              |u(e) - u(e/10)|
+    space     |u(H) - u(H/2)| 2^q / (2^q - 1) with q = 1, an upper bound for elements that converge faster
+    algebra   |u(tau) - u(tau/100)|
+    rounding  |u(float32) - u(float64)| for a float32 run; for float64 the same times 2^-29, the ratio of both units of
+              rounding
+
+Each part is left empty where it can't be had: no parameter of the scene refines the mesh, the finer run was not
+accepted, or float32 can't hold the case. The parts may have different signs: their sum bounds the error, with that of
+the model itself (element, law) left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from .finer import scaled
+from .measure import DONE, Outcome
+from .motion import Motion, distances, run_motion
+from .settings import Axes, Setting, order_of
+
+__all__ = ["split"]
+
+UNITS = 2.0**-29
+"""Rounding of float64 over that of float32."""
+TIGHTER = 100.0
+DEFAULTS = {"float64": 1e-8, "float32": 1e-4}
+"""Tolerances of the solvers."""
+
+
+def split(setting: Setting, axes: Axes, motion: Motion, run: Callable[[Setting], Outcome]) -> dict[str, float | None]:
+    """time, space, algebra and rounding of the error of a setting, over the travel of the reference; None: unknown."""
+    base = run(setting)
+    if base.status != DONE:
+        return dict.fromkeys(("time", "space", "algebra", "rounding"))
+    names = list(motion.probes)
+
+    def away(other: Setting) -> float | None:
+        found = run(other)
+        if found.status != DONE:
+            return None
+        own = run_motion(found, names, "")
+        return float(distances(base, own)["l2"]) * own.travel / motion.travel
+
+    def times(value: float | None, factor: float) -> float | None:
+        return None if value is None else factor * value
+
+    if setting.dt is not None:
+        growth = 2.0 ** order_of(setting.method)
+        time = times(away(setting.changed({"dt": setting.dt / 2})), growth / (growth - 1.0))
+    else:
+        assert setting.error is not None
+        time = away(setting.changed({"error": setting.error / 10}))
+    finer = {name: scaled(setting.values[name], 2) for name in axes.mesh}
+    space = times(away(setting.changed(finer)), 2.0) if finer else None
+    tol = setting.tol if setting.tol is not None else DEFAULTS[setting.dtype]
+    algebra = away(setting.changed({"tol": tol / TIGHTER}))
+    single = setting.dtype == "float32"
+    other = away(setting.changed({"dtype": "float64" if single else "float32"}))
+    return {
+        "time": time,
+        "space": space,
+        "algebra": algebra,
+        "rounding": other if single else times(other, UNITS),
+    }

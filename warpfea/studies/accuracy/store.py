@@ -1,0 +1,102 @@
+"""Finished points of a study: in memory, and in a file that an interrupted study goes on from."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+import json
+import os
+import pathlib
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from ...base.console import plain
+from ...base.errors import OutputError
+from ...base.provenance import machine
+from ...builder.scene import Scene
+from .measure import LONG, REFUSED, Outcome
+from .settings import Setting
+
+__all__ = ["Store", "code_version"]
+
+_ROOT = pathlib.Path(__file__).resolve().parents[2]
+UNRELATED = ("cli", "outputs", "studies", "__pycache__")
+"""Folders of the package whose code does not change what a run gives."""
+
+
+@functools.cache
+def _package_version() -> str:
+    """A hash of the code that runs are made with, device code included."""
+    import warpfea.kernels as kernels
+
+    total = hashlib.sha256()
+    for root in (_ROOT, pathlib.Path(next(iter(kernels.__path__)))):
+        for path in sorted(root.rglob("*.py")):
+            if not set(path.relative_to(root).parts) & set(UNRELATED):
+                total.update(path.read_bytes())
+    return total.hexdigest()
+
+
+def code_version(scene: Scene[Any], device: str) -> str:
+    """What the results and times of a run depend on besides its settings: package, the scene's file, machine."""
+    file = inspect.getsourcefile(scene.function)
+    own = pathlib.Path(file).read_bytes() if file and pathlib.Path(file).is_file() else b""
+    return json.dumps([_package_version(), hashlib.sha256(own).hexdigest(), scene.name, machine(device)])
+
+
+class Store:
+    """Outcomes by setting. With a file each finished run is a line of it, written at once.
+
+    Args:
+        file: where they are kept; None: in memory alone.
+        version: function of a device that gives the version of the code there.
+
+    Raises:
+        OutputError: the file can't be read or written.
+    """
+
+    def __init__(self, file: pathlib.Path | None, version: Callable[[str], str]) -> None:
+        self.file, self.version = file, functools.cache(version)
+        self.outcomes: dict[str, Outcome] = {}
+        if file is not None and file.exists():
+            try:
+                text = file.read_text()
+            except (OSError, ValueError) as error:
+                raise OutputError(f"{file}: can't be read ({error})") from error
+            for line in text.splitlines():
+                try:
+                    data = json.loads(line)
+                    self.outcomes[data["key"]] = Outcome.unpacked(data)
+                except (ValueError, KeyError, TypeError):  # the line that a kill cut short
+                    continue
+            if text and not text.endswith("\n"):
+                self._append("\n")
+
+    def get(self, setting: Setting, repeat: int, limit: float | None) -> Outcome | None:
+        """The outcome of a setting, unless it was run fewer times than asked, or given up earlier than asked."""
+        found = self.outcomes.get(setting.key(self.version(setting.device)))
+        if found is None or found.numbers.get("asked", repeat) < repeat:
+            return None
+        if found.status == LONG and (limit is None or limit > found.numbers["limit"]):
+            return None
+        return found
+
+    def put(self, setting: Setting, outcome: Outcome) -> None:
+        """Keep an outcome. OutputError."""
+        key = setting.key(self.version(setting.device))
+        self.outcomes[key] = outcome
+        if self.file is not None and outcome.status != REFUSED:
+            line = {"key": key, "settings": asdict(setting), **outcome.packed()}
+            self._append(json.dumps(plain(line)) + "\n")
+
+    def _append(self, text: str) -> None:
+        assert self.file is not None
+        try:
+            with open(self.file, "a") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            raise OutputError(f"{self.file}: can't be written ({error})") from error

@@ -1,0 +1,354 @@
+"""Error against run time of a scene: the sweep, its reference, its rows."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+import re
+import statistics
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import warp as wp
+
+from ...base.console import quiet_warp
+from ...base.errors import ModelError
+from ...base.names import did_you_mean, listing
+from ...builder.reference import Reference, read_reference, reference_of
+from ...builder.scene import Scene, locate
+from ...builder.scene import scene as as_scene
+from ..files import prepare
+from .finer import finer_motion, finer_setting
+from .measure import DONE, REFUSED, Outcome, step_options
+from .measure import measure as run_once
+from .motion import RESOLVED, Motion, distances, known_motion
+from .problems import find_problem, problem_names
+from .report import MEASURES, Row, Study, with_orders, with_pareto
+from .settings import OPTIONS, Axes, Setting, make_axes, product
+from .split import split as parts_of_error
+from .store import Store, code_version
+
+__all__ = ["study"]
+
+SPLITS = ("best", "all", "none")
+RUN = "run"
+"""As `reference`: a finer run, also where the scene knows its motion."""
+
+
+def study(
+    scene: Scene[Any] | Callable[..., Any] | str,
+    *,
+    over: Mapping[str, Sequence[Any]] | None = None,
+    methods: Sequence[str] | None = None,
+    error: Sequence[float] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    dt: float | None = None,
+    t_end: float | None = None,
+    solver: str = "newton-pcg",
+    tol: float | None = None,
+    dtype: str = "float64",
+    device: str | None = None,
+    probes: Sequence[str] | None = None,
+    reference: Reference | Mapping[str, Any] | str | pathlib.Path | None = None,
+    finer: Mapping[str, Any] | None = None,
+    mesh: Sequence[str] | None = None,
+    measure: str = "l2",
+    target: float | None = None,
+    split: str = "best",
+    repeat: int = 3,
+    limit: float | None = None,
+    out: str | pathlib.Path | None = None,
+    name: str | None = None,
+    progress: bool | None = None,
+    what: str | None = None,
+    words: Sequence[str] | None = None,
+) -> Study:
+    """Run a scene with every combination of settings, and tell error and run time of each.
+
+    Args:
+        scene: a scene, the name of one or file.py[:NAME], or a function that gives a ModelBuilder (with dt and t_end).
+        over: lists of values by name: "dt", "tol", "solver" ("newton-pcg", "jacobi", "direct"), "dtype", "device",
+            "method", "error", or a parameter of the scene.
+        methods: the same as over["method"]: names of integrators, "generalized_alpha(rho_inf=0.8)" with options.
+        error: the same as over["error"]: runs with dt="auto" to each of these errors, beside those of fixed steps.
+        parameters: of the scene, for all runs.
+        dt, t_end, solver, tol, dtype, device: of runs where they are not swept; by default the scene's.
+        probes: whose error counts; by default all, or those that the reference has.
+        reference: a wf.Reference, a dict from probes to functions of time or samples, a file (.csv, .json), or "run"
+            for a finer run. By default what the scene gives, else a finer run.
+        finer: options and parameters of the finer run, in place of the chosen ones.
+        mesh: parameters that refine the mesh; by default cells, elements, across.
+        measure: the error that counts: "l2", "end", "energy" or "field".
+        target: error that the cheapest setting is wanted for.
+        split: parts of the error: of the "best" row (the answer to the target, else that with most digits of efficacy),
+            of "all" rows, or "none".
+        repeat: runs of each setting for the times; those longer than 2 s are not repeated.
+        limit: s, after which a run is given up.
+        out: folder for NAME.json, .csv, .png, and NAME.points.jsonl, from which an interrupted study goes on.
+        name: of the files; by default that of the scene.
+        progress: show a bar; by default when stderr is a terminal.
+        what, words: how the command line names the scene, and its words, for the files.
+
+    Returns:
+        A Study: a sequence of rows, with `table()`, `answer` and `write(folder)`.
+
+    Raises:
+        ModelError: a bad setting, a scene without probes, a reference that does not fit.
+        ConvergenceError: the reference was not accepted.
+        OutputError: the folder can't be written.
+        KeyboardInterrupt: after Ctrl-C; finished runs are kept in `out`.
+    """
+    named, found = _scene(scene, dt, t_end)
+    what, name = what or named, name or found.name
+    if not re.fullmatch(r"[\w.-]+", name):
+        raise ModelError(f"study: name {name!r} is to be part of names of files: letters, digits, _ - and .")
+    sweep = dict(over or {})
+    for option, many in (("methods", methods), ("error", error)):
+        if many is not None:
+            if option in sweep:
+                raise ModelError(f"study: {option} is given twice")
+            sweep[option] = many
+    _check_choice("measure", measure, MEASURES)
+    _check_choice("split", split, SPLITS)
+    if not (isinstance(repeat, int) and repeat >= 1):
+        raise ModelError(f"study: repeat = {repeat!r} must be a positive whole number")
+    for option, value in (("target", target), ("limit", limit), ("dt", dt), ("t_end", t_end), ("tol", tol)):
+        if value is not None and not (math.isfinite(value) and value > 0.0):
+            raise ModelError(f"study: {option} = {value!r} must be a positive finite number")
+    axes = make_axes(found, sweep, mesh)
+    values = dict(parameters or {})
+    _check_names("parameter", values, found.parameters)
+    _check_names("finer", finer or {}, [*OPTIONS, *found.parameters])
+    swept = {axis: many[0] for axis, many in axes.over.items() if axis not in OPTIONS}
+    base = Setting(
+        method=found.integrator,
+        dt=float(dt or found.dt),
+        error=None,
+        solver=solver,
+        tol=tol if tol is not None else found.tol,
+        dtype=dtype,
+        device=_device(device),
+        t_end=float(t_end or found.t_end),
+        values=found.resolve(swept | values),
+    )
+    make_axes(found, {option: [base.get(option)] for option in ("method", "solver", "dtype")}, None)
+    settings = product(base, axes)
+    for setting in settings:
+        step_options(setting)
+    if measure == "field" and found.field is None:
+        raise ModelError(f"study: scene {found.name!r} has no field whose error could count: @wf.scene(field=...)")
+    known = _reference(reference, found, base, probes)
+    with quiet_warp():
+        _check_probes(found, settings[0], probes)
+        folder = None if out is None else prepare(out)
+        store = Store(folder and folder / f"{name}.points.jsonl", lambda dev: code_version(found, dev))
+        work = _Work(found, axes, store, repeat, limit, progress, known, probes, dict(finer or {}), measure, base)
+        rows, references, motions = work.rows(settings)
+        answer = _answer(rows, target)
+        rows = work.split(rows, motions, split, answer)
+    answer = None if answer is None else _answer(rows, target)
+    command = None if answer is None else answer.setting.command(what, found)
+    told = {
+        "t_end": base.t_end, "repeat": repeat, "limit": limit, "split": split, "parameters": base.values, "dt": base.dt,
+        "tol": base.tol, "solver": solver, "dtype": dtype, "integrator": base.method, "probes": probes,
+    }  # fmt: skip
+    result = Study(name, what, rows, axes, measure, target, references, told, answer, command)
+    if folder is not None:
+        result.write(folder, words or ["study", what])
+    return result
+
+
+def _scene(given: Any, dt: float | None, t_end: float | None) -> tuple[str, Scene[Any]]:
+    """A scene, and how the command line names it."""
+    if isinstance(given, str):
+        return given, find_problem(given) if given in problem_names() else locate(given)
+    if isinstance(given, Scene):
+        return given.name, given
+    if callable(given):
+        if dt is None or t_end is None:
+            raise ModelError(f"study of the function {given.__name__!r}: give dt and t_end, or decorate it as a scene")
+        return given.__name__, as_scene(dt=dt, t_end=t_end)(given)
+    raise ModelError(f"study: expected a scene, a function or a name, got {given!r}")
+
+
+def _check_choice(name: str, value: Any, known: Sequence[str]) -> None:
+    if value not in known:
+        raise ModelError(
+            f"study: {name} {value!r} is unknown; there are {', '.join(known)}{did_you_mean(value, known)}"
+        )
+
+
+def _check_names(what: str, given: Mapping[str, Any], known: Any) -> None:
+    for name in given:
+        if name not in known:
+            raise ModelError(
+                f"study: {what} {name!r} is unknown; there are {listing(known)}{did_you_mean(name, known)}"
+            )
+
+
+def _device(name: str | None) -> str:
+    try:
+        with quiet_warp():
+            return str(wp.get_device(name) if name else wp.get_preferred_device())
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(f"study: device {name!r}: {error}") from None
+
+
+def _check_probes(scene: Scene[Any], setting: Setting, chosen: Sequence[str] | None) -> None:
+    """ModelError for a scene without probes, and for chosen ones that are not there."""
+    names = [p.name for p in scene.build(setting.values).description.probes]
+    if not names:
+        raise ModelError(
+            f"scene {scene.name!r} has no probe, whose error a study needs: b.add_probe('tip', body.surface('x+'))"
+        )
+    for name in chosen or ():
+        if name not in names:
+            raise ModelError(f"study: probe {name!r} is unknown; there are {listing(names)}{did_you_mean(name, names)}")
+
+
+def _reference(
+    given: Any, scene: Scene[Any], base: Setting, probes: Sequence[str] | None
+) -> Callable[[Setting], Reference | None]:
+    """What gives the known motion for the parameters of a setting; it gives None where a finer run is to."""
+    if given == RUN:
+        return lambda setting: None
+    if given is None:
+        return lambda setting: reference_of(scene.reference, setting.values)
+    if isinstance(given, (str, pathlib.Path)):
+        if not str(given).lower().endswith((".csv", ".json")):
+            raise ModelError(f"study: reference {str(given)!r} is neither a file .csv or .json nor {RUN!r}")
+        names = list(probes or [p.name for p in scene.build(base.values).description.probes][:1])
+        read = read_reference(given, names[0] if names else "")
+        return lambda setting: read
+    fixed = reference_of(given, base.values)
+    return lambda setting: fixed
+
+
+def _answer(rows: Sequence[Row], target: float | None) -> Row | None:
+    """The row with the smallest median time of those whose error, with that of the reference, is within the target."""
+    good = [r for r in rows if target is not None and r.status == DONE and r.reaches <= target]
+    return min(good, key=lambda r: r.seconds or 0.0) if good else None
+
+
+class _Work:
+    """Runs what a study needs, and judges it."""
+
+    def __init__(
+        self,
+        scene: Scene[Any],
+        axes: Axes,
+        store: Store,
+        repeat: int,
+        limit: float | None,
+        progress: bool | None,
+        known: Callable[[Setting], Reference | None],
+        chosen: Sequence[str] | None,
+        finer: dict[str, Any],
+        measured: str,
+        base: Setting,
+    ) -> None:
+        self.scene, self.axes, self.store, self.repeat, self.limit = scene, axes, store, repeat, limit
+        self.known, self.chosen, self.finer, self.measured, self.base = known, chosen, finer, measured, base
+        self.show = sys.stderr.isatty() if progress is None else progress
+
+    def run(self, setting: Setting) -> Outcome:
+        """The outcome of a setting beside those of the sweep."""
+        self.bar.total = (self.bar.total or 0) + 1
+        return self.point(setting, 1, None)
+
+    def point(self, setting: Setting, repeat: int, limit: float | None) -> Outcome:
+        """The outcome of a setting, run unless it is known."""
+        found = self.store.get(setting, repeat, limit)
+        if found is None:
+            self.bar.set_postfix_str(_short(setting, self.axes), refresh=True)
+            found = run_once(self.scene, setting, repeat=repeat, limit=limit)
+            self.store.put(setting, found)
+        self.bar.update()
+        return found
+
+    def rows(self, settings: Sequence[Setting]) -> tuple[list[Row], list[dict[str, Any]], dict[str, Motion]]:
+        """Rows of all settings; what references were; and those by the values of the physical parameters."""
+        from tqdm import tqdm
+
+        groups: dict[str, list[Setting]] = {}
+        for setting in settings:
+            groups.setdefault(self._problem(setting), []).append(setting)
+        motions: dict[str, Motion] = {}
+        references = []
+        with tqdm(desc=self.scene.name, unit="run", leave=False, disable=not self.show, file=sys.stderr) as self.bar:
+            self.bar.total = len(settings)
+            outcomes = {}
+            for name, group in groups.items():
+                known = self.known(group[0])
+                if known is None:
+                    best = finer_setting(group, self.axes, self.finer, self.base.dt or self.scene.dt)
+                    motions[name] = finer_motion(best, self.axes, self.chosen, self.run)
+                for setting in group:
+                    outcomes[id(setting)] = self.point(setting, self.repeat, self.limit)
+                done = [o for s in group if (o := outcomes[id(s)]).status == DONE]
+                if known is not None and done:
+                    motions[name] = known_motion(known, self.chosen, done[0], self.base.t_end)
+                if name in motions:
+                    m, values = motions[name], {k: group[0].get(k) for k in self.axes.physical}
+                    references.append(
+                        {"values": values, "about": m.about, "travel": m.travel, "own_error": m.own, "runs": m.runs}
+                    )
+        found = [outcomes[id(s)] for s in settings]
+        if all(o.status == REFUSED for o in found):
+            raise ModelError(found[0].why)
+        rows = [self._row(s, o, motions.get(self._problem(s))) for s, o in zip(settings, found)]
+        return with_pareto(with_orders(rows, self.axes)), references, motions
+
+    def _problem(self, setting: Setting) -> str:
+        return repr([setting.get(name) for name in self.axes.physical])
+
+    def _row(self, setting: Setting, outcome: Outcome, motion: Motion | None) -> Row:
+        swept = {name: setting.get(name) for name in self.axes.over}
+        n = outcome.numbers
+        row = Row(setting, swept, outcome.status, outcome.why)
+        if n:
+            names = ("compile_s", "setup_s", "steps", "newton", "pcg", "rough", "bytes", "unknowns", "elements")
+            row = replace(
+                row, seconds=statistics.median(n["seconds"]), seconds_min=min(n["seconds"]), repeats=len(n["seconds"]),
+                **{name: n[name] for name in names},
+            )  # fmt: skip
+        if outcome.status != DONE or motion is None:
+            return row
+        away: dict[str, Any] = distances(outcome, motion)
+        away["energy"] = n["drift"] / n["exchanged"] if n["exchanged"] > 0.0 else None
+        error, own = away[self.measured], motion.own.get(self.measured, 0.0)
+        if error is None:
+            needs = "a field=, and a reference that has one" if self.measured == "field" else "energy that is exchanged"
+            raise ModelError(f"study: no error by {self.measured!r} of scene {self.scene.name!r}: it needs {needs}")
+        digits = -math.log10(error * row.seconds) if error > 0.0 and row.seconds else None
+        return replace(
+            row, error=error, own_error=own, resolved=error > 0.0 and error >= RESOLVED * own, efficacy=digits, **away
+        )  # fmt: skip
+
+    def split(self, rows: list[Row], motions: dict[str, Motion], which: str, answer: Row | None) -> list[Row]:
+        """The rows with parts of the error where asked for."""
+        from tqdm import tqdm
+
+        done = [r for r in rows if r.status == DONE and r.error is not None]
+        if which == "none" or not done:
+            return rows
+        best = answer or max(done, key=lambda r: -math.inf if r.efficacy is None else r.efficacy)
+        out = []
+        with tqdm(
+            desc="parts of the error", unit="run", leave=False, disable=not self.show, file=sys.stderr
+        ) as self.bar:
+            for row in rows:
+                if row.error is not None and (which == "all" or row is best):
+                    motion = motions[self._problem(row.setting)]
+                    row = replace(row, split=parts_of_error(row.setting, self.axes, motion, self.run))
+                out.append(row)
+        return out
+
+
+def _short(setting: Setting, axes: Axes) -> str:
+    """A run in a few words, for the bar."""
+    step = f"dt={setting.dt:g}" if setting.dt is not None else f"error={setting.error:g}"
+    more = [f"{name}={setting.values[name]}" for name in axes.over if name in setting.values]
+    return " ".join([setting.method, step, *more])

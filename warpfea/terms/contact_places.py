@@ -1,0 +1,101 @@
+"""Where contact acts at a state: the deepest places of lumped contacts, gaps and forces of all points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..base.launch import Launcher
+from ..kernels.terms.contact_data import clock_struct
+from ..kernels.terms.contact_place import place_kernels
+from ..model.state import State
+from .contact_tables import ContactTables
+
+__all__ = ["Places", "at_points"]
+
+
+class Places:
+    """Lumped contacts of a model; see kernels/terms/contact_place.py.
+
+    Attributes:
+        kernels: device code.
+    """
+
+    def __init__(self, tables: ContactTables) -> None:
+        self.tables = tables
+        self.kernels = place_kernels(tables.model.dtype)
+
+    def choose(
+        self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
+        active: wp.array, changed: wp.array, *, fresh: int, settled: int = 0,
+    ) -> None:  # fmt: skip
+        """Take the deepest place of each lumped contact.
+
+        Args:
+            launch: of the device.
+            s: history, attempt, clock and row_start of the term's scratch.
+            time, u: [world] s, and displacements, at which places are compared.
+            state: displacements and velocities that the attempt begins from.
+            active: [world] where.
+            changed: [world] set to 1 where another point of a surface is the closest to the place.
+            fresh: an attempt begins.
+            settled: what follows is at a state, without motion.
+        """
+        k, t, B = self.kernels, self.tables, self.tables.model.worlds
+        groups = [group for group in t.groups if group.lumped]
+        for group in groups:
+            args = [t.data, group.data, s["history"], time, u, active, s["attempt"]]
+            launch(k.levels, (B, group.count, group.data.points), args)
+            launch(k.seek, (B, group.count), args)
+        args = [t.data, s["row_start"], active, fresh, s["attempt"], changed]
+        launch(k.pick_deepest, (B, len(t.contacts)), args)
+        for group in groups:
+            if group.data.moving:
+                args = [t.data, group.data, s["history"], s["clock"], *state, active, settled, s["attempt"]]
+                launch(k.take, (B, group.count), args)
+
+
+def at_points(term: Any, state: State, history: Any = None, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """See `Contact.at_points`; `term` is the term."""
+    m, t, B = term.model, term.tables, state.worlds
+    launch, laws = Launcher(m.device), m.terms.laws
+    K, P = len(t.colliders), t.points
+
+    def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=m.device)
+
+    every = wp.ones(B, dtype=wp.int32, device=m.device)
+    value = zeros((B, max(laws.count, 1)), wp.vec3d)
+    laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+    if history is None:
+
+        def take(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+            return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
+
+        history = term.history_of(take)
+    attempt = term.attempt_of(B, lambda _, shape, dtype: zeros(shape, dtype))
+    attempt.speed.fill_(1.0)
+    if "contact_place" in state.specs:  # statics puts its time back to 0
+        attempt.place, attempt.turn = history.place, history.turn
+    else:
+        launch(term.kernels.poses, (B, K), [t.data, history, value, every, attempt])
+        attempt.shift.zero_()
+        attempt.spin.zero_()
+    gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
+    for group in t.groups:
+        dim = (B, group.count, group.data.points)
+        launch(term.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
+    if term.places:
+        clock = clock_struct()()
+        clock.time, clock.still = state.time, 1
+        row_start = m.array("contact", t.row_start, wp.int32)
+        s = {"history": history, "attempt": attempt, "clock": clock, "row_start": row_start}
+        u, changed = state.displacement, zeros((B,), wp.int32)
+        term.places.choose(launch, s, state.time, u, (u, u), every, changed, fresh=1, settled=1)
+    for group in t.groups:
+        dim = (B, group.count, group.data.points)
+        args = [t.data, group.data, history, state.displacement, state.time, attempt, int(places), gap, force]
+        launch(term.books.at_points, dim, args)
+    return gap.numpy(), force.numpy()
