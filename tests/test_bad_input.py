@@ -152,7 +152,6 @@ def test_bad_input(case, tmp_path, monkeypatch):
 LATER = {
     "add_contact": lambda b, s: b.add_contact(s),
     "TriMesh": lambda b, s: wf.TriMesh,
-    "energy_momentum": lambda b, s: wf.Simulation(b.finalize(device="cpu"), dt=1.0, integrator="energy_momentum"),
     "set_parameter": lambda b, s: b.finalize(device="cpu").set_parameter("bar.E", 1.0),
     "GeneralizedAlpha": lambda b, s: wf.GeneralizedAlpha,
 }

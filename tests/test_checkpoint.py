@@ -53,7 +53,7 @@ def small(tmp_path_factory):
     return path, sim
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"])
 @pytest.mark.parametrize("damping", [None, DAMPED], ids=["elastic", "damped"])
 def test_a_resumed_run_equals_the_undisturbed_one(tmp_path, integrator, damping):
     path = tmp_path / "bar.npz"

@@ -447,7 +447,7 @@ LAWS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum"])
 @pytest.mark.parametrize("law", LAWS)
 @placed("plane", "rotation", "capsule")
 def test_the_ledger_closes(device, place, law, integrator):
@@ -521,7 +521,9 @@ SINGLE = [("default", "float32"), ("explicit", "float32"), ("smooth", "float32")
 
 
 @pytest.mark.parametrize(("law", "dtype"), [*((law, "float64") for law in LAWS), *SINGLE])
-@pytest.mark.parametrize(("integrator", "max_newton"), [("backward_euler", 30), ("bdf2", 30), ("backward_euler", 6)])
+@pytest.mark.parametrize(
+    ("integrator", "max_newton"), [("backward_euler", 30), ("bdf2", 30), ("energy_momentum", 30), ("backward_euler", 6)]
+)
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_resumed_run_with_live_contacts_equals_the_undisturbed_one(
     tmp_path, device, integrator, max_newton, law, dtype

@@ -24,7 +24,7 @@ def cube(gravity, density=1000.0):
 
 
 @pytest.mark.parametrize("name", LAWS)
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "generalized_alpha"])
 def test_a_free_body_falls_as_the_scheme_says(name, integrator):
     b, body = cube(LAWS[name])
     sim = wf.Simulation(b.finalize(device="cpu"), dt=0.01, integrator=integrator)

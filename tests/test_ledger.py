@@ -26,12 +26,15 @@ def totals(e, flip=None):
     return gain - sum(sign[n] * e[n] for n in ("work_loads", "work_supports", "work_fields"))
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"])
 @pytest.mark.parametrize("damping", [None, "incremental", "rate", "explicit"])
 def test_ledger_residual_is_the_unbalanced_work(damping, integrator):
     b, body = scene(damping)
     model = b.finalize(device="cpu")
-    sim = wf.Simulation(model, dt=4e-3, integrator=integrator, solver=wf.NewtonPCG(tol=1e-4))
+    conserves = integrator == "energy_momentum"
+    # the explicit form feeds modes that a step does not resolve, and nothing else damps them there
+    dt = 2e-4 if conserves and damping == "explicit" else 4e-3
+    sim = wf.Simulation(model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(tol=1e-4))
     start = {k: v.copy() for k, v in sim.energies().items()}
     sim.step(30)
     e = {k: v[0] - start[k][0] for k, v in sim.energies().items()}
@@ -39,8 +42,9 @@ def test_ledger_residual_is_the_unbalanced_work(damping, integrator):
     assert abs(e["unbalanced"]) > 1e-13 * size  # a loose tolerance leaves something to find
     assert abs(e["ledger_residual"] - e["unbalanced"]) < 1e-12 * size
     assert abs(totals(e) - e["unbalanced"]) < 1e-12 * size
+    assert not conserves or abs(e["integrator"]) < 1e-12 * size
     for name in COLUMNS:
-        if e[name] != 0.0:
+        if e[name] != 0.0 and not (name == "integrator" and conserves):
             assert abs(totals(e, flip=name) - e["unbalanced"]) > 1e-6 * size, name
     assert (e["viscous"] > 0.0) == (damping is not None)
     assert e["work_fields"] != 0.0

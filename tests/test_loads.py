@@ -145,7 +145,7 @@ def test_driven_nodes_follow_the_law_exactly():
         assert np.abs(sim.displacements(body)[0, moved] - expected).max() < 1e-14
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "generalized_alpha"])
 def test_driven_rotation_goes_round(integrator):
     b, body = one(material=wf.SVK(E=1e5, nu=0.3, density=1000.0, damping=wf.KelvinVoigt(100.0)))
     anchor, axis = np.array([0, 0.25, 0.125]), np.array([1.0, 0, 0])

@@ -116,12 +116,21 @@ def tip_errors(model, exact, integrator, h, t_end, halved):
 
 
 @pytest.mark.parametrize("halved", [False, True], ids=["uniform", "halved"])
-@pytest.mark.parametrize(("integrator", "order", "slack"), [("backward_euler", 1, 0.05), ("bdf2", 2, 0.1)])
-def test_order_of_convergence(cantilever, data, integrator, order, slack, halved):
+@pytest.mark.parametrize(
+    ("integrator", "hs", "order", "slack"),
+    [
+        ("backward_euler", (5e-4, 1.25e-4), 1, 0.05),
+        ("bdf2", (5e-4, 1.25e-4), 2, 0.1),
+        # between neighbouring steps its order scatters by 0.3, for high modes that gravity strikes are damped by little
+        ("generalized_alpha", (1e-3, 1.25e-4), 2, 0.1),
+        # it damps nothing: steps must resolve all that moves before errors fall evenly
+        pytest.param("energy_momentum", (6.25e-5, 3.125e-5), 2, 0.1, marks=slow),
+    ],
+)
+def test_order_of_convergence(cantilever, data, integrator, hs, order, slack, halved):
     ref = data.json("S3_exact_svk_q5")
     exact = np.array(ref["runs"]["reference"]["trajectory"]["tip_mean"])
     _, model = cantilever(ref)
-    hs = np.array([5e-4, 1.25e-4])
     worst = [tip_errors(model, exact, integrator, h, 0.03, halved).max() for h in hs]
     observed = np.log(worst[0] / worst[1]) / np.log(hs[0] / hs[1])
     assert observed == pytest.approx(order, abs=slack)
@@ -131,7 +140,11 @@ def test_order_of_convergence(cantilever, data, integrator, order, slack, halved
 @pytest.mark.parametrize("halved", [False, True], ids=["uniform", "halved"])
 @pytest.mark.parametrize(
     ("integrator", "hs", "order", "slack"),
-    [("backward_euler", (1e-3, 1.25e-4), 1, 0.05), ("bdf2", (5e-4, 3.125e-5), 2, 0.1)],
+    [
+        ("backward_euler", (1e-3, 1.25e-4), 1, 0.05),
+        ("bdf2", (5e-4, 3.125e-5), 2, 0.1),
+        ("energy_momentum", (5e-4, 3.125e-5), 2, 0.1),
+    ],
 )
 def test_order_of_convergence_over_a_longer_time(cantilever, data, integrator, hs, order, slack, halved):
     ref = data.json("S3_exact_svk_q5")
@@ -141,16 +154,19 @@ def test_order_of_convergence_over_a_longer_time(cantilever, data, integrator, h
     assert np.log(worst[0] / worst[1]) / np.log(hs[0] / hs[1]) == pytest.approx(order, abs=slack)
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
-def test_a_refused_step_equals_two_of_half_the_size(cantilever, data, integrator):
+@pytest.mark.parametrize(
+    ("integrator", "dt"),
+    [("backward_euler", 1e-3), ("bdf2", 1e-3), ("generalized_alpha", 1e-3), ("energy_momentum", 1.6e-3)],
+)
+def test_a_refused_step_equals_two_of_half_the_size(cantilever, data, integrator, dt):
     _, model = cantilever(data.json("S3_BE_svk_q4"))
     options = {"integrator": integrator, "ledger": False}
     ends = []
     for halves in (False, True):  # PCG is too weak for the whole step, and strong enough for a half
-        start = wf.Simulation(model, dt=1e-3, **options)
+        start = wf.Simulation(model, dt=dt, **options)
         start.step(10)
         weak = wf.NewtonPCG(tol=1e-9, max_newton=4, max_pcg=12, preconditioner="block-jacobi")
-        sim = wf.Simulation(model, start.state, dt=5e-4 if halves else 1e-3, solver=weak, **options)
+        sim = wf.Simulation(model, start.state, dt=dt / 2 if halves else dt, solver=weak, **options)
         report = sim.step(2 if halves else 1)
         assert report.converged.all()
         assert report.halvings[0] == (0 if halves else 1)

@@ -25,7 +25,7 @@ def rows(sim, world):
     return {name: values[world].tobytes() for name, values in sim.state.numpy().items() if name != "status"}
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"])
 def test_each_world_equals_its_own_run(integrator):
     model = builder().finalize(device="cpu", worlds=3)
     model.set_gravity(GRAVITIES)

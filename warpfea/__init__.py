@@ -66,6 +66,7 @@ from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
 from .simulation.checkpoint import Checkpoint  # noqa: E402
+from .simulation.integrators import GeneralizedAlpha  # noqa: E402
 from .simulation.simulation import Simulation, StepReport  # noqa: E402
 from .simulation.statics import solve_static  # noqa: E402
 from .solvers import Jacobi, NewtonPCG  # noqa: E402
@@ -86,6 +87,7 @@ __all__ = [
     "ElementSet",
     "Error",
     "GIFWriter",
+    "GeneralizedAlpha",
     "HalfSpace",
     "Jacobi",
     "Joint",
@@ -124,7 +126,6 @@ __all__ = [
 
 _LATER = {
     "TriMesh": "rigid triangle meshes",
-    "GeneralizedAlpha": "generalised-alpha steps",
 }
 
 

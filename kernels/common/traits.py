@@ -17,6 +17,7 @@ class Traits(NamedTuple):
         gated: constraints whose violation must fall below a tolerance, and whose multipliers change with the iterate.
         limited: terms may shorten a Newton step.
         walls: terms have forces that set in suddenly, such as contact.
+        midpoint: of the integrator: forces are those of the middle of a step and have no potential by its end.
     """
 
     nonpotential: bool = False
@@ -27,6 +28,7 @@ class Traits(NamedTuple):
     gated: bool = False
     limited: bool = False
     walls: bool = False
+    midpoint: bool = False
 
     def suffix(self, *names: str) -> str:
         """Part of a module's name that tells the traits in `names` that are there."""

@@ -27,6 +27,7 @@ def element_kernels(
     affine: bool,
     damping: str | None,
     framed: bool = False,
+    midpoint: bool = False,
 ) -> _types.SimpleNamespace:
     """Kernels of one kind of element block.
 
@@ -37,8 +38,10 @@ def element_kernels(
         affine: straight elements with parent gradients and one J0 each; False: a table of h_i per element and point.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         framed: the law has axes of its own at each point, `block.frame`.
+        midpoint: of the conserving scheme, see `point_functions` and conserving.py; u is half-way through the step and
+            v half of what u changes by. Energies and J are those at its end.
     """
-    fn = point_functions(dtype, law, slots, affine, damping, framed)
+    fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     NS, needs_J = fn.slots, fn.needs_J
@@ -46,7 +49,7 @@ def element_kernels(
     viscous = materials.svk(dtype)
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     form = "affine" if affine else "framed" if framed else "table"
-    name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}"
+    name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}{'_midpoint' if midpoint else ''}"
     module = kernel_module(name)
 
     @wp.kernel(module=module)
@@ -80,18 +83,25 @@ def element_kernels(
         psi_v = T(0.0)
         J_low = T(1.0e30)
         V = Local()
-        if wp.static(damping == "rate"):
+        if wp.static(fn.uses_v):
             V = fn.load(block, v, world, elem)
         dq = T(dq_dv[world])
         for point in range(lane, block.gradient.shape[0], lanes):
             G = fn.gradient_of(block, U, point, elem)
             w = fn.weight_of(block, point, elem)
-            J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
             local = fn.into_axes(block, G, point, elem)
-            P = m.stress(local, c)
-            psi += w * m.energy(local, c)
+            Fdot = fn.velocity_gradient(block, V, point, elem)
+            P = mat33()
+            if wp.static(midpoint):
+                J_low = wp.min(J_low, T(1.0) + t.volume_change(local + Fdot))
+                mean = fn.mean.mean_stress(local, Fdot, c)
+                P = mean + local * mean
+                psi += w * m.energy(local + Fdot, c)
+            else:
+                J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
+                P = m.stress(local, c)
+                psi += w * m.energy(local, c)
             if wp.static(damping == "incremental" or damping == "rate"):
-                Fdot = fn.velocity_gradient(block, V, point, elem)
                 rate = fn.strain_rate(block, local, Fdot, history, dq, world, point, elem)
                 S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
                 P = P + S + local * S
@@ -105,6 +115,8 @@ def element_kernels(
         if wp.static(needs_J):
             if low < domain_J[world]:
                 wp.atomic_min(domain_J, world, low)
+            if wp.static(midpoint):
+                U = U + V
             low = wp.min(low, wp.float64(fn.vertex_jacobian(block, U, elem)))
         if low < min_J[world]:
             wp.atomic_min(min_J, world, low)
@@ -168,7 +180,7 @@ def element_kernels(
         U = fn.load(block, u, world, elem)
         dU = fn.load(block, direction, world, elem)
         V = Local()
-        if wp.static(damping == "rate"):
+        if wp.static(fn.uses_v):
             V = fn.load(block, v, world, elem)
         f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), world, elem)
         fn.store(block, f, world, elem, contribution)
@@ -193,7 +205,7 @@ def element_kernels(
             contribution[world, block.contribution_offset + i * block.count + elem] = B
         for point in range(block.gradient.shape[0]):
             G = fn.gradient_of(block, U, point, elem)
-            w = fn.weight_of(block, point, elem)
+            w = fn.tangent_weight(block, point, elem)
             for i in range(NS):
                 a = vec3()
                 if wp.static(affine):
@@ -220,6 +232,6 @@ def element_kernels(
         largest_turn=largest_turn,
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,
-        **vars(matrix_kernels(dtype, law, slots, affine, damping, framed)),
+        **vars(matrix_kernels(dtype, law, slots, affine, damping, framed, midpoint)),
         **vars(output_kernels(fn, name, points)),
     )

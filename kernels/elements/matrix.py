@@ -42,16 +42,16 @@ def rows_type(dtype: str, slots: int):
 
 @functools.cache
 def matrix_kernels(
-    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool
+    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool, midpoint: bool = False
 ) -> _types.SimpleNamespace:
     """Kernels `prepare_matrix`, `element_matrix` and `element_rows` of one kind of element block (see element.py)."""
-    fn = point_functions(dtype, law, slots, affine, damping, framed)
+    fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     t, m, Block, Local, coef = fn.tensors, fn.law, fn.Block, fn.Local, fn.coef
     NS, needs_J = fn.slots, fn.needs_J
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
     form = "affine" if affine else "framed" if framed else "table"
-    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}"
+    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{'_midpoint' if midpoint else ''}"
     module = kernel_module(f"{name}_matrix", max_unroll=16)
     rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
     PANELS, P, _ = panels_of(NS)
@@ -87,10 +87,18 @@ def matrix_kernels(
         local = fn.into_axes(block, G, point, elem)
         F = t.identity() + G
         S = mat33()
+        if wp.static(midpoint):
+            if form == 0:
+                S = fn.mean.mean_stress(local, fn.velocity_gradient(block, V, point, elem), c)
         if wp.static(not needs_J):
-            S = m.stiffness(t.green(local), c)
-            if form == 1:
-                S += fn.compression(S) * t.identity()
+            if wp.static(midpoint):
+                if form == 1:
+                    S = m.stiffness(t.green(local), c)
+                    S += fn.compression(S) * t.identity()
+            else:
+                S = m.stiffness(t.green(local), c)
+                if form == 1:
+                    S += fn.compression(S) * t.identity()
         if wp.static(damping == "incremental" or damping == "rate"):
             if form == 0:
                 Fdot = fn.velocity_gradient(block, V, point, elem)
@@ -106,9 +114,17 @@ def matrix_kernels(
         return F, S
 
     @wp.func
+    def elastic(F: mat33, dF: mat33, c: coef) -> mat33:
+        """dP of a law that needs J > 0; `midpoint`: without the part of S, which `point_state` gives."""
+        if wp.static(midpoint):
+            return F * fn.mean.mean_increment(F - t.identity(), t.sym(wp.transpose(F) * dF), c)
+        else:
+            return m.increment(F - t.identity(), dF, c)
+
+    @wp.func
     def velocities(block: Block, v: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
-        """Velocities of an element's slots where its damping needs them (form "rate"), else zeros."""
-        if wp.static(damping == "rate"):
+        """Velocities of an element's slots where its damping needs them (form "rate") or `midpoint`, else zeros."""
+        if wp.static(fn.uses_v):
             return fn.load(block, v, world, elem)
         else:
             return Local()
@@ -217,10 +233,10 @@ def matrix_kernels(
                 if form == 1 or mixed[world] == 2:
                     dP += fn.stand_in(F, wp.outer(unit, h), c)
                 else:
-                    dP += m.increment(F - t.identity(), wp.outer(unit, h), c)
+                    dP += elastic(F, wp.outer(unit, h), c)
             if wp.static(framed):
                 dP = dP * wp.transpose(block.frame[point, elem])
-            dP = fn.weight_of(block, point, elem) * dP
+            dP = fn.tangent_weight(block, point, elem) * dP
             if wp.static(affine):
                 dP = dP * wp.transpose(fn.inverse_jacobian(block, elem))
             for a in range(NS):
@@ -281,7 +297,7 @@ def matrix_kernels(
                     if positive:
                         dP = fn.stand_in(F, dF, c)
                     else:
-                        dP = m.increment(F - t.identity(), dF, c)
+                        dP = elastic(F, dF, c)
                     for i in range(3):
                         for k in range(3):
                             A[3 * i + k, 3 * j + l] = A[3 * i + k, 3 * j + l] + dP[i, k]
@@ -341,7 +357,7 @@ def matrix_kernels(
                     h[a] = block.gradient[point, a, elem]
                 for l in range(3):
                     H[3 * (a / P) + l, a % P] = h[a][l]
-            A = elasticity(F, S, moduli, c, form == 1 or mixed[world] == 2, fn.weight_of(block, point, elem))
+            A = elasticity(F, S, moduli, c, form == 1 or mixed[world] == 2, fn.tangent_weight(block, point, elem))
             for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
                 D = Products()
                 for i in range(9):

@@ -20,6 +20,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
     """
     NQ = points
     history_module = kernel_module(f"{name}_history")
+    moving_module = kernel_module(f"{name}_history_moving")
     viscous_module = kernel_module(f"{name}_viscous")
     stress_module = kernel_module(f"{name}_stress")
     T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
@@ -46,6 +47,32 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
             if a1[world] != wp.float64(0.0):
                 U1 = fn.load(block, u1, world, elem)
                 E = E - T(a1[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U1, point, elem), point, elem))
+            history[world, fn.history_index(block, point, elem)] = fn.pack(E)
+
+    @wp.kernel(module=moving_module)
+    def moving_history(
+        block: Block,
+        u: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        a: wp.array2d(dtype=vec3),
+        b: wp.array(dtype=wp.float64),
+        q_a: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        history: wp.array2d(dtype=sym6),
+    ):
+        """E + b dE/dt + q_a d2E/dt2 per point in the law's axes: the same, by schemes that take velocity and a."""
+        world, elem = wp.tid()
+        if active[world] == 0:
+            return
+        U = fn.load(block, u, world, elem)
+        V = fn.load(block, v, world, elem)
+        A = fn.load(block, a, world, elem)
+        for point in range(NQ):
+            G = fn.into_axes(block, fn.gradient_of(block, U, point, elem), point, elem)
+            D = fn.into_axes(block, fn.gradient_of(block, V, point, elem), point, elem)
+            F = wp.transpose(t.identity() + G)
+            bend = wp.transpose(D) * D + F * fn.into_axes(block, fn.gradient_of(block, A, point, elem), point, elem)
+            E = t.green(G) + T(b[world]) * t.sym(F * D) + T(q_a[world]) * t.sym(bend)
             history[world, fn.history_index(block, point, elem)] = fn.pack(E)
 
     @wp.kernel(module=viscous_module)
@@ -94,4 +121,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
             stress[world, point, elem] = fn.pack((T(1.0) / J) * (P + P * wp.transpose(G)))
             jacobian[world, point, elem] = J
 
-    return _types.SimpleNamespace(strain_history=strain_history, viscous_force=viscous_force, point_stress=point_stress)
+    return _types.SimpleNamespace(
+        strain_history=strain_history, moving_history=moving_history, viscous_force=viscous_force,
+        point_stress=point_stress,
+    )  # fmt: skip

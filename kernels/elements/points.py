@@ -12,6 +12,7 @@ import warp as wp
 
 from ..common.types import precision
 from . import materials
+from .conserving import conserving_law
 from .load import load_functions, local_type
 
 __all__ = ["block_struct", "point_functions"]
@@ -49,13 +50,19 @@ def block_struct(dtype: str):
 
 @functools.cache
 def point_functions(
-    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool
+    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool, midpoint: bool = False
 ) -> _types.SimpleNamespace:
-    """Device functions for one kind of element block; the arguments are those of `element_kernels`."""
+    """Device functions for one kind of element block; the arguments are those of `element_kernels`.
+
+    With `midpoint` the slots' values are those half-way between both ends of a step, in the place of velocities stands
+    half of what they change by, and K is the symmetric approximation of the derivative by the values at the end.
+    """
     p = precision(dtype)
     T, mat33, sym6 = p.T, p.mat33, p.sym
     t = materials.tensors(dtype)
     m = materials.law(law, dtype)
+    mean = conserving_law(law, dtype)
+    uses_v = midpoint or damping == "rate"
     Block = block_struct(dtype)
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
@@ -113,6 +120,14 @@ def point_functions(
             return block.weight[point, elem]
 
     @wp.func
+    def tangent_weight(block: Block, point: int, elem: int) -> T:
+        """w of a point in K: `midpoint`: half of what a force is taken at moves with the end of a step."""
+        if wp.static(midpoint):
+            return T(0.5) * weight_of(block, point, elem)
+        else:
+            return weight_of(block, point, elem)
+
+    @wp.func
     def scatter(block: Block, f: Local, P: mat33, point: int, elem: int) -> Local:
         """f_i += w P h_i: what a point adds to the forces of Eq. (32)."""
         Q = weight_of(block, point, elem) * P
@@ -161,8 +176,8 @@ def point_functions(
 
     @wp.func
     def velocity_gradient(block: Block, V: Local, point: int, elem: int) -> mat33:
-        """Fdot in the law's axes (1/s) for damping of the form "rate", Eq. (60); else zero."""
-        if wp.static(damping == "rate"):
+        """Fdot in the law's axes (1/s) for damping of the form "rate", Eq. (60); `midpoint`: half of dF; else zero."""
+        if wp.static(uses_v):
             return into_axes(block, gradient_of(block, V, point, elem), point, elem)
         else:
             return mat33()
@@ -174,10 +189,13 @@ def point_functions(
         """Edot at a point in the law's axes, 1/s.
 
         Damping of the form "incremental": (E - history)/dq. "rate": Eq. (58) with F and Fdot at the new state.
+        `midpoint`: (E1 - E0)/h, h = 2 dq, which is Eq. (58) with the mean Fdot.
         """
         if wp.static(damping == "incremental"):
             past = unpack(history[world, history_index(block, point, elem)])
             return (T(1.0) / dq) * (t.green(G) - past)
+        elif wp.static(midpoint):
+            return (T(1.0) / dq) * t.sym(Fdot + wp.transpose(G) * Fdot)
         else:
             return t.sym(wp.transpose(t.identity() + G) * Fdot)
 
@@ -251,12 +269,20 @@ def point_functions(
         """dP of a change dG at a point in the body's axes, damping included: the integrand of the tangent product."""
         local = into_axes(block, G, point, elem)
         change = into_axes(block, dG, point, elem)
-        dP = m.increment(local, change, c)
+        dP = mat33()
+        if wp.static(midpoint):
+            F = t.identity() + local
+            S = mean.mean_stress(local, Fdot, c)
+            dP = change * S + F * mean.mean_increment(local, t.sym(wp.transpose(F) * change), c)
+        else:
+            dP = m.increment(local, change, c)
         if wp.static(damping == "incremental" or damping == "rate"):
             F = t.identity() + local
             S = t.isotropic(strain_rate(block, local, Fdot, history, dq, world, point, elem), c[LAMBDA_V], c[ETA])
             dS = t.isotropic(t.sym(wp.transpose(F) * change), c[LAMBDA_V] / dq, c[ETA] / dq)
             dP = dP + change * S + F * dS
+        if wp.static(midpoint):
+            dP = T(0.5) * dP
         return out_of_axes(block, dP, point, elem)
 
     @wp.func
@@ -283,7 +309,7 @@ def point_functions(
 
     return _types.SimpleNamespace(
         types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
-        framed=framed, needs_J=needs_J,
+        framed=framed, needs_J=needs_J, midpoint=midpoint, uses_v=uses_v, mean=mean, tangent_weight=tangent_weight,
         coefficients=coefficients, damping_coefficients=damping_coefficients, load=load, store=store,
         inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
         weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,

@@ -1,8 +1,8 @@
-"""Elements with assumed natural shear strain (Dvorkin and Bathe 1984): force, energy, tangent product and matrices.
+"""Elements with assumed natural strain (Dvorkin and Bathe 1984): force, energy, tangent product and matrices.
 
-Covariant shears e_t = 2 E_ab = x_a . x_b - X_a . X_b are taken at tying points ("ties") t, where x_a and x_b are the
-derivatives of the position along two parent directions. Interpolation, metric and quadrature are one symmetric matrix A
-per element, made on the host: the energy is (mu/2) e.A e, J.
+Strains e_t = 2 E_ab = x_a . x_b - X_a . X_b, mostly shears, are taken at tying points ("ties") t, where x_a and x_b are
+the derivatives of the position along two parent directions or two axes of the element. Interpolation, metric and
+quadrature are one symmetric matrix A per element, made on the host: the energy is (mu/2) e.A e, J.
 """
 
 import functools
@@ -13,48 +13,26 @@ import warp as wp
 from ..common.types import kernel_module, precision
 from .load import load_functions, local_type
 from .matrix import UNROLL, panels_of, row_of, rows_type
+from .tied_block import tied_struct
 
-__all__ = ["tied_kernels", "tied_struct"]
-
-
-@functools.cache
-def tied_struct(dtype: str):
-    """The constant data of a block of tied elements, in one precision."""
-    p = precision(dtype)
-    T, vec3 = p.T, p.vec3
-
-    @wp.struct
-    class TiedBlock:
-        conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
-        is_position: wp.array(dtype=T)  # [local]
-        first: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_a
-        second: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
-        X_first: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
-        X_second: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
-        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A; k counts within the run of ties that it couples
-        material: wp.array(dtype=wp.int32)  # [elem]
-        coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
-        contribution_offset: wp.int32
-        element_offset: wp.int32
-        history_offset: wp.int32
-        count: wp.int32
-
-    return TiedBlock
+__all__ = ["tied_kernels"]
 
 
 @functools.cache
-def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.SimpleNamespace:
+def tied_kernels(dtype: str, slots: int, ties: int, width: int, midpoint: bool = False) -> _types.SimpleNamespace:
     """Kernels of tied elements; they take the arguments of `element_kernels`, so that one loop launches both.
 
     Args:
         dtype: precision.
         slots, ties: slots and tying points per element.
         width: A couples the ties of each run of `width`.
+        midpoint: of the conserving scheme: u is half-way through the step, v half of what u changes by; the shears in
+            forces and products are the mean of those at both ends, and the energy is that at the end.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Block = tied_struct(dtype)
-    name = f"tied_{dtype}_{slots}_{ties}_{width}"
+    name = f"tied_{dtype}_{slots}_{ties}_{width}{'_midpoint' if midpoint else ''}"
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
     Local = local_type(dtype, slots)
@@ -102,6 +80,22 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         return out
 
     @wp.func
+    def mean_shears(block: Block, D: Local, e: Ties, elem: int) -> Ties:
+        """The mean of the shears at both ends of a step, m^2: e half-way, and the slots' half change D."""
+        out = e
+        for t in range(NT):
+            out[t] = out[t] + wp.dot(line(block.first, D, t, elem), line(block.second, D, t, elem))
+        return out
+
+    @wp.func
+    def half(x: T) -> T:
+        """Of a stiffness: `midpoint`: what it is taken at moves by half of the end."""
+        if wp.static(midpoint):
+            return T(0.5) * x
+        else:
+            return x
+
+    @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
         """s = mu A e, the derivative of the energy by the shears, N/m."""
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
@@ -128,6 +122,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             dd = ds[t] * x2[t] + s[t] * line(block.second, P, t, elem)
             for i in range(NS):
                 f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
+        if wp.static(midpoint):
+            f = T(0.5) * f
         return f
 
     @wp.kernel(module=module)
@@ -150,7 +146,13 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             return
         U = load(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
-        s = stresses(block, e, world, elem)
+        s = Ties()
+        if wp.static(midpoint):
+            D = load(block, v, world, elem)
+            s = stresses(block, mean_shears(block, D, e, elem), world, elem)
+            _, _, e = kinematics(block, U + D, elem)
+        else:
+            s = stresses(block, e, world, elem)
         f = Local()
         for t in range(NT):
             a = s[t] * x1[t]
@@ -158,6 +160,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             for i in range(NS):
                 f[i] = f[i] + block.first[t, i, elem] * d + block.second[t, i, elem] * a
         store(block, f, world, elem, contribution)
+        if wp.static(midpoint):
+            s = stresses(block, e, world, elem)
         energy[0, world, block.element_offset + elem] = wp.float64(T(0.5) * wp.dot(e, s))
         energy[1, world, block.element_offset + elem] = wp.float64(0.0)
 
@@ -179,6 +183,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         U = load(block, u, world, elem)
         P = load(block, direction, world, elem)
         x1, x2, e = kinematics(block, U, elem)
+        if wp.static(midpoint):
+            e = mean_shears(block, load(block, v, world, elem), e, elem)
         store(block, tangent_force(block, P, x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=mixed_module)
@@ -236,7 +242,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                     row += block.coupling[t, k, elem] * b[first + k]
                 K += wp.outer(b[t], row)
             entry = block.contribution_offset + i * block.count + elem
-            contribution[world, entry] = mu * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
+            contribution[world, entry] = half(mu) * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
 
     @wp.kernel(module=matrix_module)
     def prepare_matrix(
@@ -268,6 +274,9 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         a = block.X_first[tie, elem] + da
         d = block.X_second[tie, elem] + dd
         shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
+        if wp.static(midpoint):
+            D = load(block, v, world, elem)
+            shear += wp.dot(line(block.first, D, tie, elem), line(block.second, D, tie, elem))
         if mixed[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
             factor = T(dq_dv[world]) * T(dq_dv[world])
@@ -294,7 +303,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         if mixed[world] == 2:
             mu = T(0.0)  # no geometric part
-        lines[world, 3 * NT + tie, elem] = vec3(mu * s, T(0.0), T(0.0))
+        lines[world, 3 * NT + tie, elem] = vec3(half(mu) * s, T(0.0), T(0.0))
 
     @wp.kernel(module=matrix_module)
     def element_matrix(
@@ -315,7 +324,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         elem = index % block.count
         b = column / 3
         axis = column % 3
-        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        mu = half(block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         unit = vec3()
         unit[axis] = T(1.0)
         change = Ties()
@@ -363,7 +372,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
+        mu = half(block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         U = load(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         first, second, B = Slots(), Slots(), Changes()
@@ -382,6 +391,8 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
             change = load(block, v, world, elem) - load(block, base, world, elem)
             e = foreseen(block, T(dq_dv[world]) * change, e, elem)
         stress = Ties()
+        if wp.static(midpoint):
+            e = mean_shears(block, load(block, v, world, elem), e, elem)
         if form != 1 and mixed[world] != 2:
             stress = stresses(block, e, world, elem)
         if add == 0:
@@ -412,7 +423,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int) -> _types.Simple
                             c = B[3 * (row + o) + i, n]
                             for j in range(3):
                                 R[3 * i + j] = R[3 * i + j] + c * AB[3 * t + j]
-                        G = stress[t] * (
+                        G = half(stress[t]) * (
                             second[row + o, n] * first[NT * panel + t] + first[row + o, n] * second[NT * panel + t]
                         )
                         for i in range(3):

@@ -50,7 +50,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
         fn: functions of points.py.
         shared: functions of cluster.py.
     """
-    p, rate = fn.types, fn.damping == "rate"
+    p, rate = fn.types, fn.uses_v
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Pool, fetch, set_force, add_force = shared.Pool, shared.fetch, shared.set_force, shared.add_force
     Block, coefficients, inverse_jacobian, point_increment = (

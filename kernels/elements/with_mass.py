@@ -14,7 +14,14 @@ __all__ = ["with_mass_kernel"]
 
 @functools.cache
 def with_mass_kernel(
-    dtype: str, law: str, slots: int, points: int, damping: str | None, vertex: bool, size: int
+    dtype: str,
+    law: str,
+    slots: int,
+    points: int,
+    damping: str | None,
+    vertex: bool,
+    size: int,
+    midpoint: bool = False,
 ) -> wp.Kernel:
     """The kernel `with_mass_product` of one kind of straight elements.
 
@@ -25,14 +32,16 @@ def with_mass_kernel(
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         vertex: 10-node tetrahedra with a rule that kernels/elements/vertex.py handles.
         size: elements of a cluster.
+        midpoint: of the conserving scheme, see `point_functions`.
     """
-    fn = point_functions(dtype, law, slots, True, damping, False)
+    fn = point_functions(dtype, law, slots, True, damping, False, midpoint)
     T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
     Block, Local, NS = fn.Block, fn.Local, fn.slots
-    shared = cluster_functions(dtype, size, slots, 3 if damping == "rate" else 2)
+    shared = cluster_functions(dtype, size, slots, 3 if fn.uses_v else 2)
     Pool = shared.Pool
     # unrolled loops over slots keep them in registers; the loops over points are longer and stay loops
-    name = f"with_mass_{dtype}_{law}_{slots}_{points}_{'vertex' if vertex else 'affine'}_{damping}_{size}"
+    form = "vertex" if vertex else "affine"
+    name = f"with_mass_{dtype}_{law}_{slots}_{points}_{form}_{damping}_{size}{'_midpoint' if midpoint else ''}"
     module = kernel_module(name, max_unroll=16, block_dim=size)
 
     if vertex:
@@ -56,7 +65,7 @@ def with_mass_kernel(
             u = fetch_all(block, pool, U, at)
             du = fetch_all(block, pool, DIRECTION, at)
             v = Local()
-            if wp.static(damping == "rate"):
+            if wp.static(fn.uses_v):
                 v = fetch_all(block, pool, V, at)
             f = fn.tangent_force(block, u, du, v, history, dq, world, elem)
             first = shared.fetch(pool, DIRECTION, 0, at)
@@ -69,5 +78,5 @@ def with_mass_kernel(
                 shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
 
     # measured for this kind: the bound makes it spill few registers; for others the compiler chooses
-    bounded = vertex and law == "svk" and damping is None
+    bounded = vertex and law == "svk" and damping is None and not midpoint
     return shared.by_clusters(module, Block, product, bounded)

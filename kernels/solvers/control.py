@@ -88,6 +88,8 @@ def control_struct():
         stepped: wp.array(dtype=wp.int32)  # the trial was accepted
         outer: wp.array(dtype=wp.int32)  # multiplier updates of this step
         constraint_tol: wp.float64  # m
+        constraint_pace: wp.float64  # m/s^2: it also is this times (dq/dv)^2, but not below `constraint_least`; 0: not
+        constraint_least: wp.float64  # m
         open: wp.array(dtype=wp.float64)  # largest violation over its tolerance; with constraints
         slack: wp.float64  # norm of PCG over the norm that is judged, across constraints
         classical: wp.int32  # multipliers change in an outer loop

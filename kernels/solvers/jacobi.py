@@ -12,6 +12,7 @@ import warp as wp
 from ..common.traits import Traits
 from ..common.types import kernel_module, precision
 from .control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_NAN, control_struct
+from .judging import judging_functions
 from .newton import newton_kernels
 from .pcg import pcg_struct
 
@@ -53,6 +54,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
     shared = newton_kernels(dtype, traits)
     measure, record, accept = shared.measure, shared.record, shared.accept
+    closure = judging_functions(traits).closure
     paired = acceleration in ("secants", "anderson")
     module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'gated', 'limited')}")
 
@@ -82,7 +84,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             if ctl.norm[world] > jac.growth * jac.first_norm[world]:
                 ctl.failed[world] = FAIL_GROWTH
             if wp.static(traits.gated):
-                if ctl.open[world] * ctl.constraint_tol > jac.gap:
+                if ctl.open[world] * closure(ctl, world, ctl.constraint_tol) > jac.gap:
                     ctl.failed[world] = FAIL_CONSTRAINT
             if ctl.failed[world] == 0:
                 ctl.rough[world] = 1

@@ -23,6 +23,8 @@ FLOOR = 16.0
 PREDICTED = 1.0e-3
 STALLED = 0.5
 """A reduction of the residual that is no better than this is none."""
+CLOSING = 4
+"""Iterations in which constraints are closed to what accelerations need, where `constraint_tol` asks for less."""
 NEAR = 1.0e3
 """Roundings of the positions, as they change the residual, within which a stall may be put down to rounding."""
 SETTLING = 10.0
@@ -42,10 +44,10 @@ TRIES = 3
 
 @functools.cache
 def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """The functions; of the traits "stored" and "gated" count."""
+    """The functions; of the traits "stored", "gated" and "midpoint" count."""
     f64 = wp.float64
     Control = control_struct()
-    stored, gated = traits.stored, traits.gated
+    stored, gated, midpoint = traits.stored, traits.gated, traits.midpoint
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
@@ -55,7 +57,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         is the residual, Eq. (17). Of the sums over a world: inertia and the forces held, f_held (dead loads, and forces
         without a potential as the search began), are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc, J, are
         elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is term_sums[0].
+        With the trait "midpoint" there is no Phi: half of the squared D^-1 norm of the residual stands in its place.
         """
+        if wp.static(midpoint):
+            return ctl.slot_sums[4, world]
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
         if wp.static(stored):
             energy += ctl.term_sums[0, world]
@@ -68,6 +73,17 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if wp.static(stored):
             energy += ctl.term_sums[2, world]
         return ctl.slot_sums[5, world] + energy / ctl.dq_dv[world]
+
+    @wp.func
+    def closure(ctl: Control, world: int, tol: f64) -> f64:
+        """Violation that is allowed, m: accelerations in the state are off by it over (dq/dv)^2.
+
+        Far from the reference, where places are rounded by more, a few iterations look for it in vain.
+        """
+        if ctl.constraint_pace > f64(0.0) and tol < f64(1.0e200) and ctl.iterations[world] < CLOSING:
+            pace = ctl.constraint_pace * ctl.dq_dv[world] * ctl.dq_dv[world]
+            return wp.min(tol, wp.max(pace, ctl.constraint_least))
+        return tol
 
     @wp.func
     def largest_violation(ctl: Control, world: int) -> f64:
@@ -111,9 +127,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 accept = f64(PREDICTED) * accept  # what is left would add up over steps that none solves for
             loud = norm > accept
             if wp.static(gated):
-                if ctl.violation[world, c] > ctl.constraint_tol:
+                allowed = closure(ctl, world, ctl.constraint_tol)
+                if ctl.violation[world, c] > allowed:
                     loud = True
-                    excess = wp.max(excess, ctl.violation[world, c] / ctl.constraint_tol)
+                    excess = wp.max(excess, ctl.violation[world, c] / allowed)
                     floor_excess = f64(1.0e300)
             ctl.quiet[world, c] = wp.where(loud, 0, 1)
             if loud:
@@ -128,7 +145,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             largest = wp.max(largest, ratio)
             excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))
         if wp.static(gated):
-            ctl.open[world] = largest_violation(ctl, world) / ctl.constraint_tol
+            ctl.open[world] = largest_violation(ctl, world) / closure(ctl, world, ctl.constraint_tol)
         ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
         ctl.relative[world] = largest
         ctl.excess[world] = excess
@@ -215,7 +232,13 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def fail(ctl: Control, world: int, why: int):
         """No step was found. Where rounding alone may explain that, stand still and ask for the error that is left."""
         near = ctl.floor_excess[world] <= f64(NEAR) and ctl.iterations[world] > 0 and ctl.strict_count[world] < TRIES
-        if near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
+        enough = False
+        if wp.static(gated):  # only accelerations ask for more, and rounding does not give it
+            if ctl.constraint_pace > f64(0.0) and ctl.relative[world] <= ctl.tol + f64(FLOOR) * ctl.eps:
+                enough = largest_violation(ctl, world) <= ctl.constraint_tol
+        if enough and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
+            accept(ctl, world)
+        elif near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             ask(ctl, world)
             ctl.alpha[world] = f64(0.0)
         elif (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE) and ctl.eta[world] < f64(1.0e30):
@@ -224,6 +247,6 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             give_up(ctl, world, why)
 
     return _types.SimpleNamespace(
-        objective=objective, magnitude=magnitude, largest_violation=largest_violation, measure=measure, record=record,
-        accept=accept, ask=ask, patience=patience, give_up=give_up, settle=settle, fail=fail,
+        objective=objective, magnitude=magnitude, closure=closure, largest_violation=largest_violation, measure=measure,
+        record=record, accept=accept, ask=ask, patience=patience, give_up=give_up, settle=settle, fail=fail,
     )  # fmt: skip

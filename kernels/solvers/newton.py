@@ -52,17 +52,18 @@ HOPELESS = 3.0
 def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     """Kernels of the Newton iteration in one precision of the vectors; scalars are float64.
 
-    Of the traits "stored", "gated" and "limited" count.
+    Of the traits "stored", "gated", "limited", "walls" and "midpoint" count.
     """
     f64 = wp.float64
     Control = control_struct()
     PCG = pcg_struct()
     stored, gated, limited, walls = traits.stored, traits.gated, traits.limited, traits.walls
+    midpoint = traits.midpoint
     judging = judging_functions(traits)
     objective, magnitude = judging.objective, judging.magnitude
     measure, settle, fail = judging.measure, judging.settle, judging.fail
     accept, give_up, record, patience = judging.accept, judging.give_up, judging.record, judging.patience
-    module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited', 'walls')}")
+    module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited', 'walls', 'midpoint')}")
 
     @wp.kernel(module=module)
     def reset_min_J(ctl: Control, active: wp.array(dtype=wp.int32)):
@@ -117,6 +118,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         Euler and a third of which for BDF2.
         """
         phi = objective(ctl, world)
+        if wp.static(midpoint):
+            return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
         bound = ctl.potential[world] / ctl.dq_dv[world] + f64(HOPELESS) * ctl.slot_sums[10, world]
         bound += f64(NOISE) * ctl.eps * magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
@@ -155,13 +158,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             better[world] = 1
             if first == 0:
                 ctl.predicted[world] = 0
-
-    @wp.kernel(module=module)
-    def free_step(ctl: Control):
-        """Before terms limit a step: the full one."""
-        world = wp.tid()
-        if ctl.active[world] != 0:
-            ctl.limit[world] = f64(1.0)
 
     @wp.func
     def lost(ctl: Control, world: int) -> bool:
@@ -328,6 +324,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
         if wp.static(stored):
             ctl.stepped[world] = 1
+        if wp.static(stored and not midpoint):
             more = ctl.term_sums[1, world] - ctl.term_sums[0, world]
             ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
         ctl.phi_magnitude[world] = magnitude(ctl, world)
@@ -396,6 +393,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
             else:
                 good = ctl.slot_sums[6, world] - alpha * bend <= f64(WOLFE) * wp.abs(ctl.slope[world])
+            if wp.static(midpoint):
+                good = finite and change <= f64(-2.0) * f64(ARMIJO) * alpha * old_phi
             if ctl.nonpotential != 0 and norm <= f64(0.5) * old_norm:
                 good = True
         if ctl.domain_J[world] <= f64(0.0):
@@ -408,6 +407,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         wishes = finite and not (good or stands or reused) and ctl.searches[world] == 0
         wishes = wishes and ctl.wish[world] == 0 and ctl.negative[world] == 0
         wishes = wishes and (ctl.tame[world] == 0 or ctl.mixed[world] == 2)
+        if wp.static(midpoint):
+            wishes = False
         if wp.static(walls):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
             wishes = wishes and ctl.refreshed[world] == 0 and ctl.excursions[world] < EXCURSIONS
         leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
@@ -421,13 +422,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.restoring[world] = 1
         else:
             shorten(ctl, world, reused)
-
-    @wp.kernel(module=module)
-    def any_set(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
-        """out[0] = 1 where any world's flag is set; out must be 0 before."""
-        world = wp.tid()
-        if flags[world] != 0:
-            wp.atomic_max(out, 0, 1)
 
     vectors = vector_kernels(dtype, module)
     outer = outer_kernels(traits, module)
@@ -443,8 +437,6 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         plan_leap=plan_leap,
         compare=compare,
         judge_floor=judge_floor,
-        free_step=free_step,
         begin_search=begin_search,
         judge_trial=judge_trial,
-        any_set=any_set,
     )

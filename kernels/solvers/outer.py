@@ -1,4 +1,4 @@
-"""What goes around Newton's iteration: multipliers of the classical method, and what terms hold while it solves."""
+"""What goes around Newton's iteration: multipliers of the classical method, what terms hold or limit."""
 
 import types as _types
 
@@ -22,6 +22,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     f64 = wp.float64
     Control = control_struct()
     judging = judging_functions(traits)
+    closure = judging.closure
     objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
     measure, settle, record, give_up = judging.measure, judging.settle, judging.record, judging.give_up
 
@@ -72,7 +73,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         ctl.stepped[world] = 0
         if running[world] == 0 or ctl.failed[world] != 0:
             return
-        if largest_violation(ctl, world) <= tol:
+        if largest_violation(ctl, world) <= closure(ctl, world, tol):
             return
         if ctl.outer[world] >= limit:
             ctl.failed[world] = FAIL_CONSTRAINT
@@ -84,4 +85,13 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         ctl.active[world] = 1
         ctl.stepped[world] = 1
 
-    return _types.SimpleNamespace(judge_outer=judge_outer, begin_refresh=begin_refresh, end_refresh=end_refresh)
+    @wp.kernel(module=module)
+    def free_step(ctl: Control):
+        """Before terms limit a step: the full one."""
+        world = wp.tid()
+        if ctl.active[world] != 0:
+            ctl.limit[world] = f64(1.0)
+
+    return _types.SimpleNamespace(
+        free_step=free_step, judge_outer=judge_outer, begin_refresh=begin_refresh, end_refresh=end_refresh
+    )

@@ -155,6 +155,13 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         if active[world] != 0:
             rows[0, world, slot] = f64(wp.dot(a[world, slot], b[world, slot]))
 
+    @wp.kernel(module=module)
+    def any_set(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+        """out[0] = 1 where any world's flag is set; out must be 0 before."""
+        world = wp.tid()
+        if flags[world] != 0:
+            wp.atomic_max(out, 0, 1)
+
     return _types.SimpleNamespace(
         component_partial=component_partial,
         component_sum=component_sum,
@@ -164,4 +171,5 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         set_base=set_base,
         floor_partial=floor_partial,
         dot_rows=dot_rows,
+        any_set=any_set,
     )

@@ -31,8 +31,9 @@ REACTION = wp.constant(wp.float64(1.0e-6))
 
 @functools.cache
 def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """Kernels over slots. Of the traits "nonpotential", "tangent", "pooled" and "ties" count."""
+    """Kernels over slots. Of the traits "nonpotential", "tangent", "pooled", "ties" and "midpoint" count."""
     nonpotential, tangent, pooled, ties = traits.nonpotential, traits.tangent, traits.pooled, traits.ties
+    midpoint = traits.midpoint
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
@@ -42,7 +43,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     Pattern = pattern_struct()
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     free_inverse = inverse_function(dtype)
-    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'ties')}"
+    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'ties', 'midpoint')}"
     module = kernel_module(f"gather_{name}", max_unroll=SMALL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
 
@@ -93,6 +94,30 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             f += contribution[world, topo.entry[k]]
         return f
 
+    @wp.func
+    def pooled_force(topo: Topology, balance: Balance, world: int, slot: int) -> vec3:
+        """Sum of the pooled terms' forces on a slot, in order."""
+        f = vec3()
+        for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
+            f += balance.pool_force[world, topo.pool_entry[k]]
+        return f
+
+    @wp.func
+    def sought(balance: Balance, world: int, slot: int) -> vec3:
+        """What the Newton step is solved for."""
+        if wp.static(ties):
+            return balance.gradient[world, slot]
+        else:
+            return balance.g[world, slot]
+
+    @wp.func
+    def square(a: vec3) -> f64:
+        """a.a, of forces that float32 can't hold the square of."""
+        s = f64(0.0)
+        for k in range(3):
+            s += f64(a[k]) * f64(a[k])
+        return s
+
     @wp.kernel(module=module)
     def gather_force(
         topo: Topology,
@@ -125,9 +150,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         f = gathered(topo, contribution, world, slot)
         own = f
         if wp.static(pooled):
-            of_pool = vec3()
-            for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
-                of_pool += balance.pool_force[world, topo.pool_entry[k]]
+            of_pool = pooled_force(topo, balance, world, slot)
             f += of_pool
         a, past = vec3(), vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
@@ -172,19 +195,17 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         balance.rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
         balance.rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
         balance.rows[4, world, slot] = f64(kinetic - work)
+        if wp.static(midpoint):  # there is no Phi: half of the square of what the Newton step is solved for
+            balance.rows[4, world, slot] = f64(0.5) * weighted(wp.cw_mul(sought(balance, world, slot), free), D)
         balance.rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
         balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
         balance.rows[7, world, slot] = f64(0.0)
-        if wp.static(nonpotential):
+        if wp.static(nonpotential and not midpoint):
             balance.rows[7, world, slot] = f64(
                 wp.dot(balance.nonpotential_held[world, slot] - balance.nonpotential[world, slot], vs)
             )
         balance.rows[8, world, slot] = spread(balance, free, D, world, slot)
-        plain = wp.cw_mul(residual_force, free)
-        square = f64(0.0)  # of forces that float32 can't hold the square of
-        for k in range(3):
-            square += f64(plain[k]) * f64(plain[k])
-        balance.rows[9, world, slot] = square
+        balance.rows[9, world, slot] = square(wp.cw_mul(residual_force, free))
         motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
         balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)
 

@@ -58,8 +58,11 @@ def booked_struct():
 
 
 @functools.cache
-def ledger_kernels(dtype: str, multistep: bool, nonpotential: bool, module: wp.Module) -> _types.SimpleNamespace:
-    """Kernels of the energy ledger, in the module of the step's; arguments as those of `step_kernels`."""
+def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Module) -> _types.SimpleNamespace:
+    """Kernels of the energy ledger, in the module of the step's; arguments as those of `step_kernels`.
+
+    `chord`: the inertia's part of the integrator's work is its work along the chord less the change of kinetic energy.
+    """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
@@ -133,7 +136,7 @@ def ledger_kernels(dtype: str, multistep: bool, nonpotential: bool, module: wp.M
         viscous = implicit + held
         loads = sums[2, world] + held - sums[3, world]
         numerical = sums[1, world] - change_W - implicit
-        if wp.static(multistep):
+        if wp.static(chord):
             numerical += sums[8, world] - change_K
         else:
             numerical += sums[0, world]

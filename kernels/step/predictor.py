@@ -39,8 +39,8 @@ def predictor_struct():
 
 
 @functools.cache
-def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
-    """Kernels in one precision, compiled into the module of the step kernels."""
+def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _types.SimpleNamespace:
+    """Kernels in one precision, compiled into the module of the step kernels; `accelerated`: see `step_kernels`."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
@@ -115,6 +115,8 @@ def predictor_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         w = v[world, slot]
         a = v_n[world, slot]
         fall = (T(step.dq_dv[world]) * is_position[slot]) * vec3(step.gravity[world])
+        if wp.static(accelerated):
+            fall = (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         e = w - a - fall
         if step.a1[world] > f64(0.0):  # a multistep scheme extrapolates linearly already
             e = w - continued(1, a, before[world, slot], first[world, slot])

@@ -21,6 +21,8 @@ __all__ = ["step_kernels"]
 
 FULL = 1e-9
 """Part of the load that may lack where all of it counts as acting."""
+STRETCH = 2.0
+"""Largest growth of a step that accelerations are extrapolated for: after many halvings they are those of an event."""
 
 
 @functools.cache
@@ -31,7 +33,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         dtype: precision of the vectors.
         scheme: the time discretisation, with `coefficients`, a wp.func (h, previous h, parameter) -> Coefficients, and
             what its kernels are specialised for: static (no inertia, v is the displacement increment), multistep (it
-            uses the step before the last), takes_velocity (q~ takes v_n), variant (their name).
+            uses the step before the last), takes_velocity (q~ takes v_n), accelerated (it keeps accelerations: a_n and
+            w_n stand in place of the state before the last), midpoint (forces of the middle), variant (their name).
         traits: of the model; "nonpotential" and "gated" count.
     """
     p = precision(dtype)
@@ -43,7 +46,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     nonpotential, gated = traits.nonpotential, traits.gated
     variant = traits.suffix("nonpotential", "gated")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
-    takes_velocity = scheme.takes_velocity
+    takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
     module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
 
     @wp.kernel(module=module)
@@ -92,6 +95,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         h = step.dt[world] / parts
         step.h[world] = h
         step.new_time[world] = step.step_start[world] + step.dt[world] * (f64(step.part[world] + 1) / parts)
+        if wp.static(midpoint):
+            step.stage_time[world] = step.new_time[world] - f64(0.5) * h
         previous = f64(0.0)
         if wp.static(multistep):
             # a state that was set, reset or advanced by another scheme since has no past
@@ -102,6 +107,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         step.a1[world] = c.a1
         if wp.static(takes_velocity):
             step.b[world] = c.b
+        if wp.static(accelerated):
+            step.q_a[world] = c.q_a
+            step.stretch[world] = wp.min(h / step.previous_h[world], f64(STRETCH))
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
             step.ramp[world] = step.new_time[world]
@@ -111,6 +119,11 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.dq_dv[world] = c.dq_dv
             step.mass_factor[world] = c.mass_factor
             step.ramp[world] = f64(1.0)
+
+    @wp.func
+    def averaged(stretch: f64, a: vec3, w: vec3) -> vec3:
+        """a_n for the step at hand: a is that of the last one's, of a time as far from w's as it was long."""
+        return w + T(stretch) * (a - w)
 
     @wp.kernel(module=module)
     def predict(
@@ -128,7 +141,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         """q~, v~ and the first iterate; a clamped component keeps its place.
 
         The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) where the step before is known: its error is
-        of the second order in h then, which a stiff rotating body needs.
+        of the second order in h then, which a stiff rotating body needs. With accelerations it is v_n + h g.
         """
         world, slot = wp.tid()
         if step.running[world] == 0:
@@ -144,16 +157,26 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             w = a0 * w - a1 * v_before[world, slot]
         if wp.static(takes_velocity):
             q += T(step.b[world]) * v_n[world, slot]
+        if wp.static(accelerated):
+            c = coefficients(step.h[world], f64(0.0), step.parameter)
+            a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
+            q += T(c.q_a) * a
+            w += T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
         q_tilde[world, slot] = q
         v_tilde[world, slot] = w
         first = vec3()
         dq = T(step.dq_dv[world])
         if wp.static(not static):
-            first = w + (dq * is_position[slot]) * vec3(step.gravity[world])
+            fall = dq
+            if wp.static(midpoint):
+                fall = T(f64(1.0) / step.mass_factor[world])
+            first = w + (fall * is_position[slot]) * vec3(step.gravity[world])
             if wp.static(multistep):
                 if step.a1[world] > f64(0.0):  # goes on as it went: exact for a constant acceleration too
                     ratio = T(step.h[world] / step.previous_h[world])
                     first = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
+            if wp.static(accelerated):
+                first = v_n[world, slot] + (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         keep = (T(1.0) / dq) * (u_n[world, slot] - q)
         f = free[slot]
         for k in range(3):
@@ -181,7 +204,12 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         dq = T(step.dq_dv[world])
         new = v_n[world, slot]
         if kind == 0:
-            new = v_tilde[world, slot] + (dq * is_position[slot]) * vec3(step.gravity[world])
+            fall = dq
+            if wp.static(midpoint):
+                fall = T(f64(1.0) / step.mass_factor[world])
+            new = v_tilde[world, slot] + (fall * is_position[slot]) * vec3(step.gravity[world])
+            if wp.static(accelerated):
+                new = v_n[world, slot] + (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         elif kind == 2:
             new = (T(1.0) / dq) * (u_n[world, slot] - q_tilde[world, slot])
         f = free[slot]
@@ -264,6 +292,16 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             if slot == 0:
                 step.previous_h[world] = step.h[world]
                 step.previous_end[world] = step.new_time[world]
+        if wp.static(accelerated):
+            c = coefficients(step.h[world], f64(0.0), step.parameter)
+            a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
+            new = v[world, slot]
+            before = v_n[world, slot] + T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
+            u_before[world, slot] = T(c.a_v) * (new - v_n[world, slot]) - T(c.a_a) * a
+            v_before[world, slot] = T(c.mass_factor) * (new - before)
+            if slot == 0:
+                step.previous_h[world] = step.h[world]
+                step.previous_end[world] = step.new_time[world]
         u_n[world, slot] = u[world, slot]
         if slot == 0:
             newton.potential[world] = newton.elem_sums[0, world]
@@ -326,7 +364,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         end_attempt=end_attempt,
         failed_now=failed_now,
         commit=commit,
-        **vars(ledger_kernels(dtype, multistep, nonpotential, module)),
+        **vars(ledger_kernels(dtype, multistep or midpoint or accelerated, nonpotential, module)),
         write_report=write_report,
         probe_values=probe_values,
     )

@@ -88,11 +88,12 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         pairs: Couplings,
         con: Constraints,
         mul: Multipliers,
+        share: f64,
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=mat33),
     ):
-        """value += (dq/dv) (J^T rho J + sum lambda d2c/dq2)."""
+        """value += (dq/dv) (J^T rho J + share sum lambda d2c/dq2), `share` as gradients move with u."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -102,7 +103,7 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             b = pairs.term_b[k]
             row = a / 3
             tight = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
-            bend = mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
+            bend = share * mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
             A += pairs.weight[k] * (tight + bend)
         add_block(topo, pattern.upper[pairs.entry[item]], mat33(dq_dv[world] * A), world, value)
 

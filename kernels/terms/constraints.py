@@ -159,15 +159,19 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
 
 
 @functools.cache
-def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels of the constraints for one precision of the slots."""
+def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNamespace:
+    """Kernels of the constraints for one precision of the slots.
+
+    `midpoint`: rows hold at the end of a step and act along their gradient in its middle, of a distance
+    (a0 + a1) / (|a0| + |a1|): the work of a step is lambda times the change of c, to the last digit.
+    """
     p = precision(dtype)
     vec3 = p.vec3
     f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers, Joints = constraint_struct(), multiplier_struct(), joint_struct()
     functions = constraint_functions(dtype)
     combine, directional = functions.combine, functions.directional
-    module = kernel_module(f"constraints_{dtype}")
+    module = kernel_module(f"constraints_{dtype}{'_midpoint' if midpoint else ''}")
 
     @wp.func
     def gradients(kind: int, scale: f64, f: f64, a: vec3d, b: vec3d, a2: vec3d) -> wp.mat33d:
@@ -191,12 +195,13 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
     def evaluate(
         con: Constraints,
         u: wp.array2d(dtype=vec3),
+        u_stage: wp.array2d(dtype=vec3),
         law_value: wp.array2d(dtype=vec3d),
         alpha: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """c and its gradients at u; multipliers of the trial step alpha; the rows of the augmented potential."""
+        """c at u, its gradients at u_stage; multipliers of the trial step; the rows of the augmented potential."""
         world, row = wp.tid()
         if active[world] == 0:
             return
@@ -231,6 +236,15 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
                 c = f64(2.0) * con.scale[row]  # turns can't be told apart: the step must be halved
         else:
             c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
+        if wp.static(midpoint):
+            middle = A + combine(con, 3 * row, u_stage, world)
+            if kind == DISTANCE:
+                slope = middle * (f64(2.0) / (wp.length(a) + wp.length(f64(2.0) * middle - a)))
+            else:
+                slope = middle
+            b = B + combine(con, 3 * row + 1, u_stage, world)
+            if kind == TURN:
+                a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u_stage, world)
         G = gradients(kind, scale, f, slope, b, a2)
         for side in range(3):
             mul.gradient[world, 3 * row + side] = G[side]
@@ -286,6 +300,8 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
         bend = gradients(kind, scale, f, a, b, a2)
         tight = dq_dv[world] * mul.stiffness[world, row] * change
         force = dq_dv[world] * mul.trial[world, row]
+        if wp.static(midpoint):  # gradients move with half of the end
+            force = f64(0.5) * force
         mul.product[world, 3 * row] = tight * Ga + force * bend[0]
         mul.product[world, 3 * row + 1] = tight * Gb + force * bend[1]
         mul.product[world, 3 * row + 2] = tight * Gc + force * bend[2]
@@ -355,7 +371,8 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """Work of a substep per row: of the drive, -lambda scale df, and lambda (J dq - scale df), which is lost.
 
-        A constraint at rest does no work along the exact path; along a chord it takes some.
+        A constraint at rest does no work along the exact path; along a chord it takes some. `midpoint`: a driven row
+        does the work of its drive alone.
         """
         world, row = wp.tid()
         if accepted[world] == 0:
@@ -369,6 +386,9 @@ def constraint_kernels(dtype: str) -> _types.SimpleNamespace:
                 s += con.weight[k] * vec3d(u[world, slot] - u_n[world, slot])
             moved += wp.dot(mul.gradient[world, term], s)
         driven = con.scale[row] * (mul.target[world, row] - travel[world, row])
+        if wp.static(midpoint):
+            if con.law[row] >= 0:
+                driven = moved
         mul.rows[0, world, row] = -mul.trial[world, row] * driven
         mul.rows[1, world, row] = mul.trial[world, row] * (moved - driven)
 

@@ -94,13 +94,17 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=pressure_module)
     def pressure_product(
         data: Follower,
+        share: T,
         u: wp.array2d(dtype=vec3),
         value: wp.array2d(dtype=wp.vec3d),
         active: wp.array(dtype=wp.int32),
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """(K + K^T)/2 p with K = df/dq of the pressure force: its symmetric part, all of it on a closed surface."""
+        """(K + K^T)/2 p with K = df/dq of the pressure force: its symmetric part, all of it on a closed surface.
+
+        `share`: of p, that there is of it at u.
+        """
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -111,7 +115,7 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
             da = combine(data, data.d_a, direction, world, q, item)
             db = combine(data, data.d_b, direction, world, q, item)
             d = combine(data, data.shape, direction, world, q, item)
-            w = T(-0.5) * T(value[world, data.law[item]][0]) * data.weight[q]
+            w = share * T(-0.5) * T(value[world, data.law[item]][0]) * data.weight[q]
             force = wp.cross(da, b) + wp.cross(a, db)
             left = wp.cross(b, d)
             right = wp.cross(d, a)
@@ -238,17 +242,18 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def moment_product(
         data: Follower,
+        share: T,
         u: wp.array2d(dtype=vec3),
         value: wp.array2d(dtype=wp.vec3d),
         active: wp.array(dtype=wp.int32),
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """(K + K^T)/2 p with K = df/dq."""
+        """(K + K^T)/2 p with K = df/dq; `share`: of p, that there is of it at u."""
         world, item = wp.tid()
         if active[world] == 0:
             return
-        m = data.share[item] * vec3(value[world, data.law[item]])
+        m = (share * data.share[item]) * vec3(value[world, data.law[item]])
         Y = current(data, u, world, item)
         D = gather(data, direction, world, item)
         S = T(0.5) * spin_force_change(Y, D, m)

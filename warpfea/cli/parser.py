@@ -148,7 +148,12 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
     how.add_argument("--dt", type=step_size, metavar="S", help="step, s; auto: as --error asks for")
     how.add_argument("--error", type=positive, metavar="X", help="of --dt auto: of positions, over the model's size")
-    how.add_argument("--integrator", metavar="NAME", help="backward_euler or bdf2")
+    how.add_argument(
+        "--integrator",
+        metavar="NAME",
+        help="backward_euler, bdf2, energy_momentum or generalized_alpha, also with its option: "
+        "generalized_alpha(rho_inf=0.5)",
+    )
     how.add_argument(
         "--solver",
         choices=tuple(SOLVERS),

@@ -92,7 +92,7 @@ def _content(source: Source, sim: Simulation, found: Profile) -> dict[str, Any]:
         "device": str(sim.model.device),
         "dtype": sim.model.dtype,
         "dt": sim.dt,
-        "integrator": sim.integrator.name,
+        "integrator": sim.integrator.label,
         "elements": info["elements"],
         "unknowns": info["unknowns"],
         "warm_up": WARM_UP,

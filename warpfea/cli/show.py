@@ -70,7 +70,7 @@ def info(options: argparse.Namespace) -> int:
         content |= {"bounding_box": model_box(model)}
         if is_mesh(options.what):
             content["mesh"] = mesh_facts(model.bodies[0].mesh)
-        content["integrator"] = sim.integrator.name
+        content["integrator"] = sim.integrator.label
         content["methods"] = sim.methods
         content["bytes"] = sim.bytes()
         content["bytes_per_unknown"] = sum(sim.bytes().values()) / max(content["unknowns"], 1)

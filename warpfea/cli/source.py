@@ -12,7 +12,6 @@ from ..base.errors import UsageError
 from ..builder.scene import Scene, load_file, locate, split_name
 from ..mesh import FORMATS
 from ..model.model import Model
-from ..simulation.methods import method
 from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
@@ -76,7 +75,7 @@ class Source:
                 model,
                 dt=self.dt,
                 error=self.error,
-                integrator=method(self.integrator),
+                integrator=self.integrator,
                 solver=solver,
                 inversion=self.inversion,
                 on_compile=bar,

@@ -125,7 +125,7 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
         ["scene", s["scene"] + "".join(f"  {k}={v}" for k, v in _short(s["parameters"]))],
         ["model", f"{info['elements']} elements, {info['unknowns']} unknowns"],
         ["size", f"{box_text(s['bounding_box'])}, {mass_text(s['mass'])}"],
-        ["device", f"{s['device']}, {s['dtype']}, {sim.integrator.name}"],
+        ["device", f"{s['device']}, {s['dtype']}, {sim.integrator.label}"],
         ["status", done],
         ["time", f"{s['wall_s']:.1f} s, of which {s['compile_s']:.1f} s for kernels and set-up"],
         ["iterations", _iterations(s, sim)],

@@ -18,11 +18,11 @@ __all__ = ["Family", "Lattice", "Parent", "Part", "Tying", "families", "for_cell
 
 @dataclass(frozen=True, eq=False)
 class Tying:
-    """Covariant strains e = 2 E_ab taken at tying points, and their energy (mu/2) e.A e in an element, J.
+    """Strains e = 2 E_ab taken at tying points, and their energy (mu/2) e.A e in an element, J.
 
     Attributes:
         points: (n, 3) parent coordinates.
-        pairs: (n, 2) parent directions a, b of each strain.
+        pairs: (n, 2) directions a, b of each strain: parent lines (e is covariant), or the axes of a framed part.
         coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q), the
             rule, the material, the body's section) -> A (E, n, width).
         width: A couples the points of each run of `width` points.
@@ -42,8 +42,9 @@ class Part:
         name: name in reports.
         rule: quadrature of the integral.
         law: function Material -> (device law, coefficients), or None for the material's own.
-        framed: the law has axes of the element: its first parent line, and the others made orthonormal to it.
-        tying: the energy is that of strains at tying points, and the law gives mu; None: of strains at the rule.
+        framed: the strains are along axes of the element: its first parent line, and the others made orthonormal to it.
+        tying: the energy is that of strains at tying points, and the law gives mu (or another modulus in its place);
+            None: of strains at the rule.
     """
 
     name: str
@@ -111,7 +112,7 @@ class Family:
         node_samples: (n, k, 3) parent points at each element node where fields are evaluated for drawing.
         lattice: how an element is drawn in VTK.
         schemes: integrations of several parts by name; every force rule is one of a single part besides.
-        output_schemes: integrations that are for stress output only.
+        output_schemes: integrations that are for stress output only: "shear stress" in place of a tied part "shear".
         slot_sets: slot kinds by the name under which supports may hold them.
         spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
             or a shell's surface offers almost no rotational stiffness at a point, and must not carry it.

@@ -59,9 +59,11 @@ class BlockKey:
     affine: bool
     framed: bool
 
-    def output_scheme(self, name: str) -> tuple[Part, ...] | None:
-        """The output integration `name` of the family, if it has one."""
-        return families.get(self.family).output_schemes.get(name)
+    @property
+    def output_scheme(self) -> str | None:
+        """The integration that stress output takes in place of a tied part, if the family has one."""
+        name = f"{self.integral.name} stress"
+        return name if name in families.get(self.family).output_schemes else None
 
     @property
     def integral(self) -> Part:
@@ -82,7 +84,7 @@ class BlockKey:
 
     @property
     def tying(self) -> Tying | None:
-        """The tying of assumed shears, of parts that have them; else None."""
+        """The tying of assumed strains, of parts that have them; else None."""
         return self.integral.tying
 
 
@@ -267,10 +269,10 @@ def element_volumes(body: Discretisation) -> np.ndarray:
 
 @dataclass(eq=False)
 class TiedTables:
-    """Tables of elements with tied shears e_t = x_a . x_b - X_a . X_b (see kernels/elements/tied.py).
+    """Tables of elements with tied strains e_t = x_a . x_b - X_a . X_b (see kernels/elements/tied.py).
 
     Attributes:
-        first, second: (E, n, S) ds_i/dxi_a and ds_i/dxi_b at the tying points.
+        first, second: (E, n, S) derivatives of s_i along a and b at the tying points.
         X_first, X_second: (E, n, 3) X_a and X_b.
         coupling: (E, n, width) A of the energy (mu/2) e.A e.
     """
@@ -288,12 +290,16 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
     tying = part.tying
     assert tying is not None
     _, ds, J, _ = geometry(body, elements, tying.points)
+    along = J
+    if part.framed:
+        along = orthonormal(J)
+        ds = gradients(ds, J) @ along
     t = np.arange(len(tying.points))
     a, b = tying.pairs.T
     _, _, J_rule, det = geometry(body, elements, part.rule.points)
     coupling = tying.coupling(J, J_rule, det, part.rule, body.materials[host.material][1], body.section)
     first, second = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
-    X_first, X_second = (np.moveaxis(J[:, t, :, k], 0, 1) for k in (a, b))
+    X_first, X_second = (np.moveaxis(along[:, t, :, k], 0, 1) for k in (a, b))
     return TiedTables(first, second, X_first, X_second, coupling)
 
 
@@ -305,10 +311,13 @@ def orthonormal(J0: np.ndarray) -> np.ndarray:
     return np.stack([a, b, np.cross(a, b)], axis=-1)
 
 
-def check_orientation(body: Discretisation, rule: Rule) -> None:
-    """Raise MeshError where det J0 <= 0 at a point of the rule."""
-    for part in chunks(body, np.arange(len(body.mesh.cells)), len(rule.weights)):
-        det = geometry(body, part, rule.points)[3]
+def check_orientation(body: Discretisation, integral: Part) -> None:
+    """Raise MeshError where det J0 <= 0 at a point where the part of the energy takes strains or is integrated."""
+    points = integral.rule.points
+    if integral.tying:
+        points = np.vstack([points, integral.tying.points])
+    for part in chunks(body, np.arange(len(body.mesh.cells)), len(points)):
+        det = geometry(body, part, points)[3]
         bad = np.flatnonzero((det <= 0.0).any(axis=1))
         if len(bad):
             raise MeshError(

@@ -14,11 +14,12 @@ from ..kernels.elements.element import element_kernels
 from ..kernels.elements.materials import ANY_J, NCOEF
 from ..kernels.elements.mixed import mixed_product
 from ..kernels.elements.points import block_struct
-from ..kernels.elements.tied import tied_kernels, tied_struct
+from ..kernels.elements.tied import tied_kernels
+from ..kernels.elements.tied_block import tied_struct
 from ..kernels.elements.with_mass import with_mass_kernel
 from . import assembly
 
-__all__ = ["Block", "build_block", "shear_block"]
+__all__ = ["Block", "build_block", "output_block"]
 
 
 @dataclass(eq=False)
@@ -36,7 +37,7 @@ class Block:
     element_offset: int
     cluster: int
     field_rule: Any = None
-    shear: Any = None
+    output: Any = None
 
     @property
     def connectivity(self) -> np.ndarray:
@@ -48,11 +49,17 @@ class Block:
         """Whether the mass of an element is one table times a number."""
         return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
 
-    def kernels_for(self, dtype: str, damping: str | None) -> Any:
-        """The kernels of this kind of element with another form of damping."""
+    def kernels_for(self, dtype: str, damping: str | None, midpoint: bool = False) -> Any:
+        """The kernels of this kind of element with another form of damping; `midpoint`: of the conserving scheme."""
         k = self.key
+        if k.tying and midpoint:
+            return tied_kernels(dtype, self.slots, self.points, k.tying.width, midpoint)
         if k.tying:
             return self.kernels
+        if midpoint:
+            return element_kernels(
+                dtype, k.law, self.slots, self.points, k.affine, mean_damping(damping), k.framed, midpoint
+            )
         return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
 
     def mixed_product(self, dtype: str) -> wp.Kernel:
@@ -62,10 +69,18 @@ class Block:
             return self.kernels.mixed_product
         return mixed_product(dtype, k.law, self.slots, self.points, k.affine, k.framed)
 
-    def with_mass_product(self, dtype: str, damping: str | None) -> wp.Kernel:
-        """The kernel of the product of a with_mass block, with a form of damping."""
+    def with_mass_product(self, dtype: str, damping: str | None, midpoint: bool = False) -> wp.Kernel:
+        """The kernel of the product of a with_mass block, with a form of damping; `midpoint`: see `kernels_for`."""
         k = self.key
+        if midpoint:
+            damping = mean_damping(damping)
+            return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster, midpoint)
         return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster)
+
+
+def mean_damping(damping: str | None) -> str | None:
+    """Damping over a step of the conserving scheme: (E1 - E0)/h, where the incremental form and that of rates meet."""
+    return "rate" if damping == "incremental" else damping
 
 
 def build_block(
@@ -95,11 +110,10 @@ def build_block(
     return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element, cluster)
 
 
-def shear_block(model: Any, block: Block) -> Block:
-    """Elements of a tied block with their shears at points, for output."""
-    name = "shear stress"
-    key = replace(block.key, scheme=name, part=0, law="orthotropic", framed=True)
-    (part,) = key.output_scheme(name) or ()
+def output_block(model: Any, block: Block, scheme: str) -> Block:
+    """Elements of a tied block with their strains at the points of an output scheme."""
+    key = replace(block.key, scheme=scheme, part=0, law="orthotropic", framed=True)
+    part = key.integral
     assert part.law is not None
     parts, rows = [], []
     for host in block.parts:
@@ -118,17 +132,24 @@ def shear_block(model: Any, block: Block) -> Block:
 
 
 def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
-    """Tables of elements with tied shears."""
+    """Tables of elements with tied strains."""
     T, vec3 = model.types.T, model.types.vec3
     tables = [
         assembly.tied_tables(part, members)
         for part in parts
         for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
     ]
-    for name, dtype in (("first", T), ("second", T), ("X_first", vec3), ("X_second", vec3), ("coupling", T)):
+    assert key.tying is not None
+    names = [("first", T), ("X_first", vec3), ("coupling", T)]
+    normal = np.array_equal(*key.tying.pairs.T)
+    if not normal:
+        names += [("second", T), ("X_second", vec3)]
+    for name, dtype in names:
         table = np.concatenate([getattr(t, name) for t in tables])
         axis = 1 if dtype is vec3 else 2
         setattr(data, name, model.element_array(np.moveaxis(table, 0, axis), dtype))
+    if normal:  # strains x_a . x_a
+        data.second, data.X_second = data.first, data.X_first
 
 
 def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:

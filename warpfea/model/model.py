@@ -141,7 +141,7 @@ class Model:
             elements_before += len(body.mesh.cells)
             for rule in {body.rule, body.curved_rule}:
                 for part in body.family.scheme(rule):
-                    assembly.check_orientation(body, part.rule)
+                    assembly.check_orientation(body, part)
             body.slot_offset = offset
             offset += body.slot_count
         self.slots = offset

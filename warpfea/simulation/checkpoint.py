@@ -78,7 +78,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "dtype": sim.model.dtype,
         "worlds": sim.model.worlds,
         "slots": sim.model.slots,
-        "integrator": sim.integrator.name,
+        "integrator": sim.integrator.label,
         "gravity": sim.model.terms.dead.gravity_host.tolist(),
         "dt": sim.dt if sim.error is None else "auto",
         "steps": sim.steps,
@@ -154,7 +154,7 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
     expected = {
         "dtype": ("precision", sim.model.dtype),
         "worlds": ("number of worlds", sim.model.worlds),
-        "integrator": ("integrator", sim.integrator.name),
+        "integrator": ("integrator", sim.integrator.label),
         "slots": ("number of slots", sim.model.slots),
         "probes": ("probes", [probe.name for probe in sim.model.probes]),
         "fingerprint": ("model", sim.model.fingerprint()),

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ..model.state import State
     from ..solvers.residual import Reducer
     from ..terms.workspace import Workspace
+    from .integrators import Integrator
 
 __all__ = ["Predictor"]
 
@@ -23,10 +24,10 @@ class Predictor:
 
     def __init__(
         self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State, module: wp.Module,
-        *, multistep: bool,
+        *, scheme: Integrator,
     ) -> None:  # fmt: skip
         self.model, self.work, self.launch, self.reduce, self.state = model, work, launch, reduce, state
-        self.kernels = predictor_kernels(model.dtype, module)
+        self.kernels = predictor_kernels(model.dtype, scheme.accelerated, module)
         self.dim = (model.worlds, model.slots)
         self.control: Any = predictor_struct()()
         for name in ("order", "count"):
@@ -34,7 +35,7 @@ class Predictor:
         self.control.sums = work.array("predictor sums", (PREDICTOR_ROWS, model.worlds), wp.float64)
         self.control.kept = state.register("predictor", wp.float64, (4,))
         # multistep schemes store v_{n-1} themselves
-        self.own = not multistep
+        self.own = not scheme.multistep
         field = model.types.vec3, (model.slots,)
         before = state.register("predictor_before", *field) if self.own else state.previous_velocity
         self.past = before, state.register("predictor_first", *field)

@@ -25,6 +25,7 @@ from ..terms.term import At, Term
 from ..terms.workspace import Workspace
 from .adaptive import Adapt, Adaptive
 from .integrators import Integrator
+from .opening import Opening
 from .predictor import Predictor
 
 if TYPE_CHECKING:
@@ -62,6 +63,10 @@ class Stepper:
         self.launch = Launcher(model.device)
         self.terms = model.terms
         self.launch.parts |= model.terms.parts
+        if integrator.midpoint and isinstance(solver, Jacobi):
+            raise ModelError(
+                f"integrator {integrator.name!r} needs Newton's method: solver=NewtonPCG(...) in the place of Jacobi"
+            )
         self.kernels = step_kernels(model.dtype, integrator, model.terms.traits)
         vec3 = model.types.vec3
         state.sealed = False
@@ -71,14 +76,20 @@ class Stepper:
             state.register("previous_velocity", vec3, (model.slots,))
             state.register("previous_step", wp.float64)
             state.register("previous_end", wp.float64)
+        if integrator.accelerated:
+            state.register("algorithmic_acceleration", vec3, (model.slots,))
+            state.register("acceleration", vec3, (model.slots,))
+            state.register("previous_step", wp.float64)
+            state.register("acceleration_end", wp.float64, initial=np.nan)
         if ledger:
             state.register("ledger", wp.float64, (len(model.terms.ledger),))
             state.register("ledger_time", wp.float64)
         state.register("status", wp.int32)
-        self.u_before = state.previous_displacement if integrator.multistep else state.displacement
-        self.v_before = state.previous_velocity if integrator.multistep else state.velocity
-        self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger)
-        self.at = At(model, self.work, self.launch, state, self.u_before, inertia=not integrator.static)
+        self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
+        midpoint = integrator.midpoint
+        self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint)
+        kinds = {"inertia": not integrator.static, "midpoint": midpoint, "accelerated": integrator.accelerated}
+        self.at = At(model, self.work, self.launch, state, self.u_before, **kinds)
         self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
@@ -86,10 +97,11 @@ class Stepper:
         # single roundings would grow from step to step, and so would what Jacobi's steps leave
         if not integrator.static and model.dtype == "float64" and isinstance(solver, NewtonPCG):
             more = (self.newton.residual.reduce, state, self.kernels.module)
-            self.predictor = Predictor(model, self.work, self.launch, *more, multistep=integrator.multistep)
+            self.predictor = Predictor(model, self.work, self.launch, *more, scheme=integrator)
         self.dim = (model.worlds, model.slots)
         if not integrator.static and isinstance(solver, NewtonPCG):
             self.newton.candidates = [partial(self._candidate, kind) for kind in CANDIDATES]
+        self.opening = Opening(self.at, self.newton.residual, integrator) if integrator.accelerated else None
         flags = self.work.any_flag
         self.running, self.refused, self.failed = flags[2:3], flags[3:4], flags[4:5]
         self.adaptive: Adaptive | None = None
@@ -120,9 +132,12 @@ class Stepper:
         w.step.parameter = self.integrator.parameter
         if self.integrator.takes_velocity:
             w.step.b = w.array("b", (self.model.worlds,), wp.float64)
-        if self.integrator.multistep:
+        if self.integrator.accelerated:
+            w.step.q_a = w.array("q_a", (self.model.worlds,), wp.float64)
+            w.step.stretch = w.array("stretch", (self.model.worlds,), wp.float64)
+        if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
-            w.step.previous_end = state.previous_end
+            w.step.previous_end = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
             self.booked = self.terms.booked(w)
@@ -136,6 +151,7 @@ class Stepper:
         flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
         active: wp.array = wp.array(flags, dtype=wp.int32, device=m.device)
         w.step.new_time.assign(state.time)
+        w.stage_time.assign(state.time)
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
         self._laws(active)
         w.u.assign(state.displacement)
@@ -176,7 +192,9 @@ class Stepper:
         m, w = self.model, self.work
         flags = np.ones(m.worlds, dtype=np.int32) if flags is None else flags
         active: wp.array = wp.array(flags, dtype=wp.int32, device=m.device)
-        w.u.assign(self.state.displacement)
+        w.u_stage.assign(self.state.displacement)
+        if self.at.midpoint:
+            w.v_stage.zero_()
         residual = self.newton.residual
         with self.launch.rare():
             residual.elements.force(self.at, active)
@@ -238,10 +256,13 @@ class Stepper:
 
     def set_dt(self, dt: float) -> None:
         """Step of all worlds, s."""
+        self._dt = dt
         self.work.step.dt.fill_(dt)
 
     def run(self) -> None:
         """Do one step of every running world."""
+        if self.opening is not None:
+            self.opening.prepare(self._dt)
         with enough_memory("a step", self.model.device):
             if self.graph is not None:
                 wp.capture_launch(self.graph)
@@ -346,8 +367,11 @@ class Stepper:
     def _laws(self, active: wp.array) -> None:
         """Values of the time laws at the end of the attempt."""
         w = self.work
-        self.terms.laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
-        self.terms.dead.take_gravity(self.launch, w.law_value, active)
+        laws = self.terms.laws
+        laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
+        if self.at.midpoint:
+            laws.evaluate(self.launch, self.state, w.stage_time, w.step.ramp, active, w.law_stage)
+        self.terms.dead.take_gravity(self.launch, w.law_stage, active)
 
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or part of the load (B, laws, 3); the step's own stay."""

@@ -208,7 +208,7 @@ class Assembled:
         mass_factor, dq_dv = factors
         for first, parts in enumerate(self.runs):
             for k, (block, elements) in enumerate(parts):
-                state = [block.data, u, w.v, w.base, w.newton.mixed, w.history, dq_dv, int(projected), active]
+                state = [block.data, u, w.v_stage, w.base, w.newton.mixed, w.history, dq_dv, int(projected), active]
                 if self.whole:
                     _, width, rows = panels_of(block.slots)
                     matrix = shaped(self.scratch, (m.worlds, block.count, rows), rows_type(m.dtype, width))

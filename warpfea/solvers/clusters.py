@@ -107,10 +107,10 @@ def make_clusters(model: Model) -> ModelClusters:
     return ModelClusters(blocks, topo, offset)
 
 
-def make_pool(model: Model, work: Workspace) -> Any:
+def make_pool(model: Model, work: Workspace, *, midpoint: bool) -> Any:
     """Device struct with the arrays that take the place of shared memory on the CPU; empty on CUDA."""
     pool, on_host = pool_struct(model.dtype)(), not model.device.is_cuda
-    numbers = max(pool_size(b.cluster, b.slots, 3 if b.key.damping == "rate" else 2) for b in model.blocks)
+    numbers = max(pool_size(b.cluster, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks)
     words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)
     pool.number = work.array("cluster numbers", (numbers if on_host else 1,), model.types.T)
     pool.table = work.array("cluster table", (words if on_host else 1,), wp.int32)

@@ -109,7 +109,7 @@ class Direct:
     def _assemble(self, flags: wp.array, value: wp.array, *, projected: bool) -> None:
         """Assemble H or, with `projected`, its positive definite replacement."""
         w = self.work
-        self.assembled.assemble(w.u, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
+        self.assembled.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
         for term in self.model.terms:
             live = [array for _, array in term.keep(self.at)]
             term.blocks(self.at, self.assembled, live, w.step.dq_dv, flags, value, projected=projected)

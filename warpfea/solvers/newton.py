@@ -29,6 +29,10 @@ __all__ = ["NewtonLoop", "NewtonPCG"]
 EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
 FLOOR = {"float64": 1e-4, "float32": 2e-3}
 """Largest estimated error, relative and in the norm of energy, of a step whose residual is stopped by rounding."""
+FALL = 9.81
+"""m/s^2. With accelerations in the state constraints are closed to FALL (dq/dv)^2 times a tolerance, the larger one,"""
+CLOSED = 1e-14
+"""but to no less than this, over the model's size."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +149,7 @@ class NewtonLoop:
         model, work, launch, inertia = at.model, at.work, at.launch, at.inertia
         self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
         self.constraint_tol = constraint_tol
-        traits = model.terms.traits
+        traits = at.traits
         self.kernels = newton_kernels(model.dtype, traits)
         self.limited = traits.limited
         self.classical = traits.gated and options.multipliers == "outer"
@@ -201,6 +205,9 @@ class NewtonLoop:
         ctl.classical = int(self.classical)
         ctl.slack = 1.0 / math.sqrt(1.0 + options.penalty)
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves are for g alone
+        if at.accelerated and model.dtype == "float64":  # in float32 places are rounded by more
+            ctl.constraint_pace = max(constraint_tol / model.size, ctl.tol) * FALL
+            ctl.constraint_least = CLOSED * model.size
         self.candidates: Sequence[Callable[[], None]] = ()
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
@@ -240,9 +247,8 @@ class NewtonLoop:
 
     def _open(self, flags: wp.array) -> None:
         """Evaluate the first iterate."""
-        w = self.work
         # D is needed to judge it, so the blocks come first
-        self.launch(self.kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, flags, w.u])
+        self.residual.place(flags)
         self._each("prepare", flags)
         self.preconditioner.start(flags)
         self._each("scale", flags)

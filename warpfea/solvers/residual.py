@@ -13,6 +13,7 @@ from ..kernels.common.structs import additions_struct
 from ..kernels.solvers.control import COMPONENT_ROWS, LANES, TERM_ROWS
 from ..kernels.solvers.newton import newton_kernels
 from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
+from ..kernels.step.stage import stage_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
 from .assembled import Assembled, shaped
@@ -70,9 +71,10 @@ class Residual:
         self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
         self.elements: Elements = model.terms.find(Elements)
         self.reduce = Reducer(launch, work, model.worlds)
-        traits = model.terms.traits
+        traits = at.traits
         self.gather = gather_kernels(model.dtype, traits)
         self.newton = newton_kernels(model.dtype, traits)
+        self.stage = stage_kernels(model.dtype)
         self.con = model.constraints.data if traits.ties else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
@@ -91,9 +93,11 @@ class Residual:
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
-            self.pool = make_pool(model, work)
+            self.pool = make_pool(model, work, midpoint=at.midpoint)
             forms = [block.key.damping if at.inertia else None for block in model.blocks]
-            self.products = [block.with_mass_product(model.dtype, form) for block, form in zip(model.blocks, forms)]
+            self.products = [
+                block.with_mass_product(model.dtype, form, at.midpoint) for block, form in zip(model.blocks, forms)
+            ]
         self.keep, self.lasting = 0, False
         self.on_matrix: Callable[[wp.array, wp.array], None] | None = None
         self.assembled: Assembled | None = None
@@ -105,7 +109,7 @@ class Residual:
             # statics goes too far in a step for the last one's matrix, and the stress of the viscosity is no function
             # of the state that a resumed run has; forces of constraints are only as good as the solve, and a GPU makes
             # a small matrix in no time
-            damped = any(block.key.damping in ("incremental", "rate") for block in model.blocks)
+            damped = at.midpoint or any(block.key.damping in ("incremental", "rate") for block in model.blocks)
             small = model.device.is_cuda and model.slots <= SMALL_SLOTS
             self.keep = 2 if at.inertia and not damped else 0 if small else 1
             if traits.gated:
@@ -133,7 +137,7 @@ class Residual:
 
     def modules(self) -> set[wp.Module]:
         """Modules of the gather, and of the matrix where there is one; those of the terms are theirs."""
-        out = {self.gather.module}
+        out = {self.gather.module} | ({self.stage.module} if self.at.midpoint else set())
         if self.by_matrix:
             assert self.assembled is not None
             out |= {self.gather.matrix_module} | self.assembled.modules()
@@ -194,16 +198,29 @@ class Residual:
         if self.by_matrix:
             assert self.assembled is not None
             factors = (w.step.mass_factor, w.step.dq_dv)
-            self.assembled.assemble(w.u, factors, active, self.matrix, projected=False)
+            self.assembled.assemble(w.u_stage, factors, active, self.matrix, projected=False)
             if self.on_matrix:
                 self.on_matrix(self.matrix, active)
+
+    def place(self, active: wp.array) -> None:
+        """q of the iterate v, and where forces are taken, if that is not there."""
+        w, state = self.work, self.at.state
+        self.launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
+        if self.at.midpoint:
+            args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
+            self.launch(self.stage.take_stage, self.dim, args)
 
     @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
         """q, forces, g and all sums at the iterate v; `hold`: Phi holds the non-potential forces of this iterate."""
+        w, launch = self.work, self.launch
+        launch(self.newton.reset_min_J, self.model.worlds, [w.newton, active])
+        self.place(active)
+        self.balance(active, hold=hold)
+
+    def balance(self, active: wp.array, *, hold: bool = False) -> None:
+        """Forces, g and all sums at work.u and work.v."""
         m, w, launch = self.model, self.work, self.launch
-        launch(self.newton.reset_min_J, m.worlds, [w.newton, active])
-        launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         for term in self.terms:
             term.force(self.at, active)
         if self.terms.traits.nonpotential:
@@ -247,7 +264,7 @@ class Residual:
         if self.clusters:
             for block, kernel, (data, count) in zip(m.blocks, self.products, self.clusters.blocks):
                 lanes = block.cluster if m.device.is_cuda else 1
-                args = [block.data, data, w.u, w.v, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
+                args = [block.data, data, w.u_stage, w.v_stage, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
                 args += [lanes, self.pool, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
         elif self.mixed:

@@ -63,7 +63,7 @@ class Reuse:
 
         `accepted`: flags of a step; given them, the state of accepted worlds takes the place instead.
         """
-        args = [self.control, self.none if accepted is None else accepted, self.work.u, self.kept, self.place]
+        args = [self.control, self.none if accepted is None else accepted, self.work.u_stage, self.kept, self.place]
         self.launch(self.kernels.carry_places, self.dim, args)
 
     def made(self) -> None:

@@ -135,6 +135,25 @@ _ENTRIES = (
         results=("contact_hertz_cpu.json", "contact_rest_cpu.json"),
     ),
     Entry(
+        name="conservation",
+        module="reports.conservation",
+        summary="energy and momenta of the integrator energy_momentum over ten thousand steps",
+        about="Free bodies of every family and law that tumble with large strains, and mechanisms without damping: the "
+        "largest errors of energy and of both momenta. revolutions takes long: it keeps a checkpoint beside --out, and "
+        "the same command goes on from it after an interruption.",
+        parts=(
+            *((family, "a tumbling body of each law") for family in ("T4", "T10", "ENMC", "FN", "H3843")),
+            ("3243", "of each integration"),
+            ("3443", "of each integration"),
+            ("constrained", "mechanisms without damping"),
+            ("revolutions", "ten thousand turns of two bodies"),
+        ),
+        options=("device", "only", "quick"),
+        example="--out tests/results/conservation_cpu.json",
+        takes="an hour",
+        results=("conservation_cpu.json",),
+    ),
+    Entry(
         name="adaptive",
         module="reports.adaptive",
         summary="dt='auto' beside the error asked for and the best fixed step",

@@ -109,7 +109,7 @@ class BodyForces(Term):
     def force(self, at: At, active: wp.array) -> None:
         m, w = self.model, at.work
         for field in self.parts_of_fields:
-            args = [field.block.data, field.members, m.reference_device, field.origin, w.u, w.step.new_time]
+            args = [field.block.data, field.members, m.reference_device, field.origin, w.u_stage, w.stage_time]
             args += [w.step.ramp, active, self.offset + field.offset, w.nonpotential_contribution]
             at.launch(field.kernel, (m.worlds, field.count), args)
 

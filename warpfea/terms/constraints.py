@@ -22,7 +22,7 @@ from ..kernels.solvers.control import TERM_ROWS
 from ..kernels.solvers.deflation import deflation_kernels
 from ..kernels.solvers.reuse import reuse_kernels
 from ..kernels.terms.constraint_blocks import constraint_block_kernels
-from ..kernels.terms.constraints import JOINT_COLUMNS, multiplier_struct
+from ..kernels.terms.constraints import JOINT_COLUMNS, constraint_kernels, multiplier_struct
 from .constraint_tables import ConstraintTables
 from .term import NUMERICAL, WORK, At, Column, Kept, Term, part
 from .time_laws import TimeLaws
@@ -87,6 +87,10 @@ class Constraints(Term):
 
     # for one simulation
 
+    def kernels_of(self, at: At) -> Any:
+        """The kernels of a simulation, as its integrator asks."""
+        return constraint_kernels(self.model.dtype, at.midpoint)
+
     def allocate(self, work: Workspace, at: At) -> None:
         """Multipliers and matrices, work.multipliers."""
         model, con = self.model, self.tables
@@ -124,7 +128,7 @@ class Constraints(Term):
         at.scratch[self.name] = Deflation(deflate, largest, table, len(large))
 
     def modules(self, at: At) -> Iterable[wp.Module]:
-        return {self.kernels.module, deflation_kernels(self.model.dtype).module}
+        return {self.kernels_of(at).module, deflation_kernels(self.model.dtype).module}
 
     def start(self, at: At, active: wp.array) -> None:
         """Right sides at the state's time, where the state does not know them, and the violation at the start."""
@@ -140,14 +144,14 @@ class Constraints(Term):
     def begin(self, at: At, active: wp.array) -> None:
         """Warm start of an attempt from the state's multipliers and right sides; rho is not known yet."""
         args = [at.state.constraint_force, at.state.constraint_target, active, at.work.multipliers]
-        at.launch(self.kernels.load_multipliers, self.dim, args)
+        at.launch(self.kernels_of(at).load_multipliers, self.dim, args)
 
     @part("constraints")
     def force(self, at: At, active: wp.array) -> None:
         """c, J and the augmented potential's rows at work.u."""
-        m, w, k = self.model, at.work, self.kernels
+        m, w, k = self.model, at.work, self.kernels_of(at)
         at.launch(k.reset_violation, (m.worlds, m.component_count), [active, w.multipliers])
-        args = [self.tables.data, w.u, w.law_value, w.newton.alpha, active, w.multipliers]
+        args = [self.tables.data, w.u, w.u_stage, w.law_value, w.newton.alpha, active, w.multipliers]
         at.launch(k.evaluate, self.dim, args)
 
     prepare = force  # J, for rho
@@ -184,14 +188,14 @@ class Constraints(Term):
         """Terms of the constraints' part of H p, for the gather."""
         w = at.work
         args = [self.tables.data, w.multipliers, p, w.step.dq_dv, active]
-        at.launch(self.kernels.product_terms, self.dim, args)
+        at.launch(self.kernels_of(at).product_terms, self.dim, args)
 
     @part("constraints")
     def aim(self, at: At, active: wp.array) -> None:
         """The multipliers' part of the Newton step in work.direction."""
         w = at.work
         args = [self.tables.data, w.multipliers, w.direction, w.newton.quiet, w.step.dq_dv, active]
-        at.launch(self.kernels.predict_change, self.dim, args)
+        at.launch(self.kernels_of(at).predict_change, self.dim, args)
 
     def adopt(self, at: At, flags: wp.array) -> None:
         """With every Newton step; the classical method does it in its outer loop."""
@@ -201,28 +205,28 @@ class Constraints(Term):
     @part("constraints")
     def outer(self, at: At, flags: wp.array) -> None:
         """Take over the multipliers of the trial."""
-        at.launch(self.kernels.adopt, self.dim, [flags, at.work.multipliers])
+        at.launch(self.kernels_of(at).adopt, self.dim, [flags, at.work.multipliers])
 
     @part("constraints")
     def book(self, at: At, accepted: wp.array) -> wp.array:
         """Work of drives and what the chord takes from constraints at rest, along an accepted substep."""
         w, state = at.work, at.state
         args = [self.tables.data, w.multipliers, w.u, state.displacement, state.constraint_target, accepted]
-        at.launch(self.kernels.work_terms, self.dim, args)
+        at.launch(self.kernels_of(at).work_terms, self.dim, args)
         return w.multipliers.rows
 
     @part("constraints")
     def commit(self, at: At, accepted: wp.array) -> None:
         """Keep multipliers and right sides of an accepted substep."""
         args = [accepted, at.work.multipliers, at.state.constraint_force, at.state.constraint_target]
-        at.launch(self.kernels.commit_multipliers, self.dim, args)
+        at.launch(self.kernels_of(at).commit_multipliers, self.dim, args)
 
     def report(self, at: At) -> None:
         """Force and moment on the child, and violation, of each joint."""
         w, con, state = at.work, self.tables, at.state
         args = [con.data, w.multipliers, con.joint_data, state.displacement, state.constraint_force]
         dim = (self.model.worlds, len(con.joints))
-        at.launch(self.kernels.joint_report, dim, [*args, self.report_offset, w.report])
+        at.launch(self.kernels_of(at).joint_report, dim, [*args, self.report_offset, w.report])
 
     # in a linear solve
 
@@ -247,9 +251,9 @@ class Constraints(Term):
         k = constraint_block_kernels(self.model.dtype)
         pairs, count = self.model.cache["couplings"]
         args = [self.model.topology, matrix.pattern.data, pairs]
-        kernel, more = k.add_penalties, kept
+        kernel, more = k.add_penalties, list[Any](kept)
         if not projected:
-            kernel, more = k.add_tangent, [self.tables.data, at.work.multipliers]
+            kernel, more = k.add_tangent, [self.tables.data, at.work.multipliers, at.share]
         at.launch(kernel, (self.model.worlds, count), [*args, *more, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:
@@ -302,7 +306,7 @@ class Constraints(Term):
         if multipliers is not None:
             mul.force.assign(np.tile(multipliers, (B, 1)))
         mul.last.fill_(np.nan)  # any turn is as good as another
-        args = [con.data, state.displacement, value, zeros((B,), wp.float64), every, mul]
+        args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), every, mul]
         launch(self.kernels.evaluate, self.dim, args)
         return mul
 

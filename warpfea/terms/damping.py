@@ -55,7 +55,9 @@ class Damping(Term):
         if not at.inertia:
             return set()
         out = {b.kernels.viscous_force.module for b in self.model.blocks if b.key.damping == "explicit"}
-        out |= {b.kernels.strain_history.module for b in self.model.blocks if b.key.damping == "incremental"}
+        if not at.midpoint:  # it has the strains of both ends at hand
+            name = "moving_history" if at.accelerated else "strain_history"
+            out |= {getattr(b.kernels, name).module for b in self.model.blocks if b.key.damping == "incremental"}
         return out | ({self.kernels.add_explicit.module} if self.explicit else set())
 
     @part("loads")
@@ -68,14 +70,17 @@ class Damping(Term):
             w.contribution.zero_()  # the gather below sums the entries of all blocks
         for block in m.blocks:
             dim = (m.worlds, block.count)
-            if block.key.damping == "incremental":
+            if block.key.damping == "incremental" and at.accelerated:
+                args = [block.data, state.displacement, state.velocity, at.u_before, w.step.b, w.step.q_a, active]
+                launch(block.kernels.moving_history, dim, [*args, w.history])
+            elif block.key.damping == "incremental" and not at.midpoint:
                 args = [block.data, state.displacement, at.u_before, w.step.a0, w.step.a1, active, w.history]
                 launch(block.kernels.strain_history, dim, args)
             elif block.key.damping == "explicit":
                 args = [block.data, state.displacement, state.velocity, active, w.contribution, power]
                 launch(block.kernels.viscous_force, dim, args)
         if self.explicit:
-            gather = gather_kernels(m.dtype, m.terms.traits).gather_force
+            gather = gather_kernels(m.dtype, at.traits).gather_force
             launch(gather, (m.worlds, m.slots), [m.topology, w.contribution, active, force])
             launch(self.kernels.add_explicit, (m.worlds, m.slots), [force, active, w.dead])
 

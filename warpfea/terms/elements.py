@@ -36,7 +36,10 @@ class Elements(Term):
 
     def kernels(self, at: At) -> list:
         """Kernels of the blocks; statics has no rates, so those without damping serve there."""
-        return [b.kernels if at.inertia else b.kernels_for(self.model.dtype, None) for b in self.model.blocks]
+        dtype, blocks = self.model.dtype, self.model.blocks
+        if at.midpoint:
+            return [b.kernels_for(dtype, b.key.damping, midpoint=True) for b in blocks]
+        return [b.kernels if at.inertia else b.kernels_for(dtype, None) for b in blocks]
 
     def modules(self, at: At) -> Iterable[wp.Module]:
         return {kernels.module for kernels in self.kernels(at)}
@@ -45,7 +48,17 @@ class Elements(Term):
         m, w, launch = self.model, at.work, at.launch
         for block, kernels in zip(m.blocks, self.kernels(at)):
             lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1
-            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, lanes, w.contribution, w.energy_rows]
+            args = [
+                block.data,
+                w.u_stage,
+                w.v_stage,
+                w.history,
+                w.step.dq_dv,
+                active,
+                lanes,
+                w.contribution,
+                w.energy_rows,
+            ]
             dim = (w.u.shape[0], launch.padded(block.count * lanes))
             launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
 
@@ -79,11 +92,11 @@ class Elements(Term):
         """K p of all elements into work.contribution, where products go by the elements one by one."""
         m, w = self.model, at.work
         for block, kernels in zip(m.blocks, self.kernels(at)):
-            args = [block.data, w.u, w.v, w.history, w.step.dq_dv, active, p, w.contribution]
+            args = [block.data, w.u_stage, w.v_stage, w.history, w.step.dq_dv, active, p, w.contribution]
             at.launch(kernels.tangent_product, (p.shape[0], block.count), args)
 
     def diagonal(self, at: At, active: wp.array) -> None:
         m, w = self.model, at.work
         for block, kernels in zip(m.blocks, self.kernels(at)):
-            args = [block.data, w.u, w.step.dq_dv, active, w.block_contribution]
+            args = [block.data, w.u_stage, w.step.dq_dv, active, w.block_contribution]
             at.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)

@@ -19,7 +19,7 @@ from ..kernels.elements.materials import ANY_J
 from ..kernels.step.gather import gather_kernels
 from ..model import assembly
 from ..model.assembly import chunks, geometry, gradients
-from ..model.blocks import shear_block
+from ..model.blocks import output_block
 from ..model.state import State
 from .elements import Elements
 from .term import At
@@ -59,7 +59,8 @@ class Evaluation:
         none: Any = None
         work: Any = SimpleNamespace(
             u=u,
-            v=u,
+            u_stage=u,
+            v_stage=u,
             history=self._zeros((1, 1), m.types.sym),
             step=SimpleNamespace(dq_dv=wp.ones(B, dtype=wp.float64, device=m.device)),
             contribution=self._zeros((B, m.contributions), m.types.vec3),
@@ -150,10 +151,11 @@ class Evaluation:
             if body is not None and all(part.body is not body for part in block.parts):
                 continue
             if block.key.tying:
-                if block.key.output_scheme("shear stress") is None:
+                scheme = block.key.output_scheme
+                if scheme is None:
                     continue  # the transverse shear of a shell vanishes at its faces, where its stress is wanted
-                block.shear = block.shear or shear_block(m, block)
-                block = block.shear
+                block.output = block.output or output_block(m, block, scheme)
+                block = block.output
             stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
             J = self._zeros((m.worlds, block.points, block.count), m.types.T)
             kernel = block.kernels_for(m.dtype, None).point_stress
@@ -184,7 +186,7 @@ class Evaluation:
                 at_samples = np.einsum("nq,bqek->benk", to_samples, stress[:, :, members].astype(float))
                 rows = (body.mesh.cells[part.elements][:, :, None] * k + np.arange(k)).reshape(len(part.elements), -1)
                 v = volumes[part.elements]
-                if block.key.part == 0 and block.key.scheme != "shear stress":
+                if block.key.part == 0 and block.key.scheme not in family.output_schemes:
                     np.add.at(weight, rows, v[:, None])
                 for b in range(m.worlds):
                     np.add.at(total[b], rows, at_samples[b] * v[:, None, None])

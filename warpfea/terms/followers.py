@@ -99,14 +99,14 @@ class Followers(Term):
     def force(self, at: At, active: wp.array) -> None:
         m, w = self.model, at.work
         for item in self.items:
-            args = [item.data, w.u, w.law_value, active, w.nonpotential_contribution]
+            args = [item.data, w.u_stage, w.law_stage, active, w.nonpotential_contribution]
             at.launch(item.force, (m.worlds, item.count), args)
 
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
         """The symmetric tangent of the force times p."""
         m, w = self.model, at.work
         for item in self.items:
-            args = [item.data, w.u, w.law_value, active, p, w.nonpotential_tangent]
+            args = [item.data, at.share, w.u_stage, w.law_stage, active, p, w.nonpotential_tangent]
             at.launch(item.product, (m.worlds, item.count), args)
 
     def hold(self, free: np.ndarray) -> None:
@@ -175,13 +175,13 @@ class FollowerMatrix:
     def add(self, at: At, matrix: Any, dq_dv: wp.array, active: wp.array, out: wp.array) -> None:
         """out -= (dq/dv) times the items' matrices."""
         B, k, w, launch = self.model.worlds, self.kernels, at.work, at.launch
-        launch(k.take_local, (B, self.slots, self.count), [self.item.data.conn, w.u, active, self.u])
+        launch(k.take_local, (B, self.slots, self.count), [self.item.data.conn, w.u_stage, active, self.u])
         for local in range(self.slots):
             for axis in range(3):
                 args = [local, axis, self.count, self.direction]
                 launch(k.unit_direction, (B, self.slots * self.count), args)
                 column = self.columns[3 * local + axis]
-                args = [self.data, self.u, w.law_value, active, self.direction, column]
+                args = [self.data, at.share, self.u, w.law_stage, active, self.direction, column]
                 launch(self.item.product, (B, self.count), args)
         args = [self.model.topology, matrix.pattern.data, self.places, self.columns, dq_dv, active, out]
         launch(k.add_followers, (B, self.entries), args)

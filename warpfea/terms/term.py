@@ -49,8 +49,11 @@ class At:
 
     Attributes:
         model, work, launch, state: of the simulation.
-        u_before: [world, slot] displacements of the step before the last, of multistep schemes.
+        u_before: [world, slot] displacements of the step before the last, of multistep schemes; the algorithmic
+            accelerations of schemes that keep them.
         inertia: the step is dynamic; in statics there are no rates.
+        midpoint: forces are those of the middle of a step, at work.u_stage and work.stage_time.
+        accelerated: the scheme keeps accelerations.
         options: of the solver.
         scratch: what terms allocated, by their names.
     """
@@ -61,8 +64,20 @@ class At:
     state: State
     u_before: wp.array
     inertia: bool
+    midpoint: bool = False
+    accelerated: bool = False
     options: Any = None
     scratch: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def traits(self) -> Traits:
+        """What the kernels of the solvers are specialised for, of the terms and of the integrator."""
+        return self.model.terms.traits._replace(midpoint=self.midpoint)
+
+    @property
+    def share(self) -> float:
+        """How much of a change at the end of a step there is where forces are taken."""
+        return 0.5 if self.midpoint else 1.0
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ __all__ = ["Workspace"]
 class Workspace:
     """Scratch of a simulation. Features that a scene does not use get an array of one item."""
 
-    def __init__(self, model: Model, *, max_newton: int, ledger: bool) -> None:
+    def __init__(self, model: Model, *, max_newton: int, ledger: bool, midpoint: bool = False) -> None:
         self.device = model.device
         self.bytes: dict[str, int] = {}
         B, n, vec3 = model.worlds, model.slots, model.types.vec3
@@ -39,6 +39,8 @@ class Workspace:
 
         # the iterate and what it is measured from
         self.v, self.u, self.base, self.best = field("v"), field("u"), field("base"), field("best")
+        # where forces are taken, and what elements take for velocities
+        self.u_stage, self.v_stage = (field("u_stage"), field("v_stage")) if midpoint else (self.u, self.v)
         self.q_tilde, self.v_tilde = field("q_tilde"), field("v_tilde")
         # conjugate gradients
         self.direction, self.r, self.z, self.p, self.Hp = (field(k) for k in ("direction", "r", "z", "p", "Hp"))
@@ -84,6 +86,9 @@ class Workspace:
         most = max(RESIDUAL_ROWS, LEDGER_ROWS, *(len(term.columns) for term in terms))
         self.partial = self.array("partial", (most, B, chunks), wp.float64)
         self.law_value = self.array("law_value", (B, max(terms.laws.count, 1)), wp.vec3d)
+        self.law_stage = self.law_value
+        if midpoint:
+            self.law_stage = self.array("law_stage", self.law_value.shape, wp.vec3d)
         self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
         self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
@@ -106,7 +111,9 @@ class Workspace:
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative = self.pcg.negative
-        self.step = self.struct(step_struct(), B, skip=("b", "any_refused"))
+        unused = ("b", "q_a", "stretch", "any_refused") + (() if midpoint else ("stage_time",))
+        self.step = self.struct(step_struct(), B, skip=unused)
+        self.stage_time = self.step.stage_time if midpoint else self.step.new_time
         self.balance = balance_struct(model.dtype)()
         for name in balance_struct(model.dtype).vars:
             of_step = name in ("mass_factor", "dq_dv")

@@ -1,6 +1,7 @@
 """Time discretisations, one file each: small objects that say how q depends on v, and what the inertia term is.
 
-With q~ = a0 q_n - a1 q_{n-1} + b v_n and v~ = a0 v_n - a1 v_{n-1}, a step solves for v in
+With q~ = a0 q_n - a1 q_{n-1} + b v_n + q_a a_n and v~ = a0 v_n - a1 v_{n-1} + v_a a_n + v_w w_n (accelerations a_n and
+w_n: of schemes that keep them), a step solves for v in
 
     m M (v - v~) + f_int(q, v) = f(t_{n+1}),      q_{n+1} = q~ + d v,      d = dq/dv, m the mass factor.
 
@@ -9,24 +10,55 @@ Backward Euler is (a0, a1, b, d, m) = (1, 0, 0, h, 1/h), which is Eq. (17).
 
 from __future__ import annotations
 
+import inspect
+import re
+from typing import Any
+
 from ...base.errors import ModelError
 from ...base.names import did_you_mean
 from .backward_euler import BACKWARD_EULER, STATIC
 from .bdf2 import BDF2
+from .energy_momentum import ENERGY_MOMENTUM
+from .generalized_alpha import GeneralizedAlpha
 from .scheme import Integrator
 
-__all__ = ["INTEGRATORS", "Integrator", "get"]
+__all__ = ["INTEGRATORS", "GeneralizedAlpha", "Integrator", "get"]
 
-INTEGRATORS = {scheme.name: scheme for scheme in (BACKWARD_EULER, BDF2, STATIC)}
+SCHEMES = (BACKWARD_EULER, BDF2, ENERGY_MOMENTUM, GeneralizedAlpha(), STATIC)
+INTEGRATORS = {scheme.name: scheme for scheme in SCHEMES}
+CALL = re.compile(r"(\w+)\s*\((.*)\)")
+"""A name with options."""
 
 
 def get(name: str | Integrator) -> Integrator:
-    """The integrator `name`, or the one that is given. Raises ModelError listing the names."""
+    """The integrator that is given, by its name, or by its name with options: "generalized_alpha(rho_inf=0.8)".
+
+    Raises:
+        ModelError: no integrator has the name (they are listed), or it has no such option.
+    """
     if isinstance(name, Integrator):
         return name
-    if name == "energy_momentum":
-        raise NotImplementedError("integrator 'energy_momentum' is not part of this version")
-    if name not in INTEGRATORS or name == "static":
+    call = CALL.fullmatch(name.strip()) if isinstance(name, str) else None
+    word = call[1] if call else name.strip() if isinstance(name, str) else name
+    if word not in INTEGRATORS or word == "static":
         names = [n for n in INTEGRATORS if n != "static"]
-        raise ModelError(f"integrator {name!r} is unknown; there are {', '.join(names)}{did_you_mean(name, names)}")
-    return INTEGRATORS[name]
+        hint = did_you_mean(word, names) if isinstance(word, str) else ""
+        raise ModelError(f"integrator {name!r} is unknown; there are {', '.join(names)}{hint}")
+    return _with_options(INTEGRATORS[word], name, call[2]) if call else INTEGRATORS[word]
+
+
+def _with_options(scheme: Integrator, text: str, inside: str) -> Integrator:
+    """An integrator of the same kind with the options of `name(option=number, ...)`."""
+    kind: Any = type(scheme)
+    known = list(inspect.signature(kind).parameters) if kind is not Integrator else []
+    options: dict[str, float] = {}
+    for part in filter(None, (part.strip() for part in inside.split(","))):
+        key, equals, value = (word.strip() for word in part.partition("="))
+        if key not in known:
+            has = f"it has {', '.join(known)}{did_you_mean(key, known)}" if known else "it has none"
+            raise ModelError(f"integrator {text!r}: {scheme.name} has no option {key!r}; {has}")
+        try:
+            options[key] = float(value)
+        except ValueError:
+            raise ModelError(f"integrator {text!r}: {key}={value} is not a number") from None
+    return kind(**options) if known else scheme

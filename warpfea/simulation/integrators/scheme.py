@@ -18,6 +18,8 @@ class Integrator:
         order: order of convergence in h.
         multistep: keeps the state before the last, q_{n-1} and v_{n-1}.
         takes_velocity: q~ takes v_n.
+        midpoint: forces are those of the middle of the step, and conserve energy and momenta.
+        accelerated: keeps accelerations, algorithmic ones a_n and those of the equilibrium w_n, and so needs a start.
         estimate: wp.func (h, previous h) -> vec3d, the weights of v_{n+1}, v_n and v_{n-1}, of sum 0, that give the
             local error in position, m; None: steps can't be adapted to it.
         static: no inertia; v is the displacement increment of a load step.
@@ -30,6 +32,8 @@ class Integrator:
     order: int
     multistep: bool = False
     takes_velocity: bool = False
+    midpoint: bool = False
+    accelerated: bool = False
     static: bool = False
     estimate: Any = field(default=None, compare=False)  # follows from the coefficients
     # kernels don't depend on these
@@ -37,7 +41,20 @@ class Integrator:
     stabilise: float = field(default=0.0, compare=False)
 
     @property
+    def label(self) -> str:
+        """Its name with the options that results depend on, as users may give it."""
+        return self.name
+
+    @property
+    def kept(self) -> tuple[str, str]:
+        """Arrays of the state beside q_n and v_n that it takes: those of the step before, or accelerations."""
+        if self.accelerated:
+            return "algorithmic_acceleration", "acceleration"
+        return ("previous_displacement", "previous_velocity") if self.multistep else ("displacement", "velocity")
+
+    @property
     def variant(self) -> str:
         """Name of its kernels."""
-        flags = [name for name in ("multistep", "takes_velocity", "static") if getattr(self, name)]
+        flags = ("multistep", "takes_velocity", "midpoint", "accelerated", "static")
+        flags = [name for name in flags if getattr(self, name)]
         return "_".join([self.coefficients.key, *flags])

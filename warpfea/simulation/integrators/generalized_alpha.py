@@ -1,0 +1,74 @@
+"""Generalized-alpha: Chung and Hulbert (1993), for constrained systems Arnold and Bruels (2007).
+
+    q_{n+1} = q_n + h v_n + h^2 (1/2 - beta) a_n + h^2 beta a_{n+1}
+    v_{n+1} = v_n + h (1 - gamma) a_n + h gamma a_{n+1}
+    (1 - am) a_{n+1} + am a_n = (1 - af) w_{n+1} + af w_n
+    M w_{n+1} + f_int + J^T lambda = f at t_{n+1}
+
+The forces are in equilibrium with w = q'' at the end of the step; a are averages of w, of the time t + (am - af) h:
+where the step changes, the next one takes w_n + (h / h_before) (a_n - w_n).
+"""
+
+import math
+
+import warp as wp
+
+from ...base.errors import ModelError
+from ...kernels.step.control import Coefficients
+from .scheme import Integrator
+
+__all__ = ["GeneralizedAlpha", "generalized_alpha"]
+
+
+@wp.func
+def generalized_alpha(h: wp.float64, previous: wp.float64, parameter: wp.float64):
+    """Coefficients for the spectral radius `parameter` at infinite frequency: a_{n+1} and w_{n+1} eliminated for v."""
+    one, two, half = wp.float64(1.0), wp.float64(2.0), wp.float64(0.5)
+    am = (two * parameter - one) / (parameter + one)
+    af = parameter / (parameter + one)
+    gamma = half - am + af
+    beta = half * half * (gamma + half) * (gamma + half)
+    c = Coefficients()
+    c.a0 = one
+    c.dq_dv = h * beta / gamma
+    c.b = h - c.dq_dv
+    c.q_a = h * (half * h - c.dq_dv)
+    c.mass_factor = (one - am) / (h * gamma * (one - af))
+    c.v_a = h * (one - gamma) - h * gamma * am / (one - am)
+    c.v_w = h * gamma * af / (one - am)
+    c.a_v = one / (h * gamma)
+    c.a_a = (one - gamma) / gamma
+    return c
+
+
+class GeneralizedAlpha(Integrator):
+    """Generalized-alpha method, of the second order, with a chosen dissipation of high frequencies.
+
+    Args:
+        rho_inf: spectral radius at infinite frequency, 0 to 1: the factor by which a step damps what it does not
+            resolve. 1 conserves the energy of linear systems; models with joints or drives need less than 1.
+
+    Raises:
+        ModelError: rho_inf is not between 0 and 1.
+    """
+
+    def __init__(self, *, rho_inf: float = 0.8) -> None:
+        known = isinstance(rho_inf, (int, float)) and not isinstance(rho_inf, bool)
+        if not (known and math.isfinite(rho_inf) and 0.0 <= rho_inf <= 1.0):
+            raise ModelError(f"GeneralizedAlpha: rho_inf = {rho_inf!r} must lie between 0 and 1")
+        super().__init__(
+            "generalized_alpha", generalized_alpha, order=2, takes_velocity=True, accelerated=True,
+            parameter=float(rho_inf),
+        )  # fmt: skip
+
+    @property
+    def rho_inf(self) -> float:
+        """Spectral radius at infinite frequency."""
+        return self.parameter
+
+    @property
+    def label(self) -> str:
+        return f"{self.name}(rho_inf={self.parameter:g})"
+
+    def __repr__(self) -> str:
+        return f"GeneralizedAlpha(rho_inf={self.parameter!r})"

@@ -1,0 +1,38 @@
+"""Where time laws have kinks: jumps, and jumps of the slope."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..laws import TimeLaw
+
+__all__ = ["jumps", "kinks"]
+
+BEND = 0.25
+"""Change of the slope that counts as a kink, over the largest slope; samples of a smooth law bend less."""
+STEEP = 1e-3
+"""A change within this part of a step is a jump."""
+
+
+def jumps(law: TimeLaw, dt: float) -> np.ndarray:
+    """(n, 2) begin and end, s, of what is a jump to a step dt."""
+    t = law.times
+    if len(t) < 2:
+        return np.zeros((0, 2))
+    steep = (np.diff(t) < STEEP * dt) & np.any(np.diff(law.values, axis=0) != 0.0, axis=1)
+    return np.stack([t[:-1][steep], t[1:][steep]], axis=1)
+
+
+def kinks(law: TimeLaw, dt: float) -> np.ndarray:
+    """(n,) times, s, at which the slope of a sampled law jumps; those of its jumps are in `jumps`."""
+    t = law.times
+    if len(t) < 2:
+        return np.zeros(0)
+    smooth = np.diff(t) >= STEEP * dt
+    slope = np.where(smooth[:, None], np.diff(law.values, axis=0) / np.diff(t)[:, None], 0.0)
+    slope = np.concatenate([np.zeros((1, 3)), slope, np.zeros((1, 3))])
+    bend = np.linalg.norm(np.diff(slope, axis=0), axis=1)
+    return t[bend > BEND * max(np.linalg.norm(slope, axis=1).max(), 1e-300)]

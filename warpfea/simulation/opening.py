@@ -1,0 +1,367 @@
+"""Consistent velocities and accelerations, from which schemes start that keep accelerations.
+
+At a state (q, v) at time t, with supports and constraints c(q, t) = 0, whose rates along the motion are c' and c'',
+
+    M dv + J^T L = 0,    J (v + dv) + c_t = 0,        M w + J^T m = f - f_int,    J w = -(c'' without J w)
+
+are solved on the host, by factors of the mass matrix and a dense matrix of the constraints. In the directions that
+supports and constraints prescribe, a_0 = w(t + (am - af) h), and v_0 is off by h^2 (1/6 - beta - (am - af)/2) w', to
+which steps of one size lead (Arnold, Bruels and Cardona 2015): else the first reactions are of the first order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.step.control import STATUS
+from ..kernels.terms.constraints import DISTANCE, TURN
+from ..laws import TimeLaw
+from .kinks import jumps, kinks
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..solvers.residual import Residual
+    from ..terms.term import At
+    from .integrators import Integrator
+
+__all__ = ["Opening"]
+
+SAME = 1e-6
+"""Times closer than this part of a step are the same."""
+FACTORED = 20_000
+"""Slots up to which the mass matrix is factorised; larger ones are solved iteratively."""
+FIRST = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
+SECOND = np.array([35.0, -104.0, 114.0, -56.0, 11.0]) / 12.0
+THIRD = np.array([-5.0, 18.0, -24.0, 14.0, -3.0]) / 2.0
+"""Derivatives at the first of five points."""
+REDUNDANT = 1e-11
+"""Singular values of the matrix of the constraints below this part of the largest are of redundant rows."""
+
+
+class Opening:
+    """Starts worlds whose state was set, or at whose time a law of a load or drive has a kink.
+
+    Attributes:
+        count: starts of a world so far.
+    """
+
+    def __init__(self, at: At, residual: Residual, integrator: Integrator) -> None:
+        self.at, self.residual, self.integrator = at, residual, integrator
+        self.model = at.model
+        supports = at.model.terms.supports
+        self.driven = supports.moved is not None or supports.turned is not None
+        self.count = 0
+        self._breaks: tuple[float, np.ndarray, np.ndarray] = (0.0, np.zeros(0), np.zeros((2, 0)))
+        self._mass: list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]] = []
+        refuse(at.model, integrator, self.driven)
+
+    def prepare(self, dt: float) -> None:
+        """Before a step of size dt, s: start the worlds that need it."""
+        state = self.at.state
+        time, known = state.time.numpy(), state.acceleration_end.numpy()  # type: ignore[attr-defined]
+        ahead, kinked = self._kinks(time, dt)
+        flags = (state.status.numpy() == STATUS["running"]) & ((known != time) | kinked)  # type: ignore[attr-defined]
+        if flags.any():
+            self._start(flags, time, ahead, dt)
+
+    def _kinks(self, time: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times (B,) just after a jump that the state is at, else its own; whether a kink lies in the step before."""
+        if self._breaks[0] != dt:
+            self._breaks = dt, *self._find_breaks(dt)
+        near = SAME * dt
+        _, times, (begins, ends) = self._breaks
+        there = time[:, None]
+        found = np.any((times > there - dt + near) & (times <= there + near), axis=1)
+        steep = (begins <= there + near) & (ends > there)
+        ahead = np.where(steep, ends, there).max(axis=1, initial=-np.inf)
+        return np.maximum(ahead, time), found
+
+    def _find_breaks(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times of all kinks, and begins and ends of jumps (2, n), to a step dt, s."""
+        laws = self.model.terms.laws.laws
+        steep = np.concatenate([np.zeros((0, 2)), *(jumps(law, dt) for law in laws)])
+        # forces with a kink leave accelerations continuous
+        bent = [kinks(law, dt) for number, law in enumerate(laws) if number in self._drive_laws()]
+        return np.concatenate([steep[:, 0], *bent]), steep.T
+
+    def _drive_laws(self) -> set[int]:
+        """Numbers of the laws that prescribe places."""
+        terms = self.model.terms
+        out = set()
+        if terms.supports.moved is not None:
+            out |= set(terms.supports.moved.law.numpy().ravel().tolist())
+        if terms.supports.turned is not None:
+            out |= set(terms.supports.turned.law.numpy().tolist())
+        if self.model.constraints is not None:
+            out |= set(terms.constraints.tables.data.law.numpy().tolist())
+        return out
+
+    def _start(self, flags: np.ndarray, time: np.ndarray, ahead: np.ndarray, dt: float) -> None:
+        state: Any = self.at.state
+        laws = self._law_motion(flags, ahead, dt)
+        u, v = state.displacement.numpy().astype(float), state.velocity.numpy().astype(float)
+        before = self._kinetic(v)
+        for world in np.flatnonzero(flags):
+            v[world] += self._impulse(u[world], v[world], laws[:, world])
+        self._set(state.velocity, flags, v)
+        g = self._unbalanced(flags, ahead, dt)
+        w, a = np.zeros_like(v), np.zeros_like(v)
+        rho = self.integrator.parameter
+        early = (rho - 1.0) / (rho + 1.0)  # a_n is of the time t + early dt
+        late = 1.0 / 6.0 - 1.0 / (rho + 1.0) ** 2 - 0.5 * early
+        for world in np.flatnonzero(flags):
+            motion = u[world], v[world], laws[:, world]
+            w[world] = self._acceleration(g[world], *motion)
+            jerk = self._jerk(*motion, w[world], 0.25 * dt)
+            a[world] = w[world] + early * dt * jerk
+            v[world] += late * dt**2 * jerk  # where prescribed places lead a scheme of constant steps to
+        self._set(state.velocity, flags, v)
+        self._book(flags, self._kinetic(v) - before)
+        self._set(state.acceleration, flags, w)
+        self._set(state.algorithmic_acceleration, flags, a)
+        self._set(state.previous_step, flags, np.full(len(time), dt))
+        self._set(state.acceleration_end, flags, time)
+        self.count += 1
+
+    @staticmethod
+    def _set(array: wp.array, flags: np.ndarray, values: np.ndarray) -> None:
+        host = array.numpy()
+        host[flags] = values[flags]
+        array.assign(host)
+
+    def _kinetic(self, v: np.ndarray) -> np.ndarray:
+        """1/2 v.M v, (B,), J."""
+        return np.array([0.5 * np.sum(one * (self.model.mass_host @ one)) for one in v])
+
+    def _book(self, flags: np.ndarray, change: np.ndarray) -> None:
+        """What the impulse does is the integrator's."""
+        state: Any = self.at.state
+        if "ledger" in state.specs:
+            columns = list(self.model.terms.ledger)
+            ledger = state.ledger.numpy()
+            ledger[flags, columns.index("kinetic")] += change[flags]
+            ledger[flags, columns.index("integrator")] -= change[flags]
+            state.ledger.assign(ledger)
+
+    def _law_motion(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
+        """(4, B, laws, 3): values of the time laws and their first three rates from the time (B,) on.
+
+        Of samples the slope after the time alone; of a function differences over dt.
+        """
+        laws = self.model.terms.laws.laws
+        points = np.array([self._law_values(flags, time + 0.25 * dt * k) for k in range(len(FIRST))])
+        out = np.zeros((4, *points.shape[1:]))
+        out[0] = points[0]
+        for k, law in enumerate(laws):
+            if law.function is not None:
+                for order, weights in enumerate((FIRST, SECOND, THIRD), start=1):
+                    out[order, :, k] = np.tensordot(weights, points[:, :, k], 1) / (0.25 * dt) ** order
+            else:
+                out[1, :, k] = [slope_after(law, t + SAME * dt) for t in time]
+        return out
+
+    def _law_values(self, flags: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Values of the time laws in the flagged worlds at times (B,), (B, laws, 3)."""
+        m, w = self.model, self.at.work
+        self._set(w.step.new_time, flags, time)
+        active = self._active(flags)
+        m.terms.laws.evaluate(self.at.launch, self.at.state, w.step.new_time, w.step.ramp, active, w.law_value)
+        return w.law_value.numpy().copy()
+
+    def _active(self, flags: np.ndarray) -> Any:
+        return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
+
+    def _unbalanced(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
+        """f_int + J^T lambda - f at the state in the flagged worlds, with the laws at times (B,); (B, slots, 3), N."""
+        m, at, w = self.model, self.at, self.at.work
+        every, active = np.ones(len(flags)), self._active(flags)
+        # rates of strain are those of the state: E~ = E - (dq/dv) dE/dt
+        for array, value in (
+            (w.step.ramp, 1.0),
+            (w.step.h, dt),
+            (w.step.dq_dv, dt),
+            (w.step.b, -dt),
+            (w.step.q_a, 0.0),
+        ):
+            self._set(array, flags, value * every)
+        self._set(w.step.mass_factor, flags, every / dt)
+        self._law_values(flags, time)
+        m.terms.dead.take_gravity(at.launch, w.law_value, active)
+        for array, values in ((w.u, at.state.displacement), (w.v, at.state.velocity), (w.v_tilde, at.state.velocity)):
+            self._set(array, flags, values.numpy())
+        for term in m.terms:
+            term.begin(at, active)
+        for term in m.terms:
+            term.prepare(at, active)
+        self.residual.balance(active)
+        return w.g.numpy().astype(float)
+
+    # supports and constraints
+
+    def _rows(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        """J (rows, 3 slots), c' and c'' less J w (rows,)."""
+        tables = self.model.constraints
+        gradients, first, second = constraint_rates(tables, u, v, laws)
+        return tables.expand(gradients), first, second
+
+    def _held(self, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Velocities and accelerations of prescribed components, 0 of others, (slots, 3)."""
+        rate, bend = np.zeros((2, self.model.slots, 3))
+        supports = self.model.terms.supports
+        if (d := supports.moved) is not None:
+            slot, law = d.slot.numpy(), d.law.numpy()
+            k, c = np.nonzero(law >= 0)
+            rate[slot[k], c] = laws[1][law[k, c], c]
+            bend[slot[k], c] = laws[2][law[k, c], c]
+        if (d := supports.turned) is not None:
+            slot, law, on = d.slot.numpy(), d.law.numpy(), d.components.numpy() != 0.0
+            angle, first, second = (laws[k][law, 0][:, None] for k in range(3))
+            turn = np.cross(d.axis.numpy(), d.arm.numpy())
+            twice = np.cross(d.axis.numpy(), turn)
+            along = np.cos(angle) * turn + np.sin(angle) * twice
+            across = np.cos(angle) * twice - np.sin(angle) * turn
+            for target, values in ((rate, first * along), (bend, second * along + first**2 * across)):
+                target[slot] = np.where(on, values, target[slot])
+        held = self.model.free_host == 0.0
+        return np.where(held, rate, 0.0), np.where(held, bend, 0.0)
+
+    # linear algebra
+
+    def _impulse(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
+        """dv, m/s: nothing where velocities are consistent."""
+        jump = self._held(laws)[0] - np.where(self.model.free_host == 0.0, v, 0.0)
+        if self.model.constraints is None:
+            return self._saddle(np.zeros_like(v), jump) if jump.any() else jump
+        J, first, _ = self._rows(u, v, laws)
+        return self._saddle(np.zeros_like(v), jump, J, -first)
+
+    def _acceleration(self, g: np.ndarray, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
+        """w, m/s^2."""
+        held = self._held(laws)[1]
+        if self.model.constraints is None:
+            return self._saddle(-g, held)
+        J, _, second = self._rows(u, v, laws)
+        return self._saddle(-g, held, J, -second)
+
+    def _jerk(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray, w: np.ndarray, s: float) -> np.ndarray:
+        """The part of dw/dt, m/s^3, that supports and constraints prescribe, by differences over -s .. s.
+
+        The rest is left out: of stiff bodies it would be large, and their oscillations are none of a step's business.
+        """
+        if self.model.constraints is None and not self.driven:
+            return np.zeros_like(w)
+        held, goal, rows = np.zeros_like(w), None, None
+        for sign in (-0.5 / s, 0.5 / s):
+            x = np.copysign(s, sign)
+            there = np.tensordot(
+                [[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]], laws, 1
+            )
+            held += sign * self._held(there)[1]
+            if self.model.constraints is not None:
+                J, _, second = self._rows(u + x * v + 0.5 * x**2 * w, v + x * w, there)
+                goal = (0.0 if goal is None else goal) - sign * (second + J @ w.ravel())
+        if self.model.constraints is not None:
+            rows = self._rows(u, v, laws)[0]
+        return self._saddle(np.zeros_like(w), held, rows, goal)
+
+    def _saddle(self, force: np.ndarray, held: np.ndarray, J: Any = None, goal: Any = None) -> np.ndarray:
+        """x (slots, 3) with M x + J^T m = force on free components, x = held on others, and J x = goal."""
+        m = self.model
+        x = self._solve(force - m.mass_host @ held) + held
+        if J is None:
+            return x
+        free = m.free_host.ravel() != 0.0
+        columns = (J.toarray() * free).reshape(-1, m.slots, 3)
+        inverse = np.array([self._solve(row).ravel() for row in columns])  # rows of J M^-1
+        matrix = J @ inverse.T
+        multipliers = np.linalg.lstsq(matrix, J @ x.ravel() - goal, rcond=REDUNDANT)[0]
+        return x - (multipliers @ inverse).reshape(x.shape)
+
+    def _solve(self, force: np.ndarray) -> np.ndarray:
+        """M^-1 force on the free components, 0 on others."""
+        if not self._mass:
+            self._mass = [mass_solver(self.model, c) for c in range(3)]
+        out = np.zeros_like(force)
+        for c, (free, solve) in enumerate(self._mass):
+            if len(free) and force[free, c].any():
+                out[free, c] = solve(force[free, c])
+        return out
+
+
+def mass_solver(model: Model, component: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """The slots that are free in a component, and what solves with the mass matrix among them."""
+    free = np.flatnonzero(model.free_host[:, component])
+    M = model.mass_host[free][:, free].astype(float).tocsc()
+    if len(free) <= FACTORED:
+        return free, spl.splu(M).solve if len(free) else lambda f: f
+    scale = sp.diags(1.0 / M.diagonal())
+    return free, lambda f: spl.cg(M, f, rtol=1e-14, atol=0.0, maxiter=2000, M=scale)[0]
+
+
+def slope_after(law: TimeLaw, time: float) -> np.ndarray:
+    """(3,) slope of a sampled law in the interval that begins at a time or holds it; 0 beyond its samples."""
+    k = int(np.searchsorted(law.times, time, side="right")) - 1
+    if k < 0 or k >= len(law.times) - 1:
+        return np.zeros(3)
+    return (law.values[k + 1] - law.values[k]) / (law.times[k + 1] - law.times[k])
+
+
+def constraint_rates(
+    tables: Any, u: np.ndarray, v: np.ndarray, laws: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients (rows, 3, 3), first rates c' (rows,) m/s, and second rates without J w, m/s^2, of one world's rows.
+
+    u, v: (slots, 3); laws: (3 or 4, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
+    """
+    count = tables.count
+    moved, speed = np.zeros((2, 3 * count, 3))
+    for out, field in ((moved, u), (speed, v)):
+        np.add.at(out, tables.term_host, tables.weight_host[:, None] * field[tables.slot_host])
+    a, b, a2 = (tables.reference_host + moved).reshape(count, 3, 3).swapaxes(0, 1)
+    da, db, da2 = speed.reshape(count, 3, 3).swapaxes(0, 1)
+    kind, scale = tables.data.kind.numpy(), tables.scale_host
+    f, df, ddf = tables.data.fixed.numpy().copy(), np.zeros(count), np.zeros(count)
+    law, component = tables.data.law.numpy(), tables.data.law_component.numpy()
+    on = law >= 0
+    f[on] += laws[0][law[on], component[on]]
+    df[on], ddf[on] = (laws[k][law[on], component[on]] for k in (1, 2))
+
+    def dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.sum(x * y, axis=1)
+
+    G = np.stack([b, a, np.zeros_like(a)], axis=1)
+    first, second = dot(da, b) + dot(a, db) - df, 2.0 * dot(da, db) - ddf
+    far = kind == DISTANCE
+    size = np.where(far, np.linalg.norm(a, axis=1), 1.0)
+    n = a / size[:, None]
+    G[far] = np.stack([n, 0 * a, 0 * a], axis=1)[far]
+    first[far] = (dot(n, da) - df)[far]
+    second[far] = ((dot(da, da) - dot(n, da) ** 2) / size - ddf)[far]
+    turn = kind == TURN
+    s, c, w, dw = (x[:, None] for x in (np.sin(f), np.cos(f), df, ddf))
+    d, e = c * a2 - s * a, s * a2 + c * a
+    rate = c * da2 - s * da - w * e
+    bend = -2.0 * w * (s * da2 + c * da) - dw * e - w**2 * d
+    G[turn] = np.stack([-s * b, d, c * b], axis=1)[turn]
+    first[turn] = (dot(rate, b) + dot(d, db))[turn]
+    second[turn] = (dot(bend, b) + 2.0 * dot(rate, db))[turn]
+    return scale[:, None, None] * G, scale * first, scale * second
+
+
+def refuse(model: Model, integrator: Integrator, driven: bool) -> None:
+    """Raise ModelError where prescribed places would make the accelerations of an undamped scheme grow."""
+    if integrator.parameter < 1.0:
+        return
+    if model.constraints is not None or driven:
+        what = f"joint {model.constraints.joints[0].name!r}" if model.constraints is not None else "a drive"
+        raise ModelError(
+            f"{integrator!r}: with rho_inf = 1 the forces of joints and drives grow from step to step, and the model "
+            f"has {what}; take rho_inf below 1, such as 0.8"
+        )
