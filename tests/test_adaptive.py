@@ -11,8 +11,9 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.cli import main
+from warpfea.laws import time_law
 from warpfea.simulation.checkpoint import Checkpoint
-from warpfea.simulation.instants import Instants, kinks
+from warpfea.simulation.instants import Instants
 from warpfea.simulation.integrators import Integrator
 from warpfea.simulation.integrators.backward_euler import BACKWARD_EULER
 from warpfea.simulation.integrators.bdf2 import bdf2, bdf2_error
@@ -170,13 +171,12 @@ def test_a_failed_step_leaves_the_state_of_its_start():
 # instants
 
 
-def test_kinks_of_a_table_are_found_and_samples_of_a_curve_are_not():
+def test_kinks_of_tables_are_instants_and_samples_of_curves_are_not():
     t = np.linspace(0.0, 1.0, 201)
-    smooth = np.column_stack([np.sin(20.0 * t), 0 * t, 0 * t])
-    assert kinks(t, smooth).tolist() == [0.0, 1.0]  # where it begins and ends
-    ramp = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert kinks(np.array([0.0, 0.1, 0.2, 5.0]), ramp).tolist() == [0.1, 0.2]
-    assert kinks(np.zeros(1), np.ones((1, 3))).size == 0
+    smooth = time_law((t, np.column_stack([np.sin(20.0 * t), 0 * t, 0 * t])), "curve")
+    ramp = time_law(([0.0, 0.1, 0.100001, 5.0], [(0, 0, 0), (0, 0, 0), (1, 0, 0), (1, 0, 0)]), "ramp")
+    assert Instants([smooth], 1.0, 1.0).kinks.tolist() == [0.0, 1.0]  # where it begins and ends
+    assert Instants([ramp, time_law((1, 0, 0), "constant")], 1.0, 1.0).kinks.tolist() == [0.1, 0.100001]
 
 
 def test_instants_are_intervals_frames_moments_and_the_end():
@@ -239,6 +239,12 @@ def test_schemes_without_an_estimate_are_refused():
     plain = Integrator("plain", BACKWARD_EULER.coefficients, order=1)
     with pytest.raises(wf.ModelError, match="'plain' has no estimate of its error; there are backward_euler, bdf2"):
         auto(integrator=plain)
+
+
+@pytest.mark.parametrize("integrator", ["energy_momentum", wf.GeneralizedAlpha(rho_inf=0.8)])
+def test_energy_momentum_and_generalized_alpha_are_refused_by_name(integrator):
+    with pytest.raises(wf.ModelError, match=r"'(energy_momentum|generalized_alpha)' has no estimate of its error"):
+        auto(integrator=integrator)
 
 
 def test_float32_runs_and_refuses_what_it_does_not_resolve():
