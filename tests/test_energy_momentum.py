@@ -5,9 +5,8 @@ import pytest
 import warp as wp
 
 import warpfea as wf
-from warpfea.builder.scene import find
 from warpfea.solvers.assembled import Assembled
-from warpfea.studies.reports.conservation import CASES, DT, MECHANISMS, Conserved, tumble
+from warpfea.studies.reports.conservation import CASES, DT, MECHANISMS, Conserved, mechanism, tumble
 from warpfea.studies.reports.mechanisms import swing
 
 TIGHT = wf.NewtonPCG(tol=1e-12)
@@ -173,9 +172,7 @@ def test_halved_steps_conserve():
 
 @pytest.mark.parametrize("scene", MECHANISMS)
 def test_mechanisms_keep_energy(scene):
-    made = find(scene)
-    model = made.build(made.resolve({})).finalize(device="cpu")
-    sim = simulate(model, dt=MECHANISMS[scene], constraint_tol=1e-13)
+    sim = simulate(mechanism(scene), dt=MECHANISMS[scene][1], constraint_tol=1e-13)
 
     def total():
         e = {name: values[0] for name, values in sim.energies().items()}

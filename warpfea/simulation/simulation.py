@@ -40,8 +40,8 @@ class Simulation(Records):
         model: from ModelBuilder.finalize.
         state: where it starts; by default model.state(). It is advanced in place.
         dt: step, s. `sim.dt` may be set later.
-        integrator: "backward_euler", "bdf2", "energy_momentum", "generalized_alpha" or wf.GeneralizedAlpha(rho_inf=0.5),
-            as a text "generalized_alpha(rho_inf=0.5)".
+        integrator: "backward_euler", "bdf2", "energy_momentum", "generalized_alpha" or
+            wf.GeneralizedAlpha(rho_inf=0.5), as a text "generalized_alpha(rho_inf=0.5)".
         solver: "newton-pcg", "jacobi" or "direct", or options: wf.NewtonPCG(...), wf.Jacobi(...).
         constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
             float64, 1e-5 in float32.
