@@ -6,7 +6,7 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.solvers.assembled import Assembled
-from warpfea.studies.reports.conservation import CASES, DT, MECHANISMS, Conserved, mechanism, tumble
+from warpfea.studies.reports.conservation import CASES, DT, MECHANISMS, RATE, Conserved, mechanism, tumble
 from warpfea.studies.reports.mechanisms import swing
 
 TIGHT = wf.NewtonPCG(tol=1e-12)
@@ -118,6 +118,13 @@ def test_free_bodies_keep_energy_and_momenta(family, law):
     row = watch.row()
     assert row["integrator"] < 1e-13
     assert row["ledger_residual"] < bound
+
+
+@pytest.mark.parametrize(("family", "law"), QUICK)
+def test_a_step_takes_at_most_12_iterations(family, law):
+    """Of a body that spins by a tenth of a radian a step, to a tolerance of 1e-12."""
+    sim = simulate(tumble(family, law, stretch=0.0), dt=0.1 / RATE)
+    assert max(int(sim.step().newton[0]) for _ in range(100)) <= 12
 
 
 @pytest.mark.parametrize(

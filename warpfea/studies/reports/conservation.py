@@ -26,6 +26,7 @@ __all__ = [
     "CASES",
     "FREE",
     "MECHANISMS",
+    "RATE",
     "Conserved",
     "constrained",
     "free",
@@ -38,7 +39,9 @@ __all__ = [
 STEPS = 10_000
 TURNS = 10_000
 DT = 5e-3
-SPIN = 12.0
+AXIS = np.array([0.3, 0.5, 1.0])
+RATE = 12.0 * float(np.linalg.norm(AXIS))
+"""Of the spin, rad/s."""
 TOL = 1e-12
 CLOSED = 1e-13
 """Tolerance of joints, over the model's size."""
@@ -90,15 +93,17 @@ def _body(b: wf.ModelBuilder, family: str, law: str) -> wf.Body:
     return b.add_solid(mesh, material=material)
 
 
-def tumble(family: str, law: str, device: Any = "cpu", dtype: str = "float64", worlds: int = 1) -> wf.Model:
-    """A free body that spins, flies and stretches."""
+def tumble(
+    family: str, law: str, device: Any = "cpu", dtype: str = "float64", worlds: int = 1, stretch: float = 10.0
+) -> wf.Model:
+    """A free body that spins at RATE, flies, and stretches by so much a second, 1/s."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = _body(b, family, law)
-    spin = SPIN * np.array([0.3, 0.5, 1.0])
+    spin = RATE * AXIS / np.linalg.norm(AXIS)
 
     def velocity(X: np.ndarray) -> np.ndarray:
         arm = X - np.array([0.5, 0.1, 0.1])
-        return np.cross(spin, arm) + (1.0, -0.5, 0.3) + arm * (10.0, 0.0, -5.0)
+        return np.cross(spin, arm) + (1.0, -0.5, 0.3) + stretch * arm * (1.0, 0.0, -0.5)
 
     b.set_initial(body, velocity=velocity)
     return b.finalize(device=device, dtype=dtype, worlds=worlds)
@@ -227,7 +232,7 @@ def revolutions(device: Any, quick: bool, checkpoint: pathlib.Path | None = None
         start = _sim(tumble(family, "svk", device), DT)
         sim = _sim(start.model, DT, state=start.model.state())
         watch = Conserved(sim, start)
-        step = SPIN * np.linalg.norm([0.3, 0.5, 1.0]) * DT
+        step = RATE * DT
         target = _count(round(TURNS * 2.0 * np.pi / step), quick)
         kept = checkpoint and checkpoint.with_suffix(f".{family.replace(' ', '_')}.npz")
         if kept and kept.exists():
