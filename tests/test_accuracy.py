@@ -7,7 +7,6 @@ import math
 import pathlib
 import shlex
 import sys
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -17,13 +16,13 @@ import warpfea as wf
 from warpfea.builder.reference import read_reference, reference_of
 from warpfea.cli import main
 from warpfea.cli.parser import parse
-from warpfea.simulation.methods import method, split_methods
+from warpfea.simulation import integrators
 from warpfea.studies.accuracy import Row, Study
 from warpfea.studies.accuracy.measure import Outcome
 from warpfea.studies.accuracy.motion import interpolant, observed
 from warpfea.studies.accuracy.problems import find_problem, problem_names
 from warpfea.studies.accuracy.report import with_orders
-from warpfea.studies.accuracy.settings import make_axes, parse_over, product
+from warpfea.studies.accuracy.settings import make_axes, parse_over, product, split_methods
 
 G, T = 9.81, 0.04
 START = np.array([1.0, 0.5, 0.5])
@@ -396,19 +395,14 @@ def test_cubics_between_steps_are_of_fourth_order():
 # what is asked
 
 
-def test_methods_with_options(monkeypatch):
-    @dataclass(frozen=True)
-    class MyScheme:
-        rho: float = 1.0
-
-    monkeypatch.setattr(wf, "MyScheme", MyScheme, raising=False)
-    assert method("my_scheme(rho=.5)") == MyScheme(0.5)
-    assert method(" bdf2 ") == "bdf2"
+def test_methods_with_options():
+    assert integrators.get("generalized_alpha(rho_inf=.5)").parameter == 0.5
+    assert integrators.get(" bdf2 ").name == "bdf2"
     assert split_methods("bdf2,my_scheme(rho=.5, a=1),x") == ["bdf2", "my_scheme(rho=.5, a=1)", "x"]
-    for text, named in (("my_scheme(tau=1)", "tau"), ("my_scheme(rho)", "name=number"), ("bdf2(rho=1)", "no options"),
-                        ("bdf3", "bdf2")):  # fmt: skip
+    for text, named in (("generalized_alpha(tau=1)", "tau"), ("generalized_alpha(rho_inf)", "not a number"),
+                        ("bdf2(rho=1)", "no option"), ("bdf3", "bdf2")):  # fmt: skip
         with pytest.raises(wf.ModelError, match=named):
-            method(text)
+            integrators.get(text)
 
 
 def test_what_is_swept_is_sorted_out():

@@ -178,3 +178,20 @@ def test_a_thin_arc_bends_as_a_thick_one_does(kind, bound, thickness):
 
     got = result.probe("tip").position[0, -1, [0, 2]]
     assert np.linalg.norm(got - tip(1.0 + extra)) < bound * np.linalg.norm(tip(1.0 + extra) - tip(1.0))
+
+
+def test_a_thin_arc_with_poissons_ratio_bends_between_a_strip_and_a_plate():
+    """The same quarter circle, nu = 0.3, R/t = 1000, sides free; as wide as 3 sqrt(R t) it keeps most of its form."""
+    E, nu, extra, length, width, t = 1e9, 0.3, 0.1, np.pi / 2, 0.1, 1e-3
+    bend = lambda X: np.stack([np.sin(X[:, 0]), X[:, 1], 1.0 - np.cos(X[:, 0])], axis=1)  # noqa: E731
+    normals = lambda X: np.stack([-X[:, 0], 0.0 * X[:, 0], 1.0 - X[:, 2]], axis=1)  # noqa: E731
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    mesh = wf.mesh.grid((length, width), cells=(8, 1), map=bend)
+    body = b.add_shell(mesh, thickness=t, material=wf.SVK(E=E, nu=nu), normals=normals)
+    b.clamp(body.edge("x-"))
+    b.add_moment(body.edge("x+"), (0.0, -extra * E * width * t**3 / 12.0, 0.0))
+    b.add_probe("tip", body.edge("x+"))
+    moved = wf.solve_static(b.finalize(device="cpu"), load_steps=2, tol=1e-5).probe("tip").displacement[0, -1, [0, 2]]
+    k = 1.0 + extra
+    strip = np.array([np.sin(k * length), 1.0 - np.cos(k * length)]) / k - 1.0
+    assert (1.0 - nu**2) < np.linalg.norm(moved) / np.linalg.norm(strip) < 1.0

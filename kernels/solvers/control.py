@@ -8,6 +8,7 @@ __all__ = [
     "COMPONENT_ROWS",
     "FAIL_CONSTRAINT",
     "FAIL_CURVATURE",
+    "FAIL_ERROR",
     "FAIL_FLOOR",
     "FAIL_GROWTH",
     "FAIL_INVERTED",
@@ -35,6 +36,7 @@ FAIL_LIMIT = 8
 FAIL_FLOOR = 9
 FAIL_INVERTED = 10
 FAIL_WORK = 11
+FAIL_ERROR = 12
 
 COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
 FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|

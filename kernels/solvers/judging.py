@@ -23,7 +23,7 @@ FLOOR = 16.0
 PREDICTED = 1.0e-3
 STALLED = 0.5
 """A reduction of the residual that is no better than this is none."""
-CLOSING = 8
+CLOSING = 4
 """Iterations in which constraints are closed to what accelerations need, where `constraint_tol` asks for less."""
 NEAR = 1.0e3
 """Roundings of the positions, as they change the residual, within which a stall may be put down to rounding."""

@@ -21,7 +21,13 @@ class Output:
     `write` comes once for the initial state and after each accepted step; the writer decides itself whether a
     frame is due. `close` makes the file valid and is also called after an interrupted run. `abort` drops all
     that the run wrote and leaves an older target file as it was. A writer may be opened again after either.
+
+    Adaptive steps end where a frame is due: `rate` is frames per simulated second, None without a rate; `moments` are
+    single times, s.
     """
+
+    rate: float | None = None
+    moments: Sequence[float] = ()
 
     def open(self, sim: Any) -> None:
         """Check the target and start. OutputError if the target can't be written."""

@@ -25,6 +25,7 @@ __all__ = [
     "pair",
     "positive",
     "size",
+    "step_size",
     "vector",
 ]
 
@@ -71,6 +72,16 @@ def positive(text: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive finite number")
     return value
+
+
+def step_size(text: str) -> float | str:
+    """A positive finite number, or "auto"."""
+    if text == "auto":
+        return text
+    try:
+        return positive(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a positive finite number nor auto") from None
 
 
 def count(text: str) -> int:

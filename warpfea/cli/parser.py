@@ -10,7 +10,20 @@ from typing import Any
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
 from ..solvers import SOLVERS
-from .arguments import Once, Parser, add_general, call, color_range, count, load_steps, pair, positive, size, vector
+from .arguments import (
+    Once,
+    Parser,
+    add_general,
+    call,
+    color_range,
+    count,
+    load_steps,
+    pair,
+    positive,
+    size,
+    step_size,
+    vector,
+)
 from .measuring import add_bench, add_profile, add_stress, add_study, with_scene
 
 __all__ = ["parse"]
@@ -133,7 +146,8 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     how = to.add_argument_group("simulation (defaults are the scene's)")
     how.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
-    how.add_argument("--dt", type=positive, metavar="S", help="step, s")
+    how.add_argument("--dt", type=step_size, metavar="S", help="step, s; auto: as --error asks for")
+    how.add_argument("--error", type=positive, metavar="X", help="of --dt auto: of positions, over the model's size")
     how.add_argument(
         "--integrator",
         metavar="NAME",

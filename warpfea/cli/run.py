@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
         if options.resume:
             load_checkpoint(sim, options.resume)
             now = float(sim.time.max())
-            if now >= t_end - 0.5 * sim.dt:
+            if now >= t_end - (0.5 * sim.dt if sim.error is None else 0.0):
                 raise UsageError(f"{options.resume}: is at t = {now:g} s already, the end is {t_end:g} s; give --t-end")
         status = "failed"
         try:
@@ -122,7 +122,7 @@ def check_targets(options: argparse.Namespace) -> None:
         check_folder(folder if folder.is_dir() else folder.parent, folder)
 
 
-FOR_MOTION = ("t_end", "dt", "integrator", "png_time", "checkpoint", "resume")
+FOR_MOTION = ("t_end", "dt", "error", "integrator", "png_time", "checkpoint", "resume")
 
 
 def _check_kind(options: argparse.Namespace) -> None:
@@ -167,7 +167,8 @@ def _check_look(options: argparse.Namespace) -> None:
 
 def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> None:
     """UsageError for an end before the first step, and for a picture of what is not reached."""
-    if not (options.static or options.resume) and t_end <= 0.5 * source.dt:
+    fixed = not (options.static or options.resume or isinstance(source.dt, str))
+    if fixed and t_end <= 0.5 * float(source.dt):
         raise UsageError(
             f"--t-end {t_end:g}: no step would be done, for it is at most half a step of dt = {source.dt:g} s; "
             "give a smaller --dt or a later --t-end"

@@ -12,7 +12,6 @@ from ..base.errors import UsageError
 from ..builder.scene import Scene, load_file, locate, split_name
 from ..mesh import FORMATS
 from ..model.model import Model
-from ..simulation.methods import method
 from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
@@ -34,7 +33,7 @@ class Source:
         label: what the user wrote.
         scene: the scene. values: what it is called with.
         parameters: what a summary says.
-        dt, integrator, dtype, device, tol, solver, inversion: of the run.
+        dt, integrator, dtype, device, tol, solver, inversion, error: of the run.
         load_steps, static_tol: of statics; None: a motion, the solver's default. stabilise: of statics.
     """
 
@@ -42,7 +41,7 @@ class Source:
     scene: Scene[Any]
     values: dict[str, Any]
     parameters: dict[str, Any]
-    dt: float
+    dt: float | str
     integrator: str
     dtype: str
     device: str | None
@@ -52,6 +51,7 @@ class Source:
     load_steps: int | None = None
     static_tol: float | None = None
     stabilise: bool = False
+    error: float | None = None
 
     def model(self) -> Model:
         """Call the scene and finalize."""
@@ -74,7 +74,8 @@ class Source:
             return Simulation(
                 model,
                 dt=self.dt,
-                integrator=method(self.integrator),
+                error=self.error,
+                integrator=self.integrator,
                 solver=solver,
                 inversion=self.inversion,
                 on_compile=bar,
@@ -135,12 +136,16 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
             raise UsageError(f"--{given[0].replace('_', '-')} is for mesh files; {options.what} is a scene, use --set")
         values = found.resolve(found.parse(options.set))
         parameters = values
+    dt = options.dt or saved.get("dt") or found.dt
+    error = options.error or (saved.get("error") if dt == "auto" else None)
+    if (error is None) == (dt == "auto"):
+        raise UsageError("--dt auto needs --error, such as 1e-4" if dt == "auto" else "--error is for --dt auto")
     return Source(
         label=options.what,
         scene=found,
         values=values,
         parameters=parameters,
-        dt=options.dt or saved.get("dt") or found.dt,
+        dt=dt,
         integrator=options.integrator or saved.get("integrator") or found.integrator,
         dtype=options.dtype or saved.get("dtype") or "float64",
         device=options.device,
@@ -150,4 +155,5 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         load_steps=(options.load_steps or 10) if getattr(options, "static", False) else None,
         static_tol=options.tol,
         stabilise=getattr(options, "stabilise", False),
+        error=error,
     )

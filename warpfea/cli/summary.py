@@ -87,7 +87,7 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
         "parameters": source.parameters,
         "device": str(sim.model.device),
         "dtype": sim.model.dtype,
-        "dt": None if static else sim.dt,
+        "dt": None if static else sim.dt if sim.error is None else "auto",
         "t_end": None if static else float(sim.time.max()),
         "load": None if sim.load is None else float(sim.load.max()),
         "steps": sim.steps,
@@ -120,7 +120,7 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
     steps = max(s["steps"], 1)
     done = f"{s['status']}, static, at {number(100.0 * (s['load'] or 0.0))} % of the load, {s['steps']} load steps"
     if s["load"] is None:
-        done = f"{s['status']} at t = {number(s['t_end'], 6)} s, {s['steps']} steps of {number(s['dt'])} s"
+        done = f"{s['status']} at t = {number(s['t_end'], 6)} s, {_steps(s, sim)}"
     rows = [
         ["scene", s["scene"] + "".join(f"  {k}={v}" for k, v in _short(s["parameters"]))],
         ["model", f"{info['elements']} elements, {info['unknowns']} unknowns"],
@@ -157,6 +157,14 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
     rows += _contact_rows(s["contacts"])
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return table(rows)
+
+
+def _steps(s: dict[str, Any], sim: Simulation) -> str:
+    """How many steps of which size."""
+    if sim.error is None:
+        return f"{s['steps']} steps of {number(s['dt'])} s"
+    refused = int(sim.totals["rejected"].sum())
+    return f"{int(sim.totals['substeps'].sum())} adaptive steps, {refused} refused, for an error of {number(sim.error)}"
 
 
 def model_box(model: Model) -> list[list[float]]:

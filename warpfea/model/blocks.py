@@ -139,10 +139,17 @@ def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[asse
         for part in parts
         for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
     ]
-    for name, dtype in (("first", T), ("second", T), ("X_first", vec3), ("X_second", vec3), ("coupling", T)):
+    assert key.tying is not None
+    names = [("first", T), ("X_first", vec3), ("coupling", T)]
+    normal = np.array_equal(*key.tying.pairs.T)
+    if not normal:
+        names += [("second", T), ("X_second", vec3)]
+    for name, dtype in names:
         table = np.concatenate([getattr(t, name) for t in tables])
         axis = 1 if dtype is vec3 else 2
         setattr(data, name, model.element_array(np.moveaxis(table, 0, axis), dtype))
+    if normal:  # strains x_a . x_a
+        data.second, data.X_second = data.first, data.X_first
 
 
 def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:

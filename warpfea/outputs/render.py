@@ -132,6 +132,7 @@ class PNGWriter(_Drawing):
             path, field=field, size=size, view=view, color_range=color_range, spacing=spacing, ground=ground
         )
         self.time = time
+        self.moments = () if time is None else (time,)
 
     def write(self, sim: Any) -> None:
         if self._reel is None or self.time is None or self._reel.frames:
@@ -184,6 +185,7 @@ class GIFWriter(_Drawing):
         )
         check_rates(fps, speed, max_frames)
         self.fps, self.speed, self.max_frames, self.progress = fps, speed, max_frames, progress
+        self.rate = fps / speed
 
     def open(self, sim: Any) -> None:
         super().open(sim)

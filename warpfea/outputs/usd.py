@@ -87,7 +87,7 @@ class USDWriter(Output):
         extend: bool = False,
     ) -> None:
         self.path = pathlib.Path(path)
-        self.fps = FrameClock(fps).fps
+        self.fps = self.rate = FrameClock(fps).fps
         self.color = color
         if isinstance(fields, str) or not all(isinstance(name, str) for name in fields):
             raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {fields!r}")

@@ -59,7 +59,7 @@ class VTUWriter(Output):
             raise OutputError(f"every must be a whole number of steps, at least 1, got {every!r}")
         self.folder = pathlib.Path(folder)
         self.every = int(every or 1)
-        self.fps = None if fps is None else FrameClock(fps).fps
+        self.fps = self.rate = None if fps is None else FrameClock(fps).fps
         self.fields = [name for name in dict.fromkeys(fields) if name not in ("displacement", "velocity")]
         self.extend = extend
         self._open = False

@@ -80,7 +80,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "slots": sim.model.slots,
         "integrator": sim.integrator.label,
         "gravity": sim.model.terms.dead.gravity_host.tolist(),
-        "dt": sim.dt,
+        "dt": sim.dt if sim.error is None else "auto",
         "steps": sim.steps,
         "max_residual": sim.max_residual,
         "max_floor": sim.max_floor,
@@ -88,6 +88,10 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "min_J": sim.min_J if math.isfinite(sim.min_J) else None,
         "probes": [probe.name for probe in sim.model.probes],
     }
+    if sim.stepper.adaptive:
+        instants = sim.stepper.adaptive.instants
+        meta["error"] = sim.error
+        meta["instants"] = [instants.interval, instants.horizon, instants.origin] if instants.settled else None
     arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
     arrays |= {f"total.{name}": values for name, values in sim.totals.items()}
     if sim._history:
@@ -109,7 +113,8 @@ def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
-    """Continue from a checkpoint: state, probes' records and totals. The step dt stays the simulation's own.
+    """Continue from a checkpoint: state, probes' records and totals. The step dt stays the simulation's own,
+    and so does the error of dt = "auto"; interval and horizon are the checkpoint's.
 
     Raises:
         CheckpointError: unreadable or truncated, or of another model, precision, number of worlds or integrator. The
@@ -132,6 +137,8 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         sim.stepper.start_terms()
     except CheckpointError as error:
         raise CheckpointError(f"{file}: {error}") from None
+    if sim.stepper.adaptive and meta.get("instants"):
+        sim.stepper.adaptive.instants.load(*meta["instants"])
     sim.totals = {name: np.array(a) for name, a in totals.items()}
     sim.steps = int(meta["steps"])
     sim.max_residual = float(meta["max_residual"])

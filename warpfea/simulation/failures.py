@@ -10,6 +10,7 @@ from ..base.errors import ConstraintError, ConvergenceError
 from ..kernels.solvers.control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
+    FAIL_ERROR,
     FAIL_FLOOR,
     FAIL_GROWTH,
     FAIL_INVERTED,
@@ -39,6 +40,7 @@ REASONS = {
     FAIL_LIMIT: "a term allowed no step along Newton's direction",
     FAIL_GROWTH: "the residual grew more than tenfold",
     FAIL_INVERTED: "an element turned inside out (J <= 0)",
+    FAIL_ERROR: "no step is short enough for the error asked for, as where a motion jumps,",
 }
 UNSTABLE = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
 """Failures that an indefinite tangent may explain."""
@@ -122,7 +124,8 @@ def _step_from(sim: Any, time: float) -> str:
     """The refused step, by its time (s) or part of the load."""
     if sim.integrator.static:
         return f"load step from {100.0 * time:.4g} % to {100.0 * (time + sim.dt):.4g} % of the load"
-    return f"step from t = {time:.6g} s with dt = {sim.dt:g} s"
+    dt = f"{sim.dt:g} s" if sim.error is None else f"'auto', error = {sim.error:g}"
+    return f"step from t = {time:.6g} s with dt = {dt}"
 
 
 def check_closed(sim: Any, mask: np.ndarray | None = None) -> None:

@@ -29,6 +29,8 @@ class StepReport:
         residual_force: |g| over the free components, N, of the last attempt.
         violation: largest of the constraints, m.
         outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
+        substeps, rejected: of dt="auto": accepted substeps, and those refused for their estimated error, which count
+            among the halvings; least_h, largest_h: their sizes, s. None with a fixed dt.
     """
 
     converged: np.ndarray
@@ -44,6 +46,10 @@ class StepReport:
     outer: np.ndarray
     residual_force: np.ndarray
     floor: np.ndarray
+    substeps: np.ndarray | None = None
+    rejected: np.ndarray | None = None
+    least_h: np.ndarray | None = None
+    largest_h: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +114,8 @@ def idle_report(sim: Any) -> StepReport:
 def describe(sim: Any) -> str:
     """A simulation in one line."""
     m, steps = sim.model, sim.steps
-    at = f"t = {float(sim.time.max()):.6g} s, {steps} steps, dt = {sim.dt:g} s, {sim.integrator.name}"
+    dt = f"{sim.dt:g} s" if sim.error is None else f"auto, error = {sim.error:g}"
+    at = f"t = {float(sim.time.max()):.6g} s, {steps} steps, dt = {dt}, {sim.integrator.name}"
     if sim.load is not None:
         at = f"static, load {100.0 * float(sim.load.max()):.4g} %, {steps} load step{'s' * (steps != 1)}"
     worlds = f", {m.worlds} worlds" if m.worlds > 1 else ""

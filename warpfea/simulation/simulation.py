@@ -19,6 +19,7 @@ from ..model.handles import NodeSet
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
+from .adaptive import adapt_of
 from .checks import check_choice, check_constraint_tol, check_dt, check_model, check_state, check_steps
 from .controls import Controls
 from .failures import check_closed, step_error
@@ -39,9 +40,14 @@ class Simulation(Records):
     Args:
         model: from ModelBuilder.finalize.
         state: where it starts; by default model.state(). It is advanced in place.
-        dt: step, s. `sim.dt` may be set later.
-        integrator: "backward_euler", "bdf2", "energy_momentum", "generalized_alpha" or
-            wf.GeneralizedAlpha(rho_inf=0.5), as a text "generalized_alpha(rho_inf=0.5)".
+        dt: step, s, which may be set later; or "auto": each world takes the steps that keep its error to `error`, and
+            all meet at common instants, to which `step` goes.
+        error: of dt="auto": largest error of a position at the end, over the model's size (`model.size`).
+        interval: of dt="auto": s between common instants at most; they are multiples of it, times of outputs, kinks of
+            time laws and the ends of runs. None: a 64th of the first run, 1/60 s of steps without one.
+        horizon: of dt="auto": s over which the error may build up. None: the first run, or 64 intervals.
+        integrator: "backward_euler", "bdf2", "energy_momentum", or wf.GeneralizedAlpha(rho_inf=0.5), as a text
+            "generalized_alpha(rho_inf=0.5)".
         solver: "newton-pcg", "jacobi" or "direct", or options: wf.NewtonPCG(...), wf.Jacobi(...).
         constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
             float64, 1e-5 in float32.
@@ -69,7 +75,10 @@ class Simulation(Records):
         model: Model,
         state: State | None = None,
         *,
-        dt: float,
+        dt: float | str,
+        error: float | None = None,
+        interval: float | None = None,
+        horizon: float | None = None,
         integrator: str | integrators.Integrator = "backward_euler",
         solver: NewtonPCG | Jacobi | str | None = None,
         constraint_tol: float | None = None,
@@ -87,7 +96,10 @@ class Simulation(Records):
         check_choice("inversion", inversion, "refuse", "report")
         if on_failure is not None:
             check_choice("on_failure", on_failure, "raise", "freeze")
-        check_dt(dt)
+        given = {"error": error, "interval": interval, "horizon": horizon}
+        adapt = adapt_of(dt, **given, model=model, scheme=scheme, solver=options)
+        if adapt is None:
+            check_dt(dt)
         if constraint_tol is None:
             constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
         check_constraint_tol(constraint_tol)
@@ -103,15 +115,19 @@ class Simulation(Records):
             self.stepper = Stepper(
                 model, self.state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
-                on_compile=on_compile or bar,
+                adapt=adapt, on_compile=on_compile or bar,
             )  # fmt: skip
         self.controls = Controls(model, self.state)
         self.compile_s = clock.perf_counter() - began
-        self.dt = dt
+        self.error = adapt.error if adapt else None
+        if not isinstance(dt, str):
+            self.dt = dt
         check_closed(self)
         self.steps = 0
         self.last: StepReport | None = None
         self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough", "floored")}
+        if adapt:
+            self.totals |= {name: np.zeros(model.worlds, int) for name in ("substeps", "rejected")}
         self.max_residual = 0.0
         self.max_floor = 0.0
         self.min_J = math.inf
@@ -127,11 +143,13 @@ class Simulation(Records):
 
     @property
     def dt(self) -> float:
-        """Step, s."""
-        return self._dt
+        """Step, s; of dt="auto" the interval between common instants, NaN before the first run or step settles it."""
+        return self.stepper.adaptive.instants.interval if self.stepper.adaptive else self._dt
 
     @dt.setter
     def dt(self, value: float) -> None:
+        if self.stepper.adaptive:
+            raise ModelError(f"dt = {value!r}: this simulation was made with dt = 'auto'")
         check_dt(value)
         self._dt = float(value)
         self.stepper.set_dt(self._dt)
@@ -159,7 +177,7 @@ class Simulation(Records):
         return self.state.status.numpy().copy()
 
     def step(self, count: int = 1) -> StepReport:
-        """Advance `count` steps of dt; the report is that of the last.
+        """Advance `count` steps of dt, or to the next common instants; the report is that of the last.
 
         Raises:
             ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
@@ -169,6 +187,8 @@ class Simulation(Records):
         """
         check_steps(count)
         for _ in range(count):
+            if self.stepper.adaptive:
+                self.stepper.adaptive.aim(self.time)
             self.stepper.run()
             report = self.stepper.work.report.numpy()
             self._digest(report)
@@ -194,11 +214,15 @@ class Simulation(Records):
             outer=column["outer"].astype(int),
             residual_force=column["residual_force"].copy(),
             floor=column["floor"].copy(),
+            **(self.stepper.adaptive.counts() if self.stepper.adaptive else {}),
         )
         self.steps += 1
         good = status == STATUS["running"]
         self._stepped |= good
         self._stepped &= status != STATUS["failed"]
+        if self.stepper.adaptive:
+            self.totals["substeps"] += self.last.substeps
+            self.totals["rejected"] += self.last.rejected
         self.totals["newton"] += self.last.newton
         self.totals["pcg"] += self.last.pcg
         self.totals["rough"] += good & ~self.last.converged
@@ -253,6 +277,7 @@ class Simulation(Records):
 
         Args:
             t_end: end time, s; the number of steps is rounded to the nearest, so the end may differ by half a step.
+                With dt="auto" it is met.
             outputs: writers (USDWriter, VTUWriter, Checkpoint, ...).
             on_step: called after each step; ends the run when it returns False.
             progress: show a bar on stderr; by default when stderr is a terminal.
@@ -268,13 +293,14 @@ class Simulation(Records):
             raise ModelError(f"run: outputs must be a list of writers such as USDWriter(path), got {outputs!r}")
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
-        total = round((t_end - now) / self._dt)
+        adaptive = self.stepper.adaptive
+        total = adaptive.steps_to(now, t_end, outputs) if adaptive else round((t_end - now) / self._dt)
         if total < 0:
             raise ModelError(f"t_end = {t_end:g} s lies in the past: the simulation is at t = {now:.6g} s")
         # who has stepped may be as close to t_end as whole steps come; a start is not
         if total == 0 and t_end != now and (self.steps == 0 or now == 0.0):
             away = f"t_end = {t_end:g} s is at most half a step from the start at t = {now:g} s"
-            raise ModelError(f"{away}, so no step would be done; take dt < {self._dt:g} s or a later t_end")
+            raise ModelError(f"{away}, so no step would be done; take dt < {self.dt:g} s or a later t_end")
         run_steps(self, total, t_end, outputs, on_step, progress)
         if self.last is None:
             self.last = idle_report(self)

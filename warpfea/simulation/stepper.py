@@ -14,6 +14,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
 from ..base.memory import enough_memory
+from ..kernels.step.adaptive import MAX_LEVEL
 from ..kernels.step.control import REPORT
 from ..kernels.step.ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
@@ -22,6 +23,7 @@ from ..solvers import Jacobi, NewtonPCG, make_loop
 from ..terms.checks import check_measured
 from ..terms.term import At, Term
 from ..terms.workspace import Workspace
+from .adaptive import Adapt, Adaptive
 from .integrators import Integrator
 from .opening import Opening
 from .predictor import Predictor
@@ -53,6 +55,7 @@ class Stepper:
         capture: bool,
         constraint_tol: float = 0.0,
         inversion: str = "refuse",
+        adapt: Adapt | None = None,
         on_compile: OnCompile | None = None,
     ) -> None:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
@@ -85,8 +88,10 @@ class Stepper:
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
         midpoint = integrator.midpoint
         self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint)
-        kinds = {"inertia": not integrator.static, "midpoint": midpoint, "accelerated": integrator.accelerated}
-        self.at = At(model, self.work, self.launch, state, self.u_before, **kinds)
+        self.at = At(
+            model, self.work, self.launch, state, self.u_before,
+            inertia=not integrator.static, midpoint=midpoint, accelerated=integrator.accelerated,
+        )  # fmt: skip
         self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
@@ -101,10 +106,14 @@ class Stepper:
         self.opening = Opening(self.at, self.newton.residual, integrator) if integrator.accelerated else None
         flags = self.work.any_flag
         self.running, self.refused, self.failed = flags[2:3], flags[3:4], flags[4:5]
+        self.adaptive: Adaptive | None = None
+        if adapt:
+            tries = solver.max_halvings
+            self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
-        self.backup = state.like() if solver.max_halvings > 0 else None
+        self.backup = state.like() if solver.max_halvings > 0 or self.adaptive else None
         self._load_modules()
         self.start_terms()
         self._measure_potential(None)
@@ -120,7 +129,7 @@ class Stepper:
         w.step.status = state.status
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
-        w.step.max_halvings = self.solver.max_halvings
+        w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
         w.step.stabilise = self.integrator.stabilise
         w.step.parameter = self.integrator.parameter
         if self.integrator.takes_velocity:
@@ -211,6 +220,8 @@ class Stepper:
         out |= self.newton.modules() | self.terms.modules(self.at)
         if self.backup is not None:
             out.add(state_kernels().module)
+        if self.adaptive:
+            out.add(self.adaptive.kernels.module)
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
@@ -267,7 +278,13 @@ class Stepper:
         m, w, launch = self.model, self.work, self.launch
         w.any_flag[2:5].zero_()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
+        if self.adaptive:
+            assert self.backup is not None
+            self.backup.copy_rows(launch, w.step.running, self.state)
+            self.adaptive.open()
         wp.capture_while(self.running, self._attempt)
+        if self.adaptive:
+            self.adaptive.close()
         self._report()
 
     @labelled("commit")
@@ -318,7 +335,11 @@ class Stepper:
         for term in self.terms:
             term.begin(self.at, running)
         self.newton.run()
+        if self.adaptive:
+            self.adaptive.judge()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
+        if self.adaptive:
+            self.adaptive.settle()
         self.commit()
 
     def _candidate(self, kind: int) -> None:

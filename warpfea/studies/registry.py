@@ -154,6 +154,15 @@ _ENTRIES = (
         results=("conservation_cpu.json",),
     ),
     Entry(
+        name="adaptive",
+        module="reports.adaptive",
+        summary="dt='auto' beside the error asked for and the best fixed step",
+        about="Five motions (stiff, an impact of load, a dead point, free flight, contact) with backward Euler and "
+        "BDF2: true errors for errors asked for of 1e-2 to 1e-5, and Newton iterations beside fixed steps.",
+        example="--out tests/results/adaptive_cpu.json",
+        results=("adaptive_cpu.json",),
+    ),
+    Entry(
         name="jacobi",
         module="reports.jacobi",
         summary="error and cost of the solver wf.Jacobi beside Newton's method",

@@ -5,7 +5,7 @@ import warp as wp
 from ...kernels.step.control import Coefficients
 from .scheme import Integrator
 
-__all__ = ["BACKWARD_EULER", "STATIC", "backward_euler"]
+__all__ = ["BACKWARD_EULER", "STATIC", "backward_euler", "euler_error"]
 
 
 @wp.func
@@ -18,5 +18,12 @@ def backward_euler(h: wp.float64, previous: wp.float64, parameter: wp.float64):
     return c
 
 
-BACKWARD_EULER = Integrator("backward_euler", backward_euler, order=1)
+@wp.func
+def euler_error(h: wp.float64, previous: wp.float64):
+    """Local error h^2 a / 2 = h/2 (v_{n+1} - v_n)."""
+    half = wp.float64(0.5) * h
+    return wp.vec3d(half, -half, wp.float64(0.0))
+
+
+BACKWARD_EULER = Integrator("backward_euler", backward_euler, order=1, estimate=euler_error)
 STATIC = Integrator("static", backward_euler, order=0, static=True)

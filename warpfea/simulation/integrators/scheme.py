@@ -20,6 +20,8 @@ class Integrator:
         takes_velocity: q~ takes v_n.
         midpoint: forces are those of the middle of the step, and conserve energy and momenta.
         accelerated: keeps accelerations, algorithmic ones a_n and those of the equilibrium w_n, and so needs a start.
+        estimate: wp.func (h, previous h) -> vec3d, the weights of v_{n+1}, v_n and v_{n-1}, of sum 0, that give the
+            local error in position, m; None: steps can't be adapted to it.
         static: no inertia; v is the displacement increment of a load step.
         parameter: the number that `coefficients` gets, such as a spectral radius.
         stabilise: N/m per kg, of statics: springs from the last equilibrium to the next, fading with the load.
@@ -33,6 +35,7 @@ class Integrator:
     midpoint: bool = False
     accelerated: bool = False
     static: bool = False
+    estimate: Any = field(default=None, compare=False)  # follows from the coefficients
     # kernels don't depend on these
     parameter: float = field(default=0.0, compare=False)
     stabilise: float = field(default=0.0, compare=False)
@@ -52,6 +55,6 @@ class Integrator:
     @property
     def variant(self) -> str:
         """Name of its kernels."""
-        flags = ("multistep", "takes_velocity", "midpoint", "accelerated", "static")
-        flags = [name for name in flags if getattr(self, name)]
+        names = ("multistep", "takes_velocity", "midpoint", "accelerated", "static")
+        flags = [name for name in names if getattr(self, name)]
         return "_".join([self.coefficients.key, *flags])

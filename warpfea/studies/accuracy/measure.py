@@ -16,7 +16,6 @@ from ...base.errors import CapacityError, ConstraintError, ConvergenceError, Err
 from ...base.usercode import user_code
 from ...builder.scene import Scene
 from ...model.model import Model
-from ...simulation.methods import method
 from ...simulation.simulation import Simulation
 from ...solvers import SOLVERS
 from ..timing import repeated
@@ -152,7 +151,7 @@ class _Run:
         self.sim = Simulation(
             model,
             solver=SOLVERS[setting.solver](tol=setting.tol),
-            integrator=method(setting.method),
+            integrator=setting.method,
             **step_options(setting),
         )
         self.energies = [self.sim.energies()]

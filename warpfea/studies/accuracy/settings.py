@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import json
 import math
+import re
 import shlex
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +18,6 @@ from ...base.errors import ModelError
 from ...base.names import did_you_mean
 from ...builder.scene import Scene
 from ...simulation import integrators
-from ...simulation.methods import method, split_methods
 from ...solvers import SOLVERS
 
 __all__ = ["OPTIONS", "Axes", "Setting", "check_steps", "make_axes", "order_of", "parse_over", "product"]
@@ -127,9 +127,14 @@ def word(value: Any) -> str:
     return "none" if value is None else str(value)
 
 
+def split_methods(text: str) -> list[str]:
+    """The words of a list with commas; commas in brackets belong to a word."""
+    return [part.strip() for part in re.split(r",(?![^(]*\))", text)]
+
+
 def order_of(text: str) -> int:
     """Order of convergence of an integrator."""
-    return int(integrators.get(method(text)).order)
+    return integrators.get(text).order
 
 
 def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") -> dict[str, list[Any]]:
@@ -203,7 +208,7 @@ def make_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequen
                 hint = did_you_mean(value, known)
                 raise ModelError(f"study: {name} {value!r} is unknown; there are {', '.join(known)}{hint}")
             if name == "method":
-                method(value)
+                integrators.get(value)
     whole = {name for name, p in scene.parameters.items() if is_whole(p.default) and not isinstance(p.default, bool)}
     for name in mesh or ():
         if name not in whole:

@@ -1,0 +1,232 @@
+"""Step sizes from an estimate of the local error: what a substep has left in the positions, and what follows from it.
+
+A substep of h is accepted where its error e in position, over the model's size, is at most
+
+    SHARE error max(h, SPREAD pace) / horizon,
+
+with `pace` a running mean of the accepted sizes: local errors then add up over the horizon to a share of what was
+asked. Where a velocity jumps, e is of order h however short the substep is: the pace lets it pass.
+"""
+
+import functools
+import types as _types
+from typing import Any
+
+import warp as wp
+
+from ..common.types import kernel_module, precision
+from ..solvers.control import FAIL_ERROR, control_struct
+from ..solvers.pcg import pcg_struct
+from .control import step_struct
+
+__all__ = ["COUNTS", "KEPT", "MAX_LEVEL", "adaptive_kernels", "adaptive_struct"]
+
+KEPT = ("wish", "pace", "last_error", "last_size")
+"""Columns of what the state holds, [world, column]: the size that the next substep should have at most, s, 0 at the
+start; the mean of sizes, s; error, m, and size, s, of the last substep."""
+COUNTS = ("substeps", "rejected", "least_h", "largest_h")
+"""Columns of what a step reports: accepted substeps, those refused for their error, least and largest size, s."""
+MAX_LEVEL = 26
+"""Halvings of the interval between common instants at most; a float32 time would not tell such steps apart."""
+SHARE = 0.5
+"""Of the error asked for that the estimates may add up to: errors grow on their way to the end."""
+GROW = 0.7
+"""A step is doubled where its estimate then keeps to this part of the tolerance."""
+CUT = 3
+"""Halvings of a refused substep at most: where a motion is not smooth, the estimate falls with a lower power of h."""
+SPREAD = 0.125
+"""Part of the pace that counts. With 1, loads and contacts that set in leave errors of velocity, which grow on."""
+START = 0.1
+"""Part of the error asked for that a multistep scheme's first step, of order 1, may have."""
+MEMORY = 16.0
+"""Substeps that the pace looks back over."""
+
+
+@functools.cache
+def adaptive_struct():
+    """What the control of step sizes knows of each world."""
+
+    @wp.struct
+    class AdaptiveControl:
+        flags: wp.array(dtype=wp.int32)  # an estimate is wanted
+        error: wp.array(dtype=wp.float64)  # of this attempt, m
+        tries: wp.array(dtype=wp.int32)  # refusals in a row that are none of the estimate's
+        work: wp.array(dtype=wp.int32)  # PCG iterations of the substeps before
+        kept: wp.array2d(dtype=wp.float64)  # KEPT, in the state
+        counts: wp.array2d(dtype=wp.float64)  # COUNTS
+        horizon: wp.array(dtype=wp.float64)  # [1] s, over which errors may add up
+        first: wp.array(dtype=wp.float64)  # [1] s, size of the first substep
+        tolerance: wp.float64  # m
+        max_tries: wp.int32
+
+    return AdaptiveControl
+
+
+@functools.cache
+def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
+    """Kernels in one precision.
+
+    Args:
+        dtype: precision of the vectors.
+        scheme: the time discretisation: `estimate`, a wp.func (h, previous h) -> weights of v_{n+1}, v_n and v_{n-1}
+            that give its local error in position; `order`; `multistep`; `variant`.
+    """
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Step, Newton, PCG, Adaptive = step_struct(), control_struct(), pcg_struct(), adaptive_struct()
+    estimate, order, multistep = scheme.estimate, scheme.order, scheme.multistep
+    module = kernel_module(f"adaptive_{dtype}_{scheme.variant}")
+
+    @wp.func
+    def refine(step: Step, wish: f64, world: int):
+        """Raise the level until substeps are no longer than the wish."""
+        level = step.level[world]
+        part = step.part[world]
+        h = step.dt[world] / f64(wp.lshift(1, level))
+        while level < MAX_LEVEL and h > f64(1.000001) * wish:
+            h = f64(0.5) * h
+            level = level + 1
+            part = part * 2
+        step.level[world] = level
+        step.part[world] = part
+
+    @wp.kernel(module=module)
+    def open_step(step: Step, ctl: Adaptive):
+        """Begin a step of all running worlds with the size that the state asks for."""
+        world = wp.tid()
+        for k in range(4):
+            ctl.counts[world, k] = f64(0.0)
+        ctl.tries[world] = 0
+        ctl.work[world] = 0
+        if step.running[world] == 0:
+            return
+        if ctl.kept[world, 0] == f64(0.0):
+            ctl.kept[world, 0] = ctl.first[0]
+            ctl.kept[world, 1] = ctl.first[0]
+        refine(step, ctl.kept[world, 0], world)
+
+    @wp.kernel(module=module)
+    def begin_estimate(step: Step, newton: Newton, ctl: Adaptive):
+        """Flag the worlds whose Newton iteration has converged."""
+        world = wp.tid()
+        good = step.running[world] != 0 and newton.failed[world] == 0 and newton.turned[world] == 0
+        ctl.flags[world] = wp.where(good, 1, 0)
+        ctl.error[world] = f64(0.0)
+
+    @wp.kernel(module=module)
+    def local_error(
+        step: Step,
+        ctl: Adaptive,
+        is_position: wp.array(dtype=T),
+        free: wp.array(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        v_before: wp.array2d(dtype=vec3),
+    ):
+        """Largest local error of a free position in the substep, m. A maximum does not depend on the order."""
+        world, slot = wp.tid()
+        if ctl.flags[world] == 0 or is_position[slot] == T(0.0):
+            return
+        previous = f64(0.0)
+        if wp.static(multistep):
+            if step.a1[world] > f64(0.0):
+                previous = step.previous_h[world]
+        c = estimate(step.h[world], previous)
+        # differences first: the velocities themselves may be large beside them
+        e = T(c[0]) * (v[world, slot] - v_n[world, slot])
+        if wp.static(multistep):
+            e -= T(c[2]) * (v_n[world, slot] - v_before[world, slot])
+        size = f64(wp.length(wp.cw_mul(free[slot], e)))
+        if not wp.isfinite(size):
+            size = f64(1.0e300)
+        wp.atomic_max(ctl.error, world, size)
+
+    @wp.func
+    def power(x: f64, n: int) -> f64:
+        """x to the power n, n >= 1."""
+        out = x
+        for _k in range(1, n):
+            out = out * x
+        return out
+
+    @wp.kernel(module=module)
+    def judge(step: Step, newton: Newton, pcg: PCG, ctl: Adaptive):
+        """Refuse a substep whose error is too large; find the size of the next."""
+        world = wp.tid()
+        if step.running[world] == 0:
+            return
+        h = step.h[world]
+        if ctl.flags[world] == 0:
+            ctl.kept[world, 0] = f64(0.5) * h
+            ctl.tries[world] = ctl.tries[world] + 1
+            if ctl.tries[world] > ctl.max_tries:
+                step.level[world] = MAX_LEVEL  # it is the last
+            return
+        n = wp.static(order) + 1
+        if wp.static(multistep):
+            if step.a1[world] == f64(0.0):
+                n = 2
+        pace = ctl.kept[world, 1]
+        unit = f64(SHARE) * ctl.tolerance / ctl.horizon[0]
+        e = ctl.error[world]
+        limit = unit * wp.max(h, f64(SPREAD) * pace)
+        if wp.static(multistep):
+            if n == 2:
+                limit = wp.max(limit, f64(START) * ctl.tolerance)
+        ratio = e / limit
+        if not ratio <= f64(1.0):
+            newton.failed[world] = FAIL_ERROR
+            ctl.counts[world, 1] = ctl.counts[world, 1] + f64(1.0)
+            wish = f64(0.5) * h
+            half = f64(1.0) / power(f64(2.0), n)
+            ratio = ratio * half
+            for _k in range(1, CUT):
+                if ratio > f64(1.0):
+                    ratio = ratio * half
+                    wish = f64(0.5) * wish
+            ctl.kept[world, 0] = wish
+            return
+        ctl.tries[world] = 0
+        ctl.work[world] = ctl.work[world] + pcg.total[world]
+        pcg.total[world] = 0
+        # where the estimate passes through zero, that of the step before tells how large it will be again
+        double = f64(2.0) * h
+        ahead = e * power(f64(2.0), n)
+        if ctl.kept[world, 3] > f64(0.0):
+            ahead = wp.max(ahead, ctl.kept[world, 2] * power(double / ctl.kept[world, 3], n))
+        if ahead <= f64(GROW) * unit * wp.max(double, f64(SPREAD) * pace):
+            ctl.kept[world, 0] = double
+        else:
+            ctl.kept[world, 0] = h
+        ctl.kept[world, 1] = pace + (h - pace) / f64(MEMORY)
+        ctl.kept[world, 2] = e
+        ctl.kept[world, 3] = h
+        if ctl.counts[world, 0] == f64(0.0) or h < ctl.counts[world, 2]:
+            ctl.counts[world, 2] = h
+        ctl.counts[world, 3] = wp.max(ctl.counts[world, 3], h)
+        ctl.counts[world, 0] = ctl.counts[world, 0] + f64(1.0)
+
+    @wp.kernel(module=module)
+    def settle(step: Step, ctl: Adaptive):
+        """After an attempt: substeps no longer than the wish. The state to go back to is that of the step's start."""
+        world = wp.tid()
+        step.first_refusal[world] = 0
+        if step.running[world] != 0:
+            refine(step, ctl.kept[world, 0], world)
+
+    @wp.kernel(module=module)
+    def close_step(pcg: PCG, ctl: Adaptive):
+        """Iterations of all substeps, for the report."""
+        world = wp.tid()
+        pcg.total[world] = pcg.total[world] + ctl.work[world]
+
+    return _types.SimpleNamespace(
+        module=module,
+        open_step=open_step,
+        begin_estimate=begin_estimate,
+        local_error=local_error,
+        judge=judge,
+        settle=settle,
+        close_step=close_step,
+    )

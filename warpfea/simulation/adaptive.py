@@ -1,0 +1,148 @@
+"""Adaptive steps, `dt="auto"`: the launches of kernels/step/adaptive.py, and the checks of what users ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.checks import is_number
+from ..base.errors import ModelError
+from ..kernels.step.adaptive import COUNTS, KEPT, adaptive_kernels, adaptive_struct
+from ..solvers import NewtonPCG
+from .instants import Instants
+from .integrators import INTEGRATORS, Integrator
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..terms.term import At
+
+__all__ = ["Adapt", "Adaptive", "adapt_of"]
+
+LEAST = {"float64": 1e-9, "float32": 1e-5}
+"""Smallest error that may be asked for, over the model's size: below it rounding is not small beside it."""
+FIRST = 0.125
+"""The first substep over horizon error^(1/order)."""
+
+
+@dataclass(frozen=True)
+class Adapt:
+    """What dt = "auto" asks for.
+
+    Attributes:
+        error: over the model's size.
+        interval: s between common instants at most; None: a 64th of the first run, 1/60 s of steps without a run.
+        horizon: s, over which the error may build up; None: the first run, 64 intervals of steps without one.
+    """
+
+    error: float
+    interval: float | None = None
+    horizon: float | None = None
+
+
+def adapt_of(
+    dt: Any, error: Any, interval: Any, horizon: Any, *, model: Model, scheme: Integrator, solver: Any
+) -> Adapt | None:
+    """What dt = "auto" asks for; None with a number.
+
+    Raises:
+        ModelError: a value out of range, one without dt = "auto", or what steps can't be adapted with.
+    """
+    given = {"error": error, "interval": interval, "horizon": horizon}
+    if not isinstance(dt, str):
+        for name, value in given.items():
+            if value is not None:
+                raise ModelError(f"{name} = {value!r} is for dt = 'auto', and dt is {dt!r}")
+        return None
+    if dt != "auto":
+        raise ModelError(f"dt = {dt!r} must be a positive finite time (s), or 'auto'")
+    if not (is_number(error) and 0.0 < error < 1.0):
+        raise ModelError(
+            f"dt = 'auto' needs error, over the model's size, between 0 and 1, such as 1e-4; got {error!r}"
+        )
+    for name in ("interval", "horizon"):
+        value = given[name]
+        if value is not None and not (is_number(value) and value > 0.0):
+            raise ModelError(f"{name} = {value!r} must be a positive finite time (s)")
+    if scheme.estimate is None:
+        able = [name for name, known in INTEGRATORS.items() if known.estimate is not None]
+        raise ModelError(
+            f"dt = 'auto': integrator {scheme.name!r} has no estimate of its error; there are {', '.join(able)}"
+        )
+    if not isinstance(solver, NewtonPCG):
+        raise ModelError("dt = 'auto' needs the solver 'newton-pcg': what Jacobi's iterations leave is no error of dt")
+    least = LEAST[model.dtype]
+    if error < least:
+        finer = "; take float64" if model.dtype == "float32" else ""
+        raise ModelError(
+            f"error = {error!r} is below what {model.dtype} resolves, {least:g} of the model's size{finer}"
+        )
+    return Adapt(float(error), interval, horizon)
+
+
+class Adaptive:
+    """Control of step sizes, each world its own; the host chooses common instants, at which all worlds meet.
+
+    Attributes:
+        error: asked for, over the model's size.
+        instants: when worlds meet.
+    """
+
+    def __init__(self, at: At, v_before: wp.array, scheme: Integrator, asked: Adapt, *, max_tries: int) -> None:
+        model, work = at.model, at.work
+        self.model, self.work, self.launch = model, work, at.launch
+        self.velocity, self.v_before, self.error, self.order = at.state.velocity, v_before, asked.error, scheme.order
+        self.instants = Instants(model.terms.laws.laws, asked.interval, asked.horizon)
+        self.kernels = adaptive_kernels(model.dtype, scheme)
+        self.dim = (model.worlds, model.slots)
+        shapes = {"counts": (model.worlds, len(COUNTS)), "horizon": (1,), "first": (1,)}
+        self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("kept",), **shapes)
+        self.control.kept = at.state.register("adaptive", wp.float64, (len(KEPT),))
+        self.control.tolerance = asked.error * float(model.size)
+        self.control.max_tries = max_tries
+
+    def aim(self, time: np.ndarray) -> None:
+        """Before a step from times (B,), s: all worlds go to their next instant."""
+        instants = self.instants
+        if not instants.settled:
+            instants.settle(float(time.min()))
+        self.control.horizon.fill_(instants.horizon)
+        self.control.first.fill_(FIRST * instants.horizon * self.error ** (1.0 / self.order))
+        self.work.step.dt.assign(instants.spans(time))
+
+    def steps_to(self, now: float, end: float, outputs: Iterable[Any]) -> int:
+        """Steps of a run from `now` to `end`, both s, with outputs; -1: it ends before it begins."""
+        if end < now:
+            return -1
+        self.instants.follow(outputs)
+        if end > now and not self.instants.settled:
+            self.instants.settle(now, end)
+        return self.instants.count(now, end) if end > now else 0
+
+    def open(self) -> None:
+        """After the kernel `begin_step`: substeps of the size that the state asks for."""
+        self.launch(self.kernels.open_step, self.model.worlds, [self.work.step, self.control])
+
+    def judge(self) -> None:
+        """Before the kernel `end_attempt`: estimate the error of what has converged, and refuse what is too far off."""
+        m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
+        launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
+        args = [w.step, ctl, m.is_position, m.topology.free, w.v, self.velocity, self.v_before]
+        launch(k.local_error, self.dim, args)
+        launch(k.judge, m.worlds, [w.step, w.newton, w.pcg, ctl])
+
+    def settle(self) -> None:
+        """After the kernel `end_attempt`: the size of the next substep."""
+        self.launch(self.kernels.settle, self.model.worlds, [self.work.step, self.control])
+
+    def close(self) -> None:
+        """Before the report."""
+        self.launch(self.kernels.close_step, self.model.worlds, [self.work.pcg, self.control])
+
+    def counts(self) -> dict[str, np.ndarray]:
+        """Of the last step, each (B,), see COUNTS."""
+        rows = self.control.counts.numpy()
+        return {name: rows[:, k].astype(int if k < 2 else float) for k, name in enumerate(COUNTS)}
