@@ -282,9 +282,12 @@ def test_a_fixed_step_has_nothing_of_it():
 def test_the_command_line_adapts_steps(tmp_path, capsys):
     out = tmp_path / "out.json"
     options = ["run", "pendulum", "--set", "elements=2", "--t-end", "0.05", "--device", "cpu", "--json", str(out)]
-    assert main([*options, "--dt", "auto", "--error", "1e-3"]) == 0
-    assert "adaptive steps" in capsys.readouterr().out
+    assert main([*options, "--dt", "auto", "--error", "1e-4"]) == 0
+    printed = capsys.readouterr().out
     summary = json.loads(out.read_text())
+    assert f"{summary['substeps']} adaptive steps" in printed
+    assert summary["substeps"] > summary["steps"]
+    assert f"{summary['newton_iterations'] / summary['substeps']:.1f} Newton" in printed
     assert summary["dt"] == "auto"
     assert summary["t_end"] == pytest.approx(0.05, rel=1e-12)
     assert main([*options, "--dt", "auto"]) == 2

@@ -184,7 +184,7 @@ class _Run:
         drift = np.abs(table["ledger_residual"] - table["integrator"])
         return {
             "time": float(sim.time[0]),
-            "steps": sim.steps,
+            "steps": int(sim.totals["substeps"][0]) if "substeps" in sim.totals else sim.steps,
             "newton": int(sim.totals["newton"][0]),
             "pcg": int(sim.totals["pcg"][0]),
             "rough": int(sim.totals["rough"][0]),
