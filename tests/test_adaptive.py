@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import pathlib
 
@@ -12,10 +13,11 @@ import warp as wp
 import warpfea as wf
 from warpfea.cli import main
 from warpfea.simulation.checkpoint import Checkpoint
-from warpfea.simulation.instants import Instants, kinks
+from warpfea.simulation.instants import Instants
 from warpfea.simulation.integrators import Integrator
 from warpfea.simulation.integrators.backward_euler import BACKWARD_EULER
 from warpfea.simulation.integrators.bdf2 import bdf2, bdf2_error
+from warpfea.simulation.kinks import kinks
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "adaptive_cpu.json"
 SCHEMES = ("backward_euler", "bdf2")
@@ -172,11 +174,11 @@ def test_a_failed_step_leaves_the_state_of_its_start():
 
 def test_kinks_of_a_table_are_found_and_samples_of_a_curve_are_not():
     t = np.linspace(0.0, 1.0, 201)
-    smooth = np.column_stack([np.sin(20.0 * t), 0 * t, 0 * t])
-    assert kinks(t, smooth).tolist() == [0.0, 1.0]  # where it begins and ends
-    ramp = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert kinks(np.array([0.0, 0.1, 0.2, 5.0]), ramp).tolist() == [0.1, 0.2]
-    assert kinks(np.zeros(1), np.ones((1, 3))).size == 0
+    law = functools.partial(wf.laws.time_law, what="x", scalar=True)
+    assert kinks(law((t, np.sin(20.0 * t)))).tolist() == [0.0, 1.0]  # where it begins and ends
+    assert kinks(law(([0.0, 0.1, 0.2, 5.0], [0.0, 0.0, 1.0, 1.0]))).tolist() == [0.1, 0.2]
+    assert kinks(law(([0.0, 0.1, 0.1 + 1e-9, 5.0], [0.0, 0.0, 1.0, 1.0]))).tolist() == [0.1, 0.1 + 1e-9]
+    assert kinks(law(1.0)).size == 0
 
 
 def test_instants_are_intervals_frames_moments_and_the_end():
