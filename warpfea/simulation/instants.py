@@ -39,7 +39,7 @@ class Instants:
         self.given = interval, horizon
         self.interval = self.horizon = math.nan
         self.origin, self.end = 0.0, math.inf
-        found = [kinks(law) for law in laws]
+        found = [kinks(law, 0.0) for law in laws]  # both ends of what is a jump to a step
         self.kinks = self.fixed = np.unique(np.concatenate([*found, np.zeros(0)]))
         self.rates: list[float] = []
 

@@ -26,11 +26,8 @@ def jumps(law: TimeLaw, dt: float) -> np.ndarray:
     return np.stack([t[:-1][steep], t[1:][steep]], axis=1)
 
 
-def kinks(law: TimeLaw, dt: float = 0.0) -> np.ndarray:
-    """(n,) times, s, at which the slope of a sampled law jumps; those of what is a jump to a step dt are in `jumps`.
-
-    The law is constant outside of its samples. Without dt no change is a jump: it has a kink at either end.
-    """
+def kinks(law: TimeLaw, dt: float) -> np.ndarray:
+    """(n,) times, s, at which the slope of a sampled law jumps; those of its jumps are in `jumps`."""
     t = law.times
     if len(t) < 2:
         return np.zeros(0)
