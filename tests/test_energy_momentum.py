@@ -317,7 +317,7 @@ def test_damping_dissipates_and_leaves_momenta(form):
     assert abs(e["integrator"]) < 1e-13 * watch.first[0]
 
 
-def test_forms_of_damping_that_mean_the_same_give_the_same_bits():
+def test_forms_of_damping_that_mean_the_same_agree():
     ends = []
     for form in ("incremental", "rate"):
         b = wf.ModelBuilder()
