@@ -21,7 +21,7 @@ from ...builder.scene import Scene, locate
 from ...builder.scene import scene as as_scene
 from ..files import prepare
 from .finer import finer_motion, finer_setting
-from .measure import DONE, REFUSED, Outcome, step_options
+from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once
 from .motion import RESOLVED, ROUNDING, Motion, distances, known_motion
 from .problems import find_problem, problem_names
@@ -135,8 +135,6 @@ def study(
     )
     make_axes(found, {option: [base.get(option)] for option in ("solver", "dtype")}, None)
     settings = product(base, axes)
-    for setting in settings:
-        step_options(setting)
     if measure == "field" and found.field is None:
         raise ModelError(f"study: scene {found.name!r} has no field whose error could count: @wf.scene(field=...)")
     known = _reference(reference, found, base, probes)
