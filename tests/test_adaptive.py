@@ -339,7 +339,7 @@ COSTLY = {
     ("dead_points", "bdf2"): ({1e-5}, "2.43: its cause was not found"),
     ("impact", "backward_euler"): (
         {1e-2, 1e-3},
-        "1.30 and 0.92: the blow takes most of its steps with fixed ones, too",
+        "1.30, 0.92: the blow takes most of its steps with fixed ones, too",
     ),
     ("impact", "bdf2"): ({1e-5}, "0.73"),
     ("contact", "backward_euler"): (set(ERRORS), "1.35 to 2.42: the ball is in soft contact for much of its run"),

@@ -29,11 +29,6 @@ def test_free_bodies_keep_energy_and_momenta(parts, family):
         assert row["stretch"] > 0.08
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=KeyError,
-    reason="not measured yet: warpfea study conservation --only constrained --out tests/results/conservation_cpu.json",
-)
 def test_mechanisms_keep_energy(parts):
     rows = parts["constrained"]["rows"]
     assert [row["scene"] for row in rows] == list(MECHANISMS)
