@@ -38,7 +38,7 @@ def kinks(law: TimeLaw, dt: float) -> np.ndarray:
     slope = np.where(smooth[:, None], np.diff(law.values, axis=0) / np.diff(t)[:, None], 0.0)
     slope = np.concatenate([np.zeros((1, 3)), slope, np.zeros((1, 3))])
     bend = np.linalg.norm(np.diff(slope, axis=0), axis=1)
-    beside = np.diff(t, prepend=-np.inf, append=np.inf)
+    beside = np.concatenate([[np.inf], np.diff(t), [np.inf]])
     bulge = bend * np.minimum(beside[:-1], beside[1:])
     extent = np.linalg.norm(np.ptp(law.values, axis=0))
     steepest = np.linalg.norm(slope, axis=1).max()
