@@ -42,4 +42,4 @@ def kinks(law: TimeLaw, dt: float) -> np.ndarray:
     bulge = bend * np.minimum(beside[:-1], beside[1:])
     extent = np.linalg.norm(np.ptp(law.values, axis=0))
     steepest = np.linalg.norm(slope, axis=1).max()
-    return t[(bend > BEND * max(steepest, 1e-300)) | (bulge > BULGE * max(extent, 1e-300))]
+    return t[(bend > BEND * np.maximum(steepest, 1e-300)) | (bulge > BULGE * np.maximum(extent, 1e-300))]
