@@ -179,6 +179,51 @@ def test_kinks_of_tables_are_instants_and_samples_of_curves_are_not():
     assert Instants([ramp, time_law((1, 0, 0), "constant")], 1.0, 1.0).kinks.tolist() == [0.1, 0.100001]
 
 
+def test_a_short_pulse_is_seen_beside_a_jump():
+    """A jump is so steep that slopes of all else are small beside it: the pulse lies between two instants."""
+    start, half = 0.0101, 1e-4
+    times = [0.0, start, start + half, start + 2 * half, 0.5, 0.5 + 1e-7, 1.0]
+    load = np.outer([0, 0, 1e5, 0, 0, 1e5, 1e5], [1.0, 0, 0])
+    law = time_law((times, load), "pull")
+    assert set(times[1:4]) <= set(Instants([law], 1.0, 1.0).kinks)
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = b.add_solid(wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), material=LAW)
+    b.add_traction(body.surface("x+"), (times, load))
+    model = b.finalize(device="cpu")
+    sim = auto(model, 1e-3, integrator="bdf2")
+    sim.run(0.05)
+    speed = model.lumped_host @ sim.state.velocity.numpy()[0, :, 0] / model.lumped_host.sum()
+    assert speed == pytest.approx(1e5 * half / 1000.0, rel=0.25)  # impulse over mass; unseen: 0
+
+
+@pytest.mark.parametrize("start", [1e4, 1e6])
+def test_a_late_start_ends(start):
+    """Rounding of the time is above a billionth of the interval."""
+    model = bar()
+    state = model.state()
+    state.time.fill_(start)
+    sim = auto(model, 1e-2)
+    sim.run(0.1)
+    late = wf.Simulation(model, state, dt="auto", error=1e-2)
+    late.run(start + 0.1)
+    assert late.time[0] == pytest.approx(start + 0.1, abs=64.0 * np.spacing(start))
+    way = np.abs(sim.probe("tip").displacement[0, -1]).max()
+    assert np.abs(late.probe("tip").displacement[0, -1] - sim.probe("tip").displacement[0, -1]).max() < 1e-3 * way
+
+
+def test_an_interval_within_the_rounding_of_the_time_is_refused():
+    sim = auto(bar(), 1e-2, interval=1e-20, horizon=0.1)
+    with pytest.raises(wf.ModelError, match=r"interval of 1e-20 s at t = .* is within its rounding; take a longer one"):
+        sim.run(0.1)
+
+
+def test_a_checkpoint_of_fixed_steps_is_refused(tmp_path):
+    fixed = wf.Simulation(bar(), dt=1e-3)
+    fixed.run(2e-3, outputs=[Checkpoint(tmp_path / "c.npz")])
+    with pytest.raises(wf.CheckpointError, match=r"dt of the checkpoint is 0\.001, of the simulation 'auto'"):
+        auto().resume(tmp_path / "c.npz")
+
+
 def test_instants_are_intervals_frames_moments_and_the_end():
     class Frames:
         rate = 30.0
@@ -276,6 +321,37 @@ def test_a_fixed_step_has_nothing_of_it():
     assert "substeps" not in sim.totals
 
 
+@pytest.mark.parametrize("integrator", SCHEMES)
+def test_the_twist_of_a_beam_counts(integrator):
+    """Its axis does not move: only the gradients across it do, by half the section. Steps of 20 us as reference."""
+
+    def twisted(**options):
+        b = wf.ModelBuilder(gravity=(0, 0, 0))
+        beam = b.add_beam(
+            [(0, 0, 0), (1, 0, 0)], elements=2, section=wf.Rectangle(0.1, 0.1), normal=(0, 0, 1), material=LAW
+        )
+        b.clamp(beam.start, slots="all")
+        b.add_moment(beam.end, (2.0, 0, 0))
+        sim = wf.Simulation(b.finalize(device="cpu"), integrator=integrator, **options)
+        sim.run(0.1, progress=False)
+        return sim.state.displacement.numpy()[0, beam.slots]
+
+    error = 1e-3
+    surface = 0.05 * np.abs(twisted(dt="auto", error=error) - twisted(dt=2e-5))[4:].max()
+    assert surface <= 5.0 * error
+
+
+def test_too_many_substeps_are_refused_by_name(monkeypatch):
+    from warpfea.kernels.step import adaptive
+
+    assert adaptive.MOST == 65536
+    model = bar()
+    model.set_gravity([(0, 0, -1e9)])
+    sim = wf.Simulation(model, dt="auto", error=1e-6, interval=0.05)
+    with pytest.raises(wf.ConvergenceError, match="65536 substeps"):
+        sim.step()
+
+
 # the command line
 
 
@@ -358,7 +434,7 @@ def costs():
                     yield pytest.param(scene, integrator, error, marks=marks)
 
 
-@pytest.mark.parametrize(("scene", "integrator", "error"), costs())
+@pytest.mark.parametrize(("scene", "integrator", "error"), list(costs()))
 def test_newton_iterations_beside_the_best_fixed_step(scene, integrator, error):
     """At most 1.5 times those of the best fixed step on smooth motions, 0.7 times with an impact."""
     (row,) = [row for row in study(scene, integrator) if row["asked"] == error]

@@ -38,6 +38,8 @@ SPREAD = 0.125
 """Part of the pace that counts. With 1, loads and contacts that set in leave errors of velocity, which grow on."""
 START = 0.1
 """Part of the error asked for that a multistep scheme's first step, of order 1, may have."""
+MOST = 65536
+"""Substeps between two common instants at most."""
 MEMORY = 16.0
 """Substeps that the pace looks back over."""
 
@@ -118,15 +120,18 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     def local_error(
         step: Step,
         ctl: Adaptive,
-        is_position: wp.array(dtype=T),
+        arm: wp.array(dtype=T),
         free: wp.array(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3),
         v_before: wp.array2d(dtype=vec3),
     ):
-        """Largest local error of a free position in the substep, m. A maximum does not depend on the order."""
+        """Largest local error of a free place in the substep, m. A maximum does not depend on the order.
+
+        `arm`: what an unknown moves by 1, m: 1 of positions, half the section of gradients across it, else 0.
+        """
         world, slot = wp.tid()
-        if ctl.flags[world] == 0 or is_position[slot] == T(0.0):
+        if ctl.flags[world] == 0 or arm[slot] == T(0.0):
             return
         previous = f64(0.0)
         if wp.static(multistep):
@@ -137,7 +142,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         e = T(c[0]) * (v[world, slot] - v_n[world, slot])
         if wp.static(multistep):
             e -= T(c[2]) * (v_n[world, slot] - v_before[world, slot])
-        size = f64(wp.length(wp.cw_mul(free[slot], e)))
+        size = f64(arm[slot] * wp.length(wp.cw_mul(free[slot], e)))
         if not wp.isfinite(size):
             size = f64(1.0e300)
         wp.atomic_max(ctl.error, world, size)
@@ -175,9 +180,13 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
             if n == 2:
                 limit = wp.max(limit, f64(START) * ctl.tolerance)
         ratio = e / limit
+        if ctl.counts[world, 0] >= f64(MOST):
+            ratio = f64(wp.inf)
         if not ratio <= f64(1.0):
             newton.failed[world] = FAIL_ERROR
             ctl.counts[world, 1] = ctl.counts[world, 1] + f64(1.0)
+            if ctl.counts[world, 0] + ctl.counts[world, 1] > f64(MOST):
+                step.level[world] = MAX_LEVEL  # it is the last
             wish = f64(0.5) * h
             half = f64(1.0) / power(f64(2.0), n)
             ratio = ratio * half

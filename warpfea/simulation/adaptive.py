@@ -83,6 +83,19 @@ def adapt_of(
     return Adapt(float(error), interval, horizon)
 
 
+def _arms(model: Model) -> np.ndarray:
+    """(slots,) what an unknown moves by 1, m: 1 of positions, half the section of gradients across beams and shells, 0
+    of those whose motion the positions beside show."""
+    out = model.is_position_host.astype(float)
+    mass = model.mass_host.diagonal()
+    for body in model.bodies:
+        sets = body.family.slot_sets
+        for kind in sets.get("section", sets.get("director", ())):
+            slot = body.slots[model.slot_kind[body.slots] == kind]
+            out[slot] = np.sqrt(3.0 * mass[slot] / mass[slot - kind])  # a uniform section's
+    return out
+
+
 class Adaptive:
     """Control of step sizes, each world its own; the host chooses common instants, at which all worlds meet.
 
@@ -98,6 +111,7 @@ class Adaptive:
         self.instants = Instants(model.terms.laws.laws, asked.interval, asked.horizon)
         self.kernels = adaptive_kernels(model.dtype, scheme)
         self.dim = (model.worlds, model.slots)
+        self.arm = model.array("adaptive", _arms(model), model.types.T)
         shapes = {"counts": (model.worlds, len(COUNTS)), "horizon": (1,), "first": (1,)}
         self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("kept",), **shapes)
         self.control.kept = at.state.register("adaptive", wp.float64, (len(KEPT),))
@@ -130,7 +144,7 @@ class Adaptive:
         """Before the kernel `end_attempt`: estimate the error of what has converged, and refuse what is too far off."""
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
-        args = [w.step, ctl, m.is_position, m.topology.free, w.v, self.velocity, self.v_before]
+        args = [w.step, ctl, self.arm, m.topology.free, w.v, self.velocity, self.v_before]
         launch(k.local_error, self.dim, args)
         launch(k.judge, m.worlds, [w.step, w.newton, w.pcg, ctl])
 

@@ -172,6 +172,8 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
         raise CheckpointError(
             f"{file}: {what} of the checkpoint is {meta.get(key)!r}, of the simulation {value!r}{hint}"
         )
+    if sim.stepper.adaptive and meta.get("dt") != "auto":
+        raise CheckpointError(f"{file}: dt of the checkpoint is {meta.get('dt')!r}, of the simulation 'auto'")
 
 
 def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -40,7 +40,7 @@ REASONS = {
     FAIL_LIMIT: "a term allowed no step along Newton's direction",
     FAIL_GROWTH: "the residual grew more than tenfold",
     FAIL_INVERTED: "an element turned inside out (J <= 0)",
-    FAIL_ERROR: "no step is short enough for the error asked for, as where a motion jumps,",
+    FAIL_ERROR: "no step is short enough for the error asked for, or 65536 substeps are too few,",
 }
 UNSTABLE = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
 """Failures that an indefinite tangent may explain."""

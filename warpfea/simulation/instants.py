@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..base.errors import ModelError
 from .kinks import kinks
 
 if TYPE_CHECKING:
@@ -20,7 +21,8 @@ PARTS = 64
 FRAME = 1.0 / 60.0
 """Interval of steps without a run, s: a frame of animations."""
 SLACK = 1e-9
-"""Part of an interval within which two times are one."""
+"""Part of an interval within which two times are one; at least `ROUNDED` roundings of the time."""
+ROUNDED = 64.0
 
 
 class Instants:
@@ -79,7 +81,7 @@ class Instants:
 
     def after(self, time: float) -> float:
         """The first instant after a time, s."""
-        soon = time + SLACK * self.interval
+        soon = time + self._slack(time)
         steps = [(self.origin, self.interval), *((0.0, 1.0 / rate) for rate in self.rates)]
         found = [origin + (math.floor((soon - origin) / step) + 1) * step for origin, step in steps]
         found += self.fixed[self.fixed > soon][:1].tolist()
@@ -91,13 +93,28 @@ class Instants:
         """How far it is to the next instant from times (B,), s; a whole interval has always the same bits."""
         known = {time: self.after(time) - time for time in set(times.tolist())}
         whole = self.interval
-        return np.array([whole if abs(known[t] - whole) <= SLACK * whole else known[t] for t in times.tolist()])
+        return np.array([whole if 4.0 * abs(known[t] - whole) <= self._slack(t) else known[t] for t in times.tolist()])
+
+    def _slack(self, time: float) -> float:
+        """s, within which another time is the same as `time`.
+
+        Raises:
+            ModelError: the interval is not above the rounding of the time.
+        """
+        rounded = ROUNDED * math.ulp(time)
+        if 2.0 * rounded > self.interval:
+            raise ModelError(
+                f"dt = 'auto': an interval of {self.interval:g} s at t = {time:g} s is within its rounding; "
+                "take a longer one"
+            )
+        return max(SLACK * self.interval, rounded)
 
     def count(self, now: float, end: float) -> int:
         """Instants from `now` to `end`, both s, the end included."""
+        self._slack(end)  # refuses before it counts
         self.end = end
         total = 0
-        while now < end - SLACK * self.interval:
+        while now < end - self._slack(now):
             now = self.after(now)
             total += 1
         return total

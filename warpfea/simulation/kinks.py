@@ -13,6 +13,9 @@ __all__ = ["jumps", "kinks"]
 
 BEND = 0.25
 """Change of the slope that counts as a kink, over the largest slope; samples of a smooth law bend less."""
+BULGE = 0.03
+"""Change of the slope, times the shorter interval beside it and over the law's range, that counts as well, so that a
+jump elsewhere does not hide it: a sine with so few samples that `BEND` spares it has less."""
 STEEP = 1e-3
 """A change within this part of a step is a jump."""
 
@@ -35,4 +38,8 @@ def kinks(law: TimeLaw, dt: float) -> np.ndarray:
     slope = np.where(smooth[:, None], np.diff(law.values, axis=0) / np.diff(t)[:, None], 0.0)
     slope = np.concatenate([np.zeros((1, 3)), slope, np.zeros((1, 3))])
     bend = np.linalg.norm(np.diff(slope, axis=0), axis=1)
-    return t[bend > BEND * max(np.linalg.norm(slope, axis=1).max(), 1e-300)]
+    beside = np.concatenate([[np.inf], np.diff(t), [np.inf]])
+    bulge = bend * np.minimum(beside[:-1], beside[1:])
+    extent = np.linalg.norm(np.ptp(law.values, axis=0))
+    steepest = np.linalg.norm(slope, axis=1).max()
+    return t[(bend > BEND * np.maximum(steepest, 1e-300)) | (bulge > BULGE * np.maximum(extent, 1e-300))]

@@ -6,13 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from ...base.checks import is_number
 from ...base.console import number
 from ...base.errors import ConvergenceError, ModelError
 from .measure import DONE, REFUSED, Outcome
 from .motion import Motion, distances, observed, run_motion
 from .settings import Axes, Setting, check_steps, order_of
 
-__all__ = ["finer_motion", "finer_setting"]
+__all__ = ["check_finer", "finer_motion", "finer_setting"]
 
 STEP, MESH, TOL = 8.0, 2, 100.0
 """By how much finer than the finest run: step, cells along an edge, tolerance."""
@@ -32,6 +33,19 @@ def scaled(value: Any, factor: float) -> Any:
         return None if None in parts else parts
     out = value * factor
     return int(out) if out == int(out) and out >= 1 else None
+
+
+def check_finer(given: Mapping[str, Any]) -> None:
+    """ModelError for options of the finer run by which its own error could not be estimated."""
+    if given.get("error") is not None:
+        raise ModelError(
+            f"study: finer error = {given['error']!r}: the finer run takes steps of one size, from which its own error "
+            "is estimated; give dt"
+        )
+    for name in ("dt", "tol"):
+        value = given.get(name, 1.0)
+        if not (is_number(value) and value > 0.0):
+            raise ModelError(f"study: finer {name} = {value!r} must be a positive finite number")
 
 
 def finer_setting(group: Sequence[Setting], axes: Axes, given: Mapping[str, Any], default_dt: float) -> Setting:

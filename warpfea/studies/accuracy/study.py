@@ -13,6 +13,7 @@ from typing import Any
 
 import warp as wp
 
+from ...base.checks import is_number
 from ...base.console import quiet_warp
 from ...base.errors import ModelError
 from ...base.names import did_you_mean, listing
@@ -20,7 +21,7 @@ from ...builder.reference import Reference, read_reference, reference_of
 from ...builder.scene import Scene, locate
 from ...builder.scene import scene as as_scene
 from ..files import prepare
-from .finer import finer_motion, finer_setting
+from .finer import check_finer, finer_motion, finer_setting
 from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once
 from .motion import RESOLVED, ROUNDING, Motion, distances, known_motion
@@ -115,12 +116,13 @@ def study(
     if not (isinstance(repeat, int) and repeat >= 1):
         raise ModelError(f"study: repeat = {repeat!r} must be a positive whole number")
     for option, value in (("target", target), ("limit", limit), ("dt", dt), ("t_end", t_end), ("tol", tol)):
-        if value is not None and not (math.isfinite(value) and value > 0.0):
+        if value is not None and not (is_number(value) and value > 0.0):
             raise ModelError(f"study: {option} = {value!r} must be a positive finite number")
     axes = make_axes(found, sweep, mesh)
     values = dict(parameters or {})
     _check_names("parameter", values, found.parameters)
     _check_names("finer", finer or {}, [*OPTIONS, *found.parameters])
+    check_finer(finer or {})
     swept = {axis: many[0] for axis, many in axes.over.items() if axis not in OPTIONS}
     base = Setting(
         method=method_text(found.integrator),
@@ -204,6 +206,8 @@ def _check_probes(scene: Scene[Any], setting: Setting, chosen: Sequence[str] | N
         raise ModelError(
             f"scene {scene.name!r} has no probe, whose error a study needs: b.add_probe('tip', body.surface('x+'))"
         )
+    if chosen is not None and not chosen:
+        raise ModelError(f"study: probes = {chosen!r} are none; there are {listing(names)}")
     for name in chosen or ():
         if name not in names:
             raise ModelError(f"study: probe {name!r} is unknown; there are {listing(names)}{did_you_mean(name, names)}")
