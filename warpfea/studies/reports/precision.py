@@ -19,9 +19,9 @@ from .parts import run_tables
 __all__ = ["FAMILIES", "rows", "run"]
 
 FAMILIES = ("T4", "T10", "ENMC", "FN18", "H3843", "3243", "3443")
-STEPS = (4e-3, 1e-3, 2.5e-4, 6.25e-5)
-QUICK = (8e-3, 4e-3)
-END = 0.08
+STEPS = (1e-3, 2.5e-4, 6.25e-5)
+QUICK = (4e-3, 2e-3)
+END = 0.02
 
 
 def rows(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
@@ -31,7 +31,7 @@ def rows(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
     for family in FAMILIES:
         found = study(
             find_problem("small_body"), over=over, parameters={"family": family}, t_end=END, device=device, repeat=1,
-            split="none", finer={"method": "energy_momentum", "dt": steps[-1] / 4.0}, progress=False,
+            split="none", finer={"method": "energy_momentum", "dt": steps[-1] / 2.0}, progress=False,
         )  # fmt: skip
         by = {(r.setting.dtype, r.setting.dt): r for r in found}
         least = min((by["float32", dt].error or float("inf") for dt in steps), default=None)
