@@ -132,6 +132,35 @@ def test_the_target_is_answered_with_the_cheapest_row(fall):
     assert fall.command in fall.table()
 
 
+def test_the_answer_is_run_again_with_other_steps():
+    """Backward Euler falls too far by g h t / 2; steps are rounded to what divides the duration."""
+    found = run(over={"dt": [5e-4, 2.5e-4]}, target=0.02, methods=["backward_euler"])
+    answer = found.answer.setting
+    assert [c.setting.dt for c in found.checks] == [T / round(T / (f * answer.dt)) for f in (0.9, 1.1)]
+    for check in found.checks:
+        assert check.setting.method == answer.method
+        assert check.error == pytest.approx(found.answer.error * check.setting.dt / answer.dt, rel=0.02)
+        assert f"dt={check.setting.dt:.12g}: error" in found.verdict()
+    assert len(found.content(["study"])["checks"]) == 2
+    assert run(over={"dt": [5e-3]}, target=1e-9).checks == []
+
+
+def test_a_row_tells_the_energy_ledger(fall):
+    """Of the energy exchanged: what falls is potential and becomes kinetic, less what backward Euler takes."""
+    for row in fall:
+        ledger = row.ledger
+        assert ledger["potential"] == pytest.approx(-1.0, abs=1e-9)
+        assert ledger["kinetic"] + ledger["integrator"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_refusals_for_one_reason_are_told_once(tmp_path):
+    found = run(over={"dt": STEPS[:2], "error": [1e-2, 1e-3]}, methods=["energy_momentum"])
+    refused = [line for line in found.omissions() if "no estimate" in line]
+    assert len(refused) == 1
+    assert "error=0.01; energy_momentum, error=0.001: refused" in refused[0]
+    assert [r.status for r in found] == ["done", "done", "refused", "refused"]
+
+
 def test_parts_of_the_error(fall):
     """In a fall all is time: for backward Euler the difference of steps gives it exactly, for BDF2 nearly."""
     (row,) = [r for r in fall if r.split is not None]
