@@ -163,6 +163,26 @@ _ENTRIES = (
         results=("adaptive_cpu.json",),
     ),
     Entry(
+        name="contact-integrators",
+        module="reports.contact_integrators",
+        summary="scenes with contact, with every integrator: orders and dissipation",
+        about="The scenes with contact, shortened, with backward Euler, BDF2, energy_momentum and generalized_alpha "
+        "against finer runs: errors, orders, and what scheme and contact dissipate by the energy ledger.",
+        options=("device", "quick"),
+        example="--out tests/results/contact_integrators_cpu.json",
+        results=("contact_integrators_cpu.json",),
+    ),
+    Entry(
+        name="precision",
+        module="reports.precision",
+        summary="at which error rounding ends the curve of float32, for each family",
+        about="The problem small_body of each family with BDF2 in float64 and float32 over a range of steps, against "
+        "finer float64 runs.",
+        options=("device", "quick"),
+        example="--out tests/results/precision_cpu.json",
+        results=("precision_cpu.json",),
+    ),
+    Entry(
         name="jacobi",
         module="reports.jacobi",
         summary="error and cost of the solver wf.Jacobi beside Newton's method",

@@ -165,7 +165,8 @@ class _Run:
         """What the run took and lost: counts over all steps, bytes on the device, energies in J.
 
         drift: largest of |change of energy + losses of the model - work|, which is what the steps lost or won, with
-        what the solver left; exchanged: the most that one kind of energy held (kinetic, strain), or changed by.
+        what the solver left; exchanged: the most that one kind of energy held (kinetic, strain), or changed by; ledger:
+        change of each term of the energy ledger over the run.
         """
         sim, info = self.sim, self.sim.model.info()
         table = {name: np.array([float(e[name][0]) for e in self.energies]) for name in self.energies[0]}
@@ -182,5 +183,6 @@ class _Run:
             "elements": int(info["elements"]),
             "drift": float(drift.max()),
             "exchanged": float(max(kinds)),
+            "ledger": {name: float(values[-1] - values[0]) for name, values in table.items()},
             "compile_s": sim.compile_s,
         }

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...base.console import number
 from ..plots import require_matplotlib
-from .measure import DONE
+from .measure import DONE, REFUSED
 from .motion import RESOLVED
 
 __all__ = ["draw"]
@@ -47,7 +47,7 @@ def draw(study: Any, path: pathlib.Path) -> None:
     _reference(axes, study)
     if study.target is not None:
         axes.axhline(study.target, color="0.3", linestyle="--", linewidth=1.0, label=f"target {study.target:g}")
-    failed = [r for r in study.rows if r.status != DONE]
+    failed = [r for r in study.rows if r.status not in (DONE, REFUSED)]
     if failed:
         at = [r.seconds or axes.get_xlim()[0] for r in failed]
         style = {"color": "#c00000", "marker": "x", "linestyle": "none", "markersize": 9, "markeredgewidth": 2}

@@ -50,6 +50,7 @@ class Row:
         efficacy: digits, -log10(error x seconds).
         pareto: no other row has a smaller error in less time.
         split: parts of the error, see split.py; None where it was not asked for.
+        ledger: changes of the terms of the energy ledger over the run, over the largest energy exchanged.
     """
 
     setting: Setting
@@ -80,6 +81,7 @@ class Row:
     efficacy: float | None = None
     pareto: bool = False
     split: dict[str, float | None] | None = None
+    ledger: dict[str, float] | None = None
 
     @property
     def reaches(self) -> float:
@@ -150,6 +152,7 @@ class Study(Sequence[Row]):
         references: what errors are measured against, for each problem: about, own error, travel, values.
         settings: all else that the numbers depend on.
         answer: the cheapest row that reaches the target; None. command: that runs it.
+        checks: the answer rerun with about 0.9 and 1.1 times its step, or the error that it asks for.
     """
 
     name: str
@@ -162,6 +165,7 @@ class Study(Sequence[Row]):
     settings: dict[str, Any] = dataclasses.field(repr=False)
     answer: Row | None = dataclasses.field(repr=False)
     command: str | None
+    checks: list[Row] = dataclasses.field(default_factory=list, repr=False)
 
     @overload
     def __getitem__(self, index: int) -> Row: ...
@@ -205,7 +209,11 @@ class Study(Sequence[Row]):
 
     def omissions(self) -> list[str]:
         """What the picture can't show, in words."""
-        out = [f"{self.label(r)}: {r.status}: {r.why}" for r in self.rows if r.status != DONE]
+        reasons: dict[str, list[str]] = {}
+        for r in self.rows:
+            if r.status != DONE:
+                reasons.setdefault(f"{r.status}: {r.why}", []).append(self.label(r))
+        out = [f"{'; '.join(labels)}: {reason}" for reason, labels in reasons.items()]
         near = [self.label(r) for r in self.rows if r.status == DONE and not r.resolved]
         if near:
             out.append(
@@ -252,7 +260,11 @@ class Study(Sequence[Row]):
         if self.answer is not None:
             r = self.answer
             found = f"error {number(r.error or 0.0, 3)} in {number(r.seconds or 0.0, 3)} s"
-            return f"cheapest that reaches {self.target:g}: {self.label(r)}: {found}\n  {self.command}"
+            text = f"cheapest that reaches {self.target:g}: {self.label(r)}: {found}\n  {self.command}"
+            for c in self.checks:
+                size = f"error={word(c.setting.error)}" if c.setting.error else f"dt={word(c.setting.dt)}"
+                text += f"\nchecked with {size}: " + (c.why if c.error is None else f"error {number(c.error, 3)}")
+            return text
         near = min(self.rows, key=lambda r: r.reaches)
         if near.error is None:
             return f"no setting was measured to reach {self.target:g}"
@@ -292,6 +304,7 @@ class Study(Sequence[Row]):
             "references": plain(self.references),
             "orders": self.fits(),
             "answer": None if self.answer is None else {"row": self.rows.index(self.answer), "command": self.command},
+            "checks": [plain(asdict(row)) for row in self.checks],
             "rows": [plain(asdict(row)) for row in self.rows],
         }
 
@@ -326,4 +339,5 @@ class Study(Sequence[Row]):
         out = {k: v for k, v in given.items() if k != "values"} | out
         out = {f"set {k}": v for k, v in row.setting.values.items()} | out
         out |= {f"order {k}": v for k, v in row.orders.items()}
+        out |= {f"ledger {k}": v for k, v in (row.ledger or {}).items()}
         return out | {f"{name} {k}": v for name, p in row.probes.items() for k, v in p.items()}

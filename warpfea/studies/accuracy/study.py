@@ -34,6 +34,8 @@ from .store import Store, code_version
 __all__ = ["study"]
 
 SPLITS = ("best", "all", "none")
+CHECKED = (0.9, 1.1)
+"""Times the step of the answer, with which it is run again."""
 RUN = "run"
 """As `reference`: a finer run, also where the scene knows its motion."""
 
@@ -149,6 +151,7 @@ def study(
             rows, references, motions = work.rows(settings)
             answer = _answer(rows, target)
             rows = work.split(rows, motions, split, answer)
+            checks = [] if answer is None else work.checks(answer, motions)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(store.told()) from None
     answer = None if answer is None else _answer(rows, target)
@@ -157,7 +160,7 @@ def study(
         "t_end": base.t_end, "repeat": repeat, "limit": limit, "split": split, "parameters": base.values, "dt": base.dt,
         "tol": base.tol, "solver": solver, "dtype": dtype, "integrator": base.method, "probes": probes,
     }  # fmt: skip
-    result = Study(name, what, rows, axes, measure, target, references, told, answer, command)
+    result = Study(name, what, rows, axes, measure, target, references, told, answer, command, checks)
     if folder is not None:
         result.write(folder, words or ["study", what])
     return result
@@ -323,6 +326,8 @@ class _Work:
             return row
         away: dict[str, Any] = distances(outcome, motion)
         away["energy"] = n["drift"] / n["exchanged"] if n["exchanged"] > 0.0 else None
+        if n["exchanged"] > 0.0:
+            away["ledger"] = {name: change / n["exchanged"] for name, change in n["ledger"].items()}
         error, own = away[self.measured], motion.own.get(self.measured, 0.0)
         if error is None:
             needs = "a field=, and a reference that has one" if self.measured == "field" else "energy that is exchanged"
@@ -350,6 +355,25 @@ class _Work:
                     row = replace(row, split=parts_of_error(row.setting, self.axes, motion, self.run))
                 out.append(row)
         return out
+
+    def checks(self, answer: Row, motions: dict[str, Motion]) -> list[Row]:
+        """The answer with steps, or errors asked for, that are about 0.9 and 1.1 times as large; not repeated.
+
+        Steps are rounded to what divides the duration.
+        """
+        from tqdm import tqdm
+
+        setting, found = answer.setting, []
+        with tqdm(desc="target", unit="run", leave=False, disable=not self.show, file=sys.stderr) as self.bar:
+            for factor in CHECKED:
+                if setting.dt is None:
+                    assert setting.error is not None
+                    near = setting.changed({"error": factor * setting.error})
+                else:
+                    steps = max(1, round(setting.t_end / (factor * setting.dt)))
+                    near = setting.changed({"dt": setting.t_end / steps})
+                found.append(self._row(near, self.run(near), motions[self._problem(near)]))
+        return found
 
 
 def _short(setting: Setting, axes: Axes) -> str:
