@@ -266,6 +266,28 @@ def test_a_run_that_takes_too_long_is_given_up():
             "references", "settings", "answer", "command")]).verdict()  # fmt: skip
 
 
+def test_a_step_that_adapts_tells_its_substeps_and_what_was_asked(tmp_path):
+    found = run(over={"error": [1e-1, 1e-3]}, methods=["backward_euler"], out=tmp_path)
+    assert found[1].steps > found[0].steps > 64  # of 64 intervals
+    with open(tmp_path / "falling.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["asked error"]) for line in lines] == [1e-1, 1e-3]
+    assert [float(line["error"]) for line in lines] == [row.error for row in found]
+
+
+def test_integrators_may_be_given_as_they_are_made():
+    found = run(over={"dt": STEPS[:2]}, methods=["bdf2", wf.GeneralizedAlpha(rho_inf=0.5)])
+    assert [row.setting.method for row in found] == 2 * ["bdf2"] + 2 * ["generalized_alpha(rho_inf=0.5)"]
+
+
+def test_errors_of_rounding_have_no_order():
+    """The mid-point scheme is exact in a fall."""
+    found = run(over={"dt": STEPS[:2]}, methods=["energy_momentum"], target=1e-3)
+    assert all(row.error < 1e-13 and not row.resolved and not row.orders for row in found)
+    assert found.fits() == []
+    assert found.answer is not None
+
+
 # files
 
 
@@ -325,6 +347,7 @@ def test_a_stopped_study_goes_on(tmp_path, monkeypatch, capsys):
     stop = True
     assert main(words) == 130
     points = out / "falling.points.jsonl"
+    assert f"interrupted: {points} holds 2 finished runs" in capsys.readouterr().err
     assert len(points.read_text().splitlines()) == 2
     assert sorted(p.name for p in out.iterdir()) == ["falling.points.jsonl"]
     with open(points, "a") as file:

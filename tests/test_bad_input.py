@@ -153,7 +153,6 @@ LATER = {
     "add_contact": lambda b, s: b.add_contact(s),
     "TriMesh": lambda b, s: wf.TriMesh,
     "set_parameter": lambda b, s: b.finalize(device="cpu").set_parameter("bar.E", 1.0),
-    "GeneralizedAlpha": lambda b, s: wf.GeneralizedAlpha,
 }
 
 

@@ -52,7 +52,7 @@ def table(parts):
         worst = [f"{max(row[name] for row in rows):.0e}" for name in ("energy", "linear", "angular")]
         mean = sum(row["newton"] for row in rows) / len(rows)
         lines.append(f"| {family} | {' | '.join(worst)} | {mean:.1f}, {max(row['newton_max'] for row in rows)} |")
-    for row in parts["constrained"]["rows"]:
+    for row in parts.get("constrained", {"rows": []})["rows"]:
         name = row["scene"].replace("_", " ")
         lines.append(f"| {name} | {row['energy']:.0e} | | | {row['newton']:.1f}, {row['newton_max']} |")
     return "\n".join(lines)

@@ -463,7 +463,8 @@ def test_integrators_by_their_words():
     assert integrators.get("bdf2()") is integrators.get("bdf2")
     scheme = wf.GeneralizedAlpha(rho_inf=0.3)
     assert integrators.get(scheme) is scheme
-    assert integrators.get(scheme.label).rho_inf == 0.3
+    for rho in (0.3, 1.0 / 3.0, 0.0):
+        assert integrators.get(wf.GeneralizedAlpha(rho_inf=rho).label).rho_inf == rho  # to the last digit
     for text, words in (
         ("generalised_alpha", "did you mean 'generalized_alpha'"),
         ("generalized_alpha(rho_in=0.5)", "did you mean 'rho_inf'"),

@@ -163,7 +163,8 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     """Kernels of the constraints for one precision of the slots.
 
     `midpoint`: rows hold at the end of a step and act along their gradient in its middle, of a distance
-    (a0 + a1) / (|a0| + |a1|): the work of a step is lambda times the change of c, to the last digit.
+    (a0 + a1) / (|a0| + |a1|), of a turn at the mean of its angles: the work of a step is lambda times the change of c,
+    to the last digit.
     """
     p = precision(dtype)
     vec3 = p.vec3
@@ -236,6 +237,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
                 c = f64(2.0) * con.scale[row]  # turns can't be told apart: the step must be halved
         else:
             c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
+        turn = f
         if wp.static(midpoint):
             middle = A + combine(con, 3 * row, u_stage, world)
             if kind == DISTANCE:
@@ -245,7 +247,9 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             b = B + combine(con, 3 * row + 1, u_stage, world)
             if kind == TURN:
                 a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u_stage, world)
-        G = gradients(kind, scale, f, slope, b, a2)
+                if wp.isfinite(mul.last[world, row]):
+                    turn = f64(0.5) * (mul.last[world, row] + f)
+        G = gradients(kind, scale, turn, slope, b, a2)
         for side in range(3):
             mul.gradient[world, 3 * row + side] = G[side]
         rho = mul.stiffness[world, row]

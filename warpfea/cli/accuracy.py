@@ -37,9 +37,13 @@ how to read it:
   Errors are of the probes' positions over their largest travel: the root of the mean square over time (l2), and at the
   end. energy is the drift of the balance over the largest energy exchanged. "s" is the median time of all steps, with
   compilation and set-up apart; digits are -log10(error x s); Pareto marks rows that no other beats in both. Parts of
-  the error (space, time, algebra, rounding) are differences to a run that is finer in one of them.
+  the error (space, time, algebra, rounding) are differences to a run that is finer in one of them;
+  space is in the rows' errors only where the mesh is swept, or they are against a closed form or a file of the true
+  motion, and is told beside them otherwise.
+  steps of runs that adapt are those that were accepted; in the CSV their "asked error" stands beside "error".
 
-With --out a study that was stopped by Ctrl-C goes on where it was: the same command again runs what is missing.
+With --out a study that was stopped by Ctrl-C goes on where it was: the same command again runs what is missing, and the
+run that was under way. The reference is run first, and may take longer than all rows.
 exit codes: 0 done, 3 nothing reaches --target or the reference was refused, 2 bad usage, 130 interrupted
 """
 

@@ -29,6 +29,7 @@ KEYS = (
     "t_end",
     "load",
     "steps",
+    "substeps",
     "status",
     "wall_s",
     "compile_s",
@@ -60,7 +61,8 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     """The summary of a run of one world, SI units.
 
     `analysis` is "dynamic" or "static"; `t_end` the time that was reached, of statics `load` the part of the load, 0 to
-    1, with `steps` load steps; `mass` is null where a density is missing, `bounding_box` that of the reference;
+    1, with `steps` load steps; `substeps` are the accepted ones of dt="auto", whose `steps` are intervals, else
+    null; `mass` is null where a density is missing, `bounding_box` that of the reference;
     `wall_s` are the seconds from building to the closing of files, `compile_s` those of them in which the simulation
     was made; `min_J` is the smallest det F of any step, null where there is none; `rough_steps` are
     those accepted short of the tolerance (Jacobi), `floored_steps` those whose residual rounding stopped above it,
@@ -91,6 +93,7 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
         "t_end": None if static else float(sim.time.max()),
         "load": None if sim.load is None else float(sim.load.max()),
         "steps": sim.steps,
+        "substeps": int(sim.totals["substeps"].sum()) if "substeps" in sim.totals else None,
         "status": status,
         "wall_s": wall_s,
         "compile_s": sim.compile_s,
@@ -200,11 +203,12 @@ def _iterations(s: dict[str, Any], sim: Simulation) -> str:
 
 
 def _counts(s: dict[str, Any], sim: Simulation) -> str:
-    """Iterations per step."""
-    first = s["newton_iterations"] / max(s["steps"], 1)
+    """Iterations per step; of steps that adapt those that were accepted count."""
+    steps = max(s["steps"] if s["substeps"] is None else s["substeps"], 1)
+    first = s["newton_iterations"] / steps
     if isinstance(sim.solver, Jacobi):
         return f"{first:.1f} of Jacobi"
-    return f"{first:.1f} Newton and {s['pcg_iterations'] / max(s['steps'], 1):.0f} PCG"
+    return f"{first:.1f} Newton and {s['pcg_iterations'] / steps:.0f} PCG"
 
 
 def _joints(sim: Simulation) -> list[list[str]]:

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .kinks import kinks
+
 if TYPE_CHECKING:
     from ..laws import TimeLaw
 
-__all__ = ["Instants", "kinks"]
+__all__ = ["Instants"]
 
 PARTS = 64
 """Intervals of a run, if none is given."""
@@ -19,8 +21,6 @@ FRAME = 1.0 / 60.0
 """Interval of steps without a run, s: a frame of animations."""
 SLACK = 1e-9
 """Part of an interval within which two times are one."""
-KINK = 0.25
-"""Change of slope, over the steepest slope of the law, that counts as a kink: samples of a smooth curve do not."""
 
 
 class Instants:
@@ -39,7 +39,7 @@ class Instants:
         self.given = interval, horizon
         self.interval = self.horizon = math.nan
         self.origin, self.end = 0.0, math.inf
-        found = [kinks(law.times, law.values) for law in laws]
+        found = [kinks(law, 0.0) for law in laws]  # both ends of what is a jump to a step
         self.kinks = self.fixed = np.unique(np.concatenate([*found, np.zeros(0)]))
         self.rates: list[float] = []
 
@@ -101,13 +101,3 @@ class Instants:
             now = self.after(now)
             total += 1
         return total
-
-
-def kinks(times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Times at which the slope of samples (times (n,), values (n, 3)) jumps, s; the law is constant outside of them."""
-    if len(times) < 2:
-        return np.zeros(0)
-    slope = np.diff(values, axis=0) / np.diff(times)[:, None]
-    steepest = np.linalg.norm(slope, axis=1).max()
-    jump = np.linalg.norm(np.diff(slope, axis=0, prepend=0.0, append=0.0), axis=1)
-    return np.asarray(times, float)[jump > KINK * steepest]

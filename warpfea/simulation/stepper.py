@@ -88,8 +88,10 @@ class Stepper:
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
         midpoint = integrator.midpoint
         self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint)
-        kinds = {"inertia": not integrator.static, "midpoint": midpoint, "accelerated": integrator.accelerated}
-        self.at = At(model, self.work, self.launch, state, self.u_before, **kinds)
+        self.at = At(
+            model, self.work, self.launch, state, self.u_before,
+            inertia=not integrator.static, midpoint=midpoint, accelerated=integrator.accelerated,
+        )  # fmt: skip
         self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)

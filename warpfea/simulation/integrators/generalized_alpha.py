@@ -68,7 +68,7 @@ class GeneralizedAlpha(Integrator):
 
     @property
     def label(self) -> str:
-        return f"{self.name}(rho_inf={self.parameter:g})"
+        return f"{self.name}(rho_inf={self.parameter!r})"
 
     def __repr__(self) -> str:
         return f"GeneralizedAlpha(rho_inf={self.parameter!r})"

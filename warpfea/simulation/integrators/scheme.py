@@ -55,6 +55,6 @@ class Integrator:
     @property
     def variant(self) -> str:
         """Name of its kernels."""
-        flags = ("multistep", "takes_velocity", "midpoint", "accelerated", "static")
-        flags = [name for name in flags if getattr(self, name)]
+        names = ("multistep", "takes_velocity", "midpoint", "accelerated", "static")
+        flags = [name for name in names if getattr(self, name)]
         return "_".join([self.coefficients.key, *flags])

@@ -31,6 +31,8 @@ SLACK = 1e-9
 """Of the end time, within which samples count as in the run."""
 RESOLVED = 10.0
 """An error must be so many times that of the reference."""
+ROUNDING = 1e-13
+"""Errors below are those of the last digits, which have no order."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,12 +39,13 @@ class Row:
         energy: largest drift of the energy balance over the largest energy exchanged.
         field: of the scene's field at the end, over its norm.
         probes: l2 and end of each probe.
-        resolved: the error is at least ten times that of the reference.
+        resolved: the error is at least ten times that of the reference, and above rounding.
         own_error: that of the reference, in the same measure.
         orders: observed, from the next coarser row, by swept size.
         seconds, seconds_min: of all steps, median and minimum of `repeats` runs, without compilation and set-up.
         compile_s, setup_s: making the simulation (kernels, graphs), and making the model, in the first run.
-        steps, newton, pcg: counts over the run. rough: steps that were accepted above the tolerance (wf.Jacobi).
+        steps, newton, pcg: counts over the run; of steps that adapt those that were accepted.
+        rough: steps that were accepted above the tolerance (wf.Jacobi).
         bytes: of the simulation on its device. unknowns, elements: of the model.
         efficacy: digits, -log10(error x seconds).
         pareto: no other row has a smaller error in less time.
@@ -215,7 +216,9 @@ class Study(Sequence[Row]):
         out = [f"{'; '.join(labels)}: {reason}" for reason, labels in reasons.items()]
         near = [self.label(r) for r in self.rows if r.status == DONE and not r.resolved]
         if near:
-            out.append(f"not resolved (within {RESOLVED:g} times the error of the reference): {'; '.join(near)}")
+            out.append(
+                f"not resolved (within {RESOLVED:g} times the error of the reference, or rounding): {'; '.join(near)}"
+            )
         return out
 
     def label(self, row: Row) -> str:
@@ -331,7 +334,9 @@ class Study(Sequence[Row]):
     def _flat(self, row: Row) -> dict[str, Any]:
         """A row without nesting, for the CSV."""
         out = {k: v for k, v in plain(asdict(row)).items() if not isinstance(v, dict)}
-        out = {k: v for k, v in plain(asdict(row.setting)).items() if k != "values"} | out
+        given = plain(asdict(row.setting))
+        given["asked error"] = given.pop("error")  # `error` is the measured one
+        out = {k: v for k, v in given.items() if k != "values"} | out
         out = {f"set {k}": v for k, v in row.setting.values.items()} | out
         out |= {f"order {k}": v for k, v in row.orders.items()}
         out |= {f"ledger {k}": v for k, v in (row.ledger or {}).items()}

@@ -20,7 +20,7 @@ from ...builder.scene import Scene
 from ...simulation import integrators
 from ...solvers import SOLVERS
 
-__all__ = ["OPTIONS", "Axes", "Setting", "check_steps", "make_axes", "order_of", "parse_over", "product"]
+__all__ = ["OPTIONS", "Axes", "Setting", "check_steps", "make_axes", "method_text", "order_of", "parse_over", "product"]
 
 OPTIONS = ("method", "dt", "error", "solver", "tol", "dtype", "device")
 """What can be swept besides the parameters of the scene."""
@@ -132,6 +132,12 @@ def split_methods(text: str) -> list[str]:
     return [part.strip() for part in re.split(r",(?![^(]*\))", text)]
 
 
+def method_text(given: str | integrators.Integrator) -> str:
+    """An integrator as text: a name as it is given. ModelError for an unknown one."""
+    label = integrators.get(given).label
+    return given if isinstance(given, str) else label
+
+
 def order_of(text: str) -> int:
     """Order of convergence of an integrator."""
     return integrators.get(text).order
@@ -200,6 +206,8 @@ def make_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequen
         if isinstance(values, (str, bytes)) or not isinstance(values, Iterable) or not list(values):
             raise ModelError(f"study: over {name} = {values!r} must be a list of values, at least one")
         out[name] = [_number(name, v) if name in ("dt", "error", "tol") else v for v in values]
+        if name == "method":
+            out[name] = [method_text(value) for value in out[name]]
         if len({repr(value) for value in out[name]}) < len(out[name]):
             raise ModelError(f"study: over {name} = {out[name]} holds a value twice")
         known = {"solver": tuple(SOLVERS), "dtype": DTYPES}.get(name)
@@ -207,8 +215,6 @@ def make_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequen
             if known and value not in known:
                 hint = did_you_mean(value, known)
                 raise ModelError(f"study: {name} {value!r} is unknown; there are {', '.join(known)}{hint}")
-            if name == "method":
-                integrators.get(value)
     whole = {name for name, p in scene.parameters.items() if is_whole(p.default) and not isinstance(p.default, bool)}
     for name in mesh or ():
         if name not in whole:

@@ -91,6 +91,15 @@ class Store:
             line = {"key": key, "settings": asdict(setting), **outcome.packed()}
             self._append(json.dumps(plain(line)) + "\n")
 
+    def told(self) -> str:
+        """What an interrupted study leaves, in words."""
+        if self.file is None:
+            return "nothing is kept without a folder for it"
+        count = sum(outcome.status != REFUSED for outcome in self.outcomes.values())
+        if count == 0:
+            return "no run was finished yet"
+        return f"{self.file} holds {count} finished runs, which the same study does not run again"
+
     def _append(self, text: str) -> None:
         assert self.file is not None
         try:

@@ -21,12 +21,12 @@ from ...builder.scene import Scene, locate
 from ...builder.scene import scene as as_scene
 from ..files import prepare
 from .finer import finer_motion, finer_setting
-from .measure import DONE, REFUSED, Outcome, step_options
+from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once
-from .motion import RESOLVED, Motion, distances, known_motion
+from .motion import RESOLVED, ROUNDING, Motion, distances, known_motion
 from .problems import find_problem, problem_names
 from .report import MEASURES, Row, Study, with_orders, with_pareto
-from .settings import OPTIONS, Axes, Setting, make_axes, product
+from .settings import OPTIONS, Axes, Setting, make_axes, method_text, product
 from .split import split as parts_of_error
 from .store import Store, code_version
 
@@ -73,7 +73,7 @@ def study(
         scene: a scene, the name of one or file.py[:NAME], or a function that gives a ModelBuilder (with dt and t_end).
         over: lists of values by name: "dt", "tol", "solver" ("newton-pcg", "jacobi", "direct"), "dtype", "device",
             "method", "error", or a parameter of the scene.
-        methods: the same as over["method"]: names of integrators, "generalized_alpha(rho_inf=0.8)" with options.
+        methods: the same as over["method"]: integrators or their names, "generalized_alpha(rho_inf=0.8)" with options.
         error: the same as over["error"]: runs with dt="auto" to each of these errors, beside those of fixed steps.
         parameters: of the scene, for all runs.
         dt, t_end, solver, tol, dtype, device: of runs where they are not swept; by default the scene's.
@@ -125,7 +125,7 @@ def study(
     _check_names("finer", finer or {}, [*OPTIONS, *found.parameters])
     swept = {axis: many[0] for axis, many in axes.over.items() if axis not in OPTIONS}
     base = Setting(
-        method=found.integrator,
+        method=method_text(found.integrator),
         dt=float(dt or found.dt),
         error=None,
         solver=solver,
@@ -135,10 +135,8 @@ def study(
         t_end=float(t_end or found.t_end),
         values=found.resolve(swept | values),
     )
-    make_axes(found, {option: [base.get(option)] for option in ("method", "solver", "dtype")}, None)
+    make_axes(found, {option: [base.get(option)] for option in ("solver", "dtype")}, None)
     settings = product(base, axes)
-    for setting in settings:
-        step_options(setting)
     if measure == "field" and found.field is None:
         raise ModelError(f"study: scene {found.name!r} has no field whose error could count: @wf.scene(field=...)")
     known = _reference(reference, found, base, probes)
@@ -147,10 +145,13 @@ def study(
         folder = None if out is None else prepare(out)
         store = Store(folder and folder / f"{name}.points.jsonl", lambda dev: code_version(found, dev))
         work = _Work(found, axes, store, repeat, limit, progress, known, probes, dict(finer or {}), measure, base)
-        rows, references, motions = work.rows(settings)
-        answer = _answer(rows, target)
-        rows = work.split(rows, motions, split, answer)
-        checks = [] if answer is None else work.checks(answer, motions)
+        try:
+            rows, references, motions = work.rows(settings)
+            answer = _answer(rows, target)
+            rows = work.split(rows, motions, split, answer)
+            checks = [] if answer is None else work.checks(answer, motions)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(store.told()) from None
     answer = None if answer is None else _answer(rows, target)
     command = None if answer is None else answer.setting.command(what, found)
     told = {
@@ -329,7 +330,7 @@ class _Work:
             raise ModelError(f"study: no error by {self.measured!r} of scene {self.scene.name!r}: it needs {needs}")
         digits = -math.log10(error * row.seconds) if error > 0.0 and row.seconds else None
         return replace(
-            row, error=error, own_error=own, resolved=error > 0.0 and error >= RESOLVED * own, efficacy=digits, **away
+            row, error=error, own_error=own, resolved=error >= max(RESOLVED * own, ROUNDING), efficacy=digits, **away
         )  # fmt: skip
 
     def split(self, rows: list[Row], motions: dict[str, Motion], which: str, answer: Row | None) -> list[Row]:
