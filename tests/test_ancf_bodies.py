@@ -493,7 +493,8 @@ def _launched(model, state, what, *fields):
     out = wp.zeros((1, terms.side_entries), dtype=vec3, device="cpu")
     extra = [wp.array(f[None], dtype=vec3, device="cpu") for f in fields]
     for part in terms.find(Followers).items:
-        args = [part.data, state.displacement, values, active, *extra, out]
+        share = [1.0] if what == "product" else []
+        args = [part.data, *share, state.displacement, values, active, *extra, out]
         wp.launch(getattr(part, what), dim=(1, part.count), inputs=args, device="cpu")
     force = np.zeros((model.slots, 3))
     start, entry = terms.side_topology.start.numpy(), terms.side_topology.entry.numpy()

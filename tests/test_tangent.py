@@ -141,7 +141,8 @@ def with_mass_product(model, kernel, u, v, p, mass_factor=1e3):
     ((data, count),) = clusters.blocks
     sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(operator="elements"))
     out = wp.zeros((2, clusters.sums), dtype=model.types.vec3, device="cpu")
-    args = [block.data, data, *fields_of(model, u, v, p, mass_factor), 1, make_pool(model, sim.stepper.work), out]
+    args = [block.data, data, *fields_of(model, u, v, p, mass_factor), 1]
+    args += [make_pool(model, sim.stepper.work, midpoint=False), out]
     wp.launch(kernel, dim=(2, count), inputs=args, device="cpu")
     total = np.zeros((2, model.slots, 3))
     slot = np.repeat(np.arange(model.slots), np.diff(clusters.topology.start.numpy()))
