@@ -164,7 +164,7 @@ _ENTRIES = (
     ),
     Entry(
         name="contact-integrators",
-        module="reports.contact_integrators",
+        module="surveys.contact_integrators",
         summary="scenes with contact, with every integrator: orders and dissipation",
         about="The scenes with contact, shortened, with backward Euler, BDF2, energy_momentum and generalized_alpha "
         "against finer runs: errors, orders, and what scheme and contact dissipate by the energy ledger.",
@@ -174,7 +174,7 @@ _ENTRIES = (
     ),
     Entry(
         name="precision",
-        module="reports.precision",
+        module="surveys.precision",
         summary="at which error rounding ends the curve of float32, for each family",
         about="The problem small_body of each family with BDF2 in float64 and float32 over a range of steps, against "
         "finer float64 runs.",

@@ -14,7 +14,7 @@ from typing import Any
 
 from ..accuracy.problems import find_problem
 from ..accuracy.study import study
-from .parts import run_tables
+from ..reports.parts import run_tables
 
 __all__ = ["FAMILIES", "rows", "run"]
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from ...builder.scene import find
 from ..accuracy.study import study
-from .parts import Rows, run_tables
+from ..reports.parts import Rows, run_tables
 
 __all__ = ["METHODS", "SCENES", "orders", "rows", "run"]
 

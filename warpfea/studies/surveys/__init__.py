@@ -1,0 +1,1 @@
+"""Studies made of many studies of error against run time."""
