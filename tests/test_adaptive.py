@@ -345,7 +345,7 @@ def test_a_fall_that_no_step_resolves_is_refused_by_name():
     model = bar()
     model.set_gravity([(0, 0, -1e9)])
     sim = wf.Simulation(model, dt="auto", error=1e-6, interval=0.05)
-    with pytest.raises(wf.ConvergenceError, match="no step is short enough .* 65536 substeps"):
+    with pytest.raises(wf.ConvergenceError, match=r"no step is short enough .* 65536 substeps"):
         sim.step()
 
 
