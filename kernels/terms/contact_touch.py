@@ -302,7 +302,8 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return f64(1.0)
 
     return _types.SimpleNamespace(
-        Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, tangent_damping=tangent_damping,
+        Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, allowance=allowance, rate_of=rate_of,
+        tangent_damping=tangent_damping,
         depth_before=depth_before, touch=touch, in_plane=in_plane, coefficient=coefficient, hold=hold, pull=pull,
         friction_potential=friction_potential, friction_force=friction_force, point_stiffness=point_stiffness,
         acts=acts, shape_of=shape_of, lagrange=lagrange, monomial=monomial,

@@ -11,6 +11,7 @@ from ..elements.sections import Rectangle
 from ..materials import Material
 from ..model.bodies import Body
 from ..model.contacts import Collider, Contact
+from ..model.pairs import PairContact
 from ..model.description import BodyForce, Description, Rotation
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint
@@ -24,7 +25,7 @@ from .attachments import Ground
 from .beams import beam_geometry
 from .bodies import MeshLike, as_mesh, make_solid, make_structure, unused_name
 from .checks import check_densities, gravity_of, owner_of, warn_implausible
-from .contacts import make_collider, make_contact
+from .contacts import make_collider, make_contact, make_pair
 from .joints import make_constraint, make_joint
 from .shells import shell_geometry
 from .supports import clamp_support, drive_supports
@@ -370,12 +371,12 @@ class ModelBuilder:
         stiffness: float | None = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
         points: int | None = None, smoothing: Any = None, overlap: str = "refuse", overlap_time: float = 0.1,
         name: str | None = None,
-    ) -> Contact:  # fmt: skip
-        """Let a body, or a surface of it, touch a collider.
+    ) -> Contact | PairContact:  # fmt: skip
+        """Let a body, or a surface of it, touch a collider or another body.
 
         Args:
             surface: the outer faces that may touch; of a body all.
-            collider: as `add_collider` returned it.
+            collider: as `add_collider` returned it; or another body, or a surface of it.
             mu, mu_static: coefficients of friction in slip, and in stick if it is larger.
             restitution: speed after an impact over that before, 0 < restitution <= 1.
             law: "default", "paper" (Paper I, Eqs. 72-83) or "smooth".
@@ -395,16 +396,20 @@ class ModelBuilder:
 
         Raises:
             ModelError: a value out of range, an unknown name, no faces, or a handle of another builder.
-            NotImplementedError: two bodies, or a body with itself.
+            NotImplementedError: a body with itself.
         """
         self._own(surface, "add_contact", Body, SurfaceSet)
-        if collider is None or isinstance(collider, (Body, SurfaceSet)):
-            raise NotImplementedError("add_contact: contact between bodies is a later part; give a collider")
-        made = make_contact(
-            self.description, surface, collider, name, mu=mu, mu_static=mu_static, restitution=restitution, law=law,
-            treatment=treatment, stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
-            smoothing=smoothing, overlap=overlap, overlap_time=overlap_time,
-        )  # fmt: skip
+        if collider is None:
+            raise NotImplementedError("add_contact: a body with itself is a later part; give a collider or another body")
+        options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
+                       stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
+                       smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip
+        if isinstance(collider, (Body, SurfaceSet)):
+            self._own(collider, "add_contact", Body, SurfaceSet)
+            pair = make_pair(self.description, surface, collider, name, **options)
+            self.description.pairs.append(pair)
+            return pair
+        made = make_contact(self.description, surface, collider, name, **options)
         self.description.contacts.append(made)
         return made
 

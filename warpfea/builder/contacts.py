@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.checks import is_number
+from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..laws import time_law
@@ -15,12 +15,13 @@ from ..model.contact_points import check_points
 from ..model.contacts import Collider, ColliderRotation, Contact
 from ..model.description import Description, Rotation
 from ..model.handles import SurfaceSet
+from ..model.pairs import PAIR_RULES, PairContact, choose_master
 from ..model.shapes import Shape
 from .bodies import unused_name
 from .checks import vector
 
 __all__ = ["CONTACT_LAWS", "CONTACT_MODELS", "OVERLAPS", "TREATMENTS", "contact_surface", "make_collider",
-           "make_contact"]  # fmt: skip
+           "make_contact", "make_pair"]  # fmt: skip
 
 CONTACT_LAWS = ("default", "paper", "smooth")
 TREATMENTS = ("implicit", "explicit")
@@ -83,9 +84,37 @@ def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: 
         raise ModelError(f"add_contact: collider {collider.name!r} belongs to another builder")
     surface = contact_surface(thing)
     default = f"{surface.body.name} on {collider.name}"
-    name = unused_name(name, default, {c.name for c in d.contacts}, "contact")
+    name = unused_name(name, default, {c.name for c in d.contacts} | {c.name for c in d.pairs}, "contact")
     o = _checked(f"contact {name!r}", surface, dict(options))
     return Contact(surface, collider, name, index=len(d.contacts), **o)
+
+
+def make_pair(
+    d: Description, first: Body | SurfaceSet, second: Body | SurfaceSet, name: str | None, **options: Any
+) -> PairContact:  # fmt: skip
+    """See ModelBuilder.add_contact, with two bodies."""
+    a, b = contact_surface(first), contact_surface(second)
+    if a.body is b.body:
+        raise NotImplementedError(f"add_contact: body {a.body.name!r} with itself is a later part; give two bodies")
+    taken = {c.name for c in d.contacts} | {c.name for c in d.pairs}
+    name = unused_name(name, f"{a.body.name} on {b.body.name}", taken, "contact")
+    what = f"contact {name!r}"
+    if options["model"] == "sphere":
+        raise NotImplementedError(f"{what}: model = 'sphere' between bodies is a later part; take 'patch'")
+    if options["law"] == "smooth":
+        raise NotImplementedError(
+            f"{what}: law = 'smooth' acts at any distance, and is for contact with colliders; take 'default' or 'paper'"
+        )
+    slave, master = choose_master(a, b)
+    points, options["points"] = options["points"], None
+    o = _checked(what, slave, dict(options))
+    corners = {len(slave.body.family.faces[int(face)]) for face in np.unique(slave.faces[:, 1])}
+    for k in corners:
+        if points is not None and (not is_count(points) or points not in PAIR_RULES[k]):
+            numbers = ", ".join(map(str, PAIR_RULES[k]))
+            raise ModelError(f"{what}: points = {points!r}: faces of {slave.body.name!r} have rules of {numbers} points")
+    o["points"] = None if points is None else int(points)
+    return PairContact(a, b, name, slave, master, index=len(d.pairs), **o)
 
 
 def _checked(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ __all__ = [
     "conical_triangle",
     "lobatto_square",
     "square_rule",
+    "triangle_16",
     "triangle_3",
     "triangle_6",
     "triangle_7",
@@ -154,6 +155,25 @@ def triangle_7() -> Rule:
     corners, middles = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)], [(0.5, 0.0), (0.5, 0.5), (0.0, 0.5)]
     points = np.array([*corners, *middles, (1.0 / 3.0, 1.0 / 3.0)])
     return Rule("triangle7", points, np.repeat([1.0 / 40.0, 1.0 / 15.0, 9.0 / 40.0], [3, 3, 1]), 3)
+
+
+@functools.cache
+def triangle_16() -> Rule:
+    """Vertices, two points on each side, six inside and the centre: degree 7 with positive weights.
+
+    The solution of the eight moment equations of an orbit of vertices, one of six points on the sides, two of three
+    points inside and the centre; contact between bodies needs corners, and many points where meshes do not match.
+    """
+    side, near, far = 0.160700827727076, 0.1549360602237603, 0.46915074614381225
+    points = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]
+    for t in (side, 1.0 - side):
+        points += [(t, 0.0), (1.0 - t, t), (0.0, 1.0 - t)]
+    for t in (near, far):
+        points += [(t, t), (1.0 - 2.0 * t, t), (t, 1.0 - 2.0 * t)]
+    points.append((1.0 / 3.0, 1.0 / 3.0))
+    weights = (0.0040363384425610134, 0.023685036309926584, 0.11665205858990337, 0.1065039918141737,
+               0.17631261560052625)  # fmt: skip
+    return Rule("triangle16", np.array(points), 0.5 * np.repeat(weights, [3, 6, 3, 3, 1]), 7)
 
 
 Ranges = tuple[tuple[float, float], ...]

@@ -25,6 +25,7 @@ __all__ = [
     "contact_points",
     "effective_modulus",
     "lagrange_basis",
+    "points_by_rules",
 ]
 
 RULES: Mapping[int, Mapping[int, Rule]] = {
@@ -73,9 +74,16 @@ def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoi
         ModelError: another number, or one that does not fit all faces of the surface.
     """
     check_points(surface, points)
+    return points_by_rules(surface, RULES, DEFAULT, points)
+
+
+def points_by_rules(
+    surface: SurfaceSet, known: Mapping[int, Mapping[int, Rule]], default: Mapping[int, int], points: int | None
+) -> ContactPoints:
+    """The points of a surface by rules that are known by the corners of a face and their own number."""
     body = surface.body
-    rules = {corners: known[DEFAULT[corners] if points is None else points] for corners, known in RULES.items()
-             if points is None or points in known}  # fmt: skip
+    rules = {corners: those[default[corners] if points is None else points] for corners, those in known.items()
+             if points is None or points in those}  # fmt: skip
     t = assembly.facet_tables(surface, rules=rules)
     X, area = assembly.facet_places(body, t)
     x = body.reference[t.conn]

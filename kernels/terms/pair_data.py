@@ -1,0 +1,102 @@
+"""What kernels of contact between bodies read and write beside the structs of contact with obstacles."""
+
+import functools
+
+import warp as wp
+
+from ..common.types import precision
+
+__all__ = ["master_struct", "seat_struct", "touching_struct"]
+
+
+@functools.cache
+def master_struct(dtype: str):
+    """Facets of master surfaces: places are polynomials of two coordinates, and linear along an outward vector.
+
+    x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i rise_mi u_i)): the vector is the material's,
+    carried along by the deformation gradient, so that a point near a surface has weights on the slots of one element.
+    """
+    T = precision(dtype).T
+
+    @wp.struct
+    class Masters:
+        tree: wp.uint64  # boxes of [world, facet], grouped by world and surface
+        of: wp.array(dtype=wp.int32)  # [contact] its surface
+        sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points are of the second body
+        surfaces: wp.int32
+        touch: wp.float64  # depth as a step begins that counts as touch, m
+        most: wp.int32  # monomials of a facet, at most
+        conn: wp.array2d(dtype=wp.int32)  # [local, facet] slot
+        shape: wp.array3d(dtype=T)  # [monomial, local, facet]
+        rise: wp.array3d(dtype=T)  # 1/m
+        X: wp.array2d(dtype=wp.vec3d)  # [monomial, facet]
+        N: wp.array2d(dtype=wp.vec3d)
+        kind: wp.array(dtype=wp.int32)  # [facet]
+        terms: wp.array(dtype=wp.int32)  # [kind] monomials
+        corners: wp.array(dtype=wp.int32)  # [kind]
+        power: wp.array2d(dtype=wp.vec2i)  # [kind, monomial] exponents
+        hull: wp.array3d(dtype=wp.float64)  # [kind, point, monomial] control points whose hull holds the facet
+        limit: wp.array(dtype=wp.float64)  # [facet] depth beyond which a point would leave through another side, m
+        size: wp.array(dtype=wp.float64)  # [facet] length of a side, m
+        surface: wp.array(dtype=wp.int32)  # [facet]
+        pool: wp.int32  # first entry in the pool
+        count: wp.int32
+
+    return Masters
+
+
+@functools.cache
+def seat_struct():
+    """What the state keeps of points in contact, beside their history, [world, point]."""
+
+    @wp.struct
+    class Seats:
+        seat: wp.array2d(dtype=wp.int32)  # master facet + 1 that a point is in contact with
+        spot: wp.array2d(dtype=wp.vec3d)  # where on it: coordinates, and m along the outward vector
+
+    return Seats
+
+
+@functools.cache
+def touching_struct(dtype: str):
+    """What an attempt makes; [world, control]: monomial m of facet f is control `most f + m`."""
+    T, vec3 = precision(dtype).T, precision(dtype).vec3
+
+    @wp.struct
+    class Touching:
+        C: wp.array2d(dtype=wp.vec3d)  # [world, control] coefficients of displacements at the iterate
+        D: wp.array2d(dtype=wp.vec3d)  # of those of the outward vector
+        C0: wp.array2d(dtype=wp.vec3d)  # as the attempt began
+        D0: wp.array2d(dtype=wp.vec3d)
+        V0: wp.array2d(dtype=wp.vec3d)  # of velocities then
+        lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
+        upper: wp.array(dtype=wp.vec3)
+        wanted_lower: wp.array(dtype=wp.vec3)
+        wanted_upper: wp.array(dtype=wp.vec3)
+        stale: wp.array(dtype=wp.int32)  # a facet has left its box
+        fits: wp.array(dtype=wp.int32)  # refits so far
+        near: wp.array2d(dtype=wp.int32)  # [world, facet row of the slaves] a master surface is in reach
+        calm_lower: wp.array2d(dtype=wp.vec3)  # box in which none is, as of refit `calm`
+        calm_upper: wp.array2d(dtype=wp.vec3)
+        calm: wp.array2d(dtype=wp.int32)
+        x0: wp.array2d(dtype=wp.vec3d)  # [world, point] place as the attempt began
+        spot0: wp.array2d(dtype=wp.vec3d)  # of points in contact then
+        stretch: wp.array2d(dtype=wp.float64)  # gap over the coordinate along the outward vector, held in an attempt
+        seat: wp.array2d(dtype=wp.int32)  # master facet at the iterate, -1: none; -2: went through
+        spot: wp.array2d(dtype=wp.vec3d)
+        depth: wp.array2d(dtype=wp.float64)
+        before: wp.array2d(dtype=wp.float64)  # depth as the attempt began
+        normal: wp.array2d(dtype=wp.vec3d)  # minus the derivative of the depth by the place
+        motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material
+        whole: wp.array2d(dtype=wp.vec3d)  # that and the friction spring
+        weight: wp.array3d(dtype=T)  # [world, point, local] functions of the master's slots
+        listed: wp.array2d(dtype=wp.int32)  # [world, point] facet + 1 whose list it is in
+        changed: wp.array(dtype=wp.int32)  # a point belongs into another list
+        count: wp.array(dtype=wp.int32)  # [world facet] of lists in the making
+        points: wp.array2d(dtype=wp.int32)  # [world, facet] points of its list, which begins at `start`
+        start: wp.array2d(dtype=wp.int32)
+        entry: wp.array2d(dtype=wp.int32)  # [world, point]
+        flux: wp.array2d(dtype=vec3)  # [world, point] of a product
+        loaded: wp.array2d(dtype=wp.int32)  # [world, facet] a point of the list has a force
+
+    return Touching

@@ -1,0 +1,192 @@
+"""Where a point is on a master facet: polynomials of its coordinates, their jets, and Newton's method on them."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .pair_data import master_struct
+
+__all__ = ["INNER", "OUTER", "place_functions"]
+
+TURNS = 16
+"""Newton's steps of a place."""
+OUTER = 0.05
+"""By so much of a side a place may lie beyond a facet that another continues: outward vectors of two elements differ."""
+INNER = 1e-9
+
+
+@functools.cache
+def place_functions(dtype: str) -> _types.SimpleNamespace:
+    """Device functions in one precision of the displacements; all of them are float64."""
+    Masters = master_struct(dtype)
+    f64, vec3d = wp.float64, wp.vec3d
+
+    @wp.struct
+    class Jet:
+        """A place and its derivatives by the three coordinates."""
+
+        x: vec3d
+        a: vec3d
+        b: vec3d
+        c: vec3d
+
+    @wp.func
+    def power(x: f64, n: int) -> f64:
+        """x^n."""
+        out = f64(1.0)
+        for _ in range(n):
+            out *= x
+        return out
+
+    @wp.func
+    def power_change(x0: f64, x: f64, n: int) -> f64:
+        """(x^n - x0^n)/(x - x0)."""
+        out = f64(0.0)
+        for k in range(n):
+            out += power(x, k) * power(x0, n - 1 - k)
+        return out
+
+    @wp.func
+    def jet(
+        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d
+    ) -> Jet:  # fmt: skip
+        """The place of coordinates `spot`."""
+        out = Jet()
+        kind = mas.kind[f]
+        for m in range(mas.terms[kind]):
+            i = mas.power[kind, m][0]
+            j = mas.power[kind, m][1]
+            p = power(spot[0], i)
+            q = power(spot[1], j)
+            rise = mas.N[m, f] + D[world, mas.most * f + m]
+            g = mas.X[m, f] + C[world, mas.most * f + m] + spot[2] * rise
+            out.x += (p * q) * g
+            out.c += (p * q) * rise
+            if i > 0:
+                out.a += (f64(i) * power(spot[0], i - 1) * q) * g
+            if j > 0:
+                out.b += (p * f64(j) * power(spot[1], j - 1)) * g
+        return out
+
+    @wp.func
+    def moved(
+        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d
+    ) -> vec3d:  # fmt: skip
+        """The polynomial with coefficients C + z D alone, such as the displacement there."""
+        out = vec3d()
+        kind = mas.kind[f]
+        for m in range(mas.terms[kind]):
+            p = power(spot[0], mas.power[kind, m][0]) * power(spot[1], mas.power[kind, m][1])
+            out += p * (C[world, mas.most * f + m] + spot[2] * D[world, mas.most * f + m])
+        return out
+
+    @wp.func
+    def way(
+        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, old: vec3d, new: vec3d
+    ) -> vec3d:  # fmt: skip
+        """x(new) - x(old), with a rounding of its own size: a sum of differences of powers."""
+        out = vec3d()
+        kind = mas.kind[f]
+        step = new - old
+        for m in range(mas.terms[kind]):
+            i = mas.power[kind, m][0]
+            j = mas.power[kind, m][1]
+            p = step[0] * power_change(old[0], new[0], i) * power(new[1], j)
+            p += power(old[0], i) * step[1] * power_change(old[1], new[1], j)
+            rise = mas.N[m, f] + D[world, mas.most * f + m]
+            out += p * (mas.X[m, f] + C[world, mas.most * f + m] + old[2] * rise)
+            out += (power(new[0], i) * power(new[1], j) * step[2]) * rise
+        return out
+
+    @wp.func
+    def coordinates(t: Jet, r: vec3d) -> vec3d:
+        """d with a d_0 + b d_1 + c d_2 = r; 0 where the three lie in a plane."""
+        n = wp.cross(t.a, t.b)
+        det = wp.dot(n, t.c)
+        if wp.abs(det) <= f64(1.0e-12) * wp.length(n) * wp.length(t.c):
+            return vec3d()
+        return vec3d(wp.dot(r, wp.cross(t.b, t.c)), wp.dot(r, wp.cross(t.c, t.a)), wp.dot(r, n)) / det
+
+    @wp.func
+    def outside(corners: int, s: vec3d) -> f64:
+        """How far a place lies beyond the sides of the unit triangle or square; 0 on the facet."""
+        out = wp.max(-s[0], -s[1])
+        if corners == 3:
+            out = wp.max(out, s[0] + s[1] - f64(1.0))
+        else:
+            out = wp.max(out, wp.max(s[0], s[1]) - f64(1.0))
+        return wp.where(out <= f64(INNER), f64(0.0), out)
+
+    @wp.func
+    def middle(corners: int) -> vec3d:
+        """The middle of a facet."""
+        part = wp.where(corners == 3, f64(1.0) / f64(3.0), f64(0.5))
+        return vec3d(part, part, f64(0.0))
+
+    @wp.func
+    def locate(
+        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, x: vec3d, first: vec3d
+    ) -> wp.vec4d:  # fmt: skip
+        """Coordinates of x, sought from `first`, and 1 where they were found."""
+        spot = first
+        last = f64(1.0e300)
+        for _ in range(TURNS):
+            t = jet(mas, C, D, world, f, spot)
+            d = coordinates(t, x - t.x)
+            size = wp.max(wp.abs(d[0]), wp.abs(d[1]))
+            if size > f64(0.5):
+                d = d * (f64(0.5) / size)
+            spot += d
+            if outside(mas.corners[mas.kind[f]], spot) > f64(1.0):
+                return wp.vec4d(spot[0], spot[1], spot[2], f64(0.0))
+            size = wp.max(size, wp.abs(d[2]) / mas.size[f])
+            if size < f64(1.0e-15) or (size < f64(1.0e-11) and size >= f64(0.5) * last):
+                return wp.vec4d(spot[0], spot[1], spot[2], f64(1.0))
+            last = size
+        return wp.vec4d(spot[0], spot[1], spot[2], wp.where(last < f64(1.0e-9), f64(1.0), f64(0.0)))
+
+    @wp.func
+    def follow(
+        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, first: vec3d,
+        motion: vec3d,
+    ) -> wp.vec4d:  # fmt: skip
+        """Coordinates of a point that was at `first` and has moved by `motion`, and 1 where they were found; changes
+        are rounded as the motion is."""
+        spot = first
+        last = f64(1.0e300)
+        for _ in range(TURNS):
+            t = jet(mas, C, D, world, f, spot)
+            d = coordinates(t, motion - way(mas, C, D, world, f, first, spot))
+            size = wp.max(wp.abs(d[0]), wp.abs(d[1]))
+            if size > f64(0.5):
+                d = d * (f64(0.5) / size)
+            spot += d
+            if outside(mas.corners[mas.kind[f]], spot) > f64(1.0):
+                return wp.vec4d(spot[0], spot[1], spot[2], f64(0.0))
+            change = wp.length(spot - first)
+            size = wp.max(size, wp.abs(d[2]) / mas.size[f])
+            if size <= f64(1.0e-15) * change or (size < f64(1.0e-11) and size >= f64(0.5) * last):
+                return wp.vec4d(spot[0], spot[1], spot[2], f64(1.0))
+            last = size
+        return wp.vec4d(spot[0], spot[1], spot[2], wp.where(last < f64(1.0e-9), f64(1.0), f64(0.0)))
+
+    @wp.func
+    def outward(t: Jet) -> vec3d:
+        """Unit normal of the layer through a place."""
+        return wp.normalize(wp.cross(t.a, t.b))
+
+    @wp.func
+    def weigh(mas: Masters, f: int, i: int, spot: vec3d) -> f64:
+        """Function of slot i of a facet at a place."""
+        out = f64(0.0)
+        kind = mas.kind[f]
+        for m in range(mas.terms[kind]):
+            p = power(spot[0], mas.power[kind, m][0]) * power(spot[1], mas.power[kind, m][1])
+            out += p * (f64(mas.shape[m, i, f]) + spot[2] * f64(mas.rise[m, i, f]))
+        return out
+
+    return _types.SimpleNamespace(
+        Jet=Jet, power=power, jet=jet, moved=moved, way=way, coordinates=coordinates, outside=outside, middle=middle,
+        locate=locate, follow=follow, outward=outward, weigh=weigh,
+    )  # fmt: skip

@@ -1,0 +1,369 @@
+"""Which master facet a point of another body is at, and where on it: boxes, tree, and the search within it.
+
+A point in contact stays on its facet, or passes to the one that its place belongs to. Another one is in contact where
+it is inside of a facet now and was outside of it as the step began; no candidate is kept from step to step but boxes.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import SMALL, kernel_module, precision
+from .contact import SPEED_FLOOR
+from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
+from .contact_laws import PAPER
+from .contact_touch import touch_functions
+from .pair_data import master_struct, seat_struct, touching_struct
+from .pair_places import OUTER, place_functions
+
+__all__ = ["MARGIN", "THROUGH", "seek_kernels"]
+
+THROUGH = -2
+"""Seat of a point that has left through another side."""
+MARGIN = 0.25
+"""Boxes of the tree are larger than facets by this part of a side: they fit for several steps."""
+ROUNDING = 2.4e-7
+
+
+@functools.cache
+def seek_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the displacements."""
+    p = precision(dtype)
+    vec3 = p.vec3
+    f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
+    Contacts, Facets, History = contact_struct(), facet_struct(dtype), history_struct()
+    Attempt, Clock = attempt_struct(dtype), clock_struct()
+    Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
+    k, f = touch_functions(dtype), place_functions(dtype)
+    along, reach, allowance = k.along, k.reach, k.allowance
+    jet, moved, outside, middle, locate, follow, outward = (
+        f.jet, f.moved, f.outside, f.middle, f.locate, f.follow, f.outward
+    )  # fmt: skip
+    Jet = f.Jet
+    module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
+
+    @wp.kernel(module=module)
+    def controls(
+        mas: Masters, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
+        D: wp.array2d(dtype=vec3d),
+    ):  # fmt: skip
+        """Coefficients of a field of the slots on master facets."""
+        world, item, m = wp.tid()
+        if active[world] == 0 or m >= mas.terms[mas.kind[item]]:
+            return
+        c = vec3d()
+        d = vec3d()
+        for i in range(mas.conn.shape[0]):
+            value = vec3d(u[world, mas.conn[i, item]])
+            c += f64(mas.shape[m, i, item]) * value
+            d += f64(mas.rise[m, i, item]) * value
+        C[world, mas.most * item + m] = c
+        D[world, mas.most * item + m] = d
+
+    @wp.func
+    def down(x: vec3d) -> box3:
+        """x in single precision, rounded down by more than it can be rounded up."""
+        return box3(
+            wp.float32(x[0] - wp.abs(x[0]) * f64(ROUNDING)),
+            wp.float32(x[1] - wp.abs(x[1]) * f64(ROUNDING)),
+            wp.float32(x[2] - wp.abs(x[2]) * f64(ROUNDING)),
+        )
+
+    @wp.func
+    def up(x: vec3d) -> box3:
+        """x in single precision, rounded up."""
+        return -down(-x)
+
+    @wp.func
+    def contains(low: box3, high: box3, other_low: box3, other_high: box3) -> bool:
+        """Whether a box holds another one."""
+        inside = bool(True)
+        for j in range(3):
+            if other_low[j] < low[j] or other_high[j] > high[j]:
+                inside = False
+        return inside
+
+    @wp.kernel(module=module)
+    def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), t: Touching):
+        """Whether facets, as the attempt began and now, are within their boxes; and new boxes."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
+        high = -low
+        kind = mas.kind[item]
+        count = mas.terms[kind]
+        for q in range(count):
+            x = vec3d()
+            y = vec3d()
+            for m in range(count):
+                part = mas.hull[kind, q, m]
+                if part != f64(0.0):
+                    x += part * (mas.X[m, item] + t.C[world, mas.most * item + m])
+                    y += part * (mas.X[m, item] + t.C0[world, mas.most * item + m])
+            low = wp.min(low, wp.min(x, y))
+            high = wp.max(high, wp.max(x, y))
+        index = world * mas.count + item
+        if not contains(t.lower[index], t.upper[index], down(low), up(high)):
+            t.stale[0] = 1
+        room = f64(MARGIN) * mas.size[item]
+        pad = vec3d(room, room, room)
+        t.wanted_lower[index] = down(low - pad)
+        t.wanted_upper[index] = up(high + pad)
+
+    @wp.kernel(module=module)
+    def adopt_boxes(t: Touching):
+        """Take the new boxes."""
+        index = wp.tid()
+        t.lower[index] = t.wanted_lower[index]
+        t.upper[index] = t.wanted_upper[index]
+        if index == 0:
+            t.stale[0] = 0
+            t.fits[0] = t.fits[0] + 1
+
+    @wp.func
+    def approach(
+        mas: Masters, facets: Facets, t: Touching, v: wp.array2d(dtype=vec3), world: int, q: int, item: int, f: int,
+        spot: vec3d, n: vec3d,
+    ) -> f64:  # fmt: skip
+        """Speed of a point towards a facet as the attempt began."""
+        foot = vec3d(spot[0], spot[1], f64(0.0))
+        return wp.dot(n, moved(mas, t.V0, t.V0, world, f, foot) - along(facets, v, world, q, item))
+
+    @wp.kernel(module=module)
+    def begin_points(
+        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
+        u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt,
+        t: Touching,
+    ):  # fmt: skip
+        """Where points are as an attempt begins, and of those in contact their depth and approach speed."""
+        world, item, q = wp.tid()
+        if active[world] == 0:
+            return
+        if q == 0 and item == 0 and facets.row == 0:
+            at.through[world] = 0
+            at.changes[world] = 0
+            if clock.part[world] == 0:
+                at.elapsed[world] = f64(0.0)
+        if facets.share[q, item] == f64(0.0):
+            return
+        c = facets.contact[item]
+        point = facets.point + item * facets.points + q
+        shift = along(facets, u_n, world, q, item)
+        x = facets.X[q, item] + shift
+        t.x0[world, point] = x
+        at.origin[world, point] = shift
+        at.depth[world, point] = f64(-1.0e30)
+        at.speed[world, point] = f64(SPEED_FLOOR)
+        at.reach[world, point] = reach(con, his, world, c, point, clock.time[world], f64(0.0))
+        if his.speed[world, point] > f64(0.0):
+            f = seats.seat[world, point] - 1
+            found = locate(mas, t.C0, t.D0, world, f, x, seats.spot[world, point])
+            spot = vec3d(found[0], found[1], found[2])
+            if found[3] == f64(0.0):
+                spot = seats.spot[world, point]
+            s = jet(mas, t.C0, t.D0, world, f, spot)
+            n = outward(s)
+            t.spot0[world, point] = spot
+            t.stretch[world, point] = wp.dot(n, s.c)
+            at.depth[world, point] = at.reach[world, point] - spot[2] * wp.dot(n, s.c)
+            speed = wp.max(his.speed[world, point], f64(SPEED_FLOOR))
+            if clock.still == 0:
+                speed = wp.max(speed, approach(mas, facets, t, v_n, world, q, item, f, spot, n))
+            at.speed[world, point] = speed
+
+    @wp.kernel(module=module)
+    def look_around(
+        con: Contacts, mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
+        reaching: f64, t: Touching,
+    ):  # fmt: skip
+        """Whether a box of a master facet is near a slave facet; where none is, the box in which that holds."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        row = facets.row + item
+        low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
+        high = -low
+        for q in range(facets.points):
+            x = facets.X[q, item] + along(facets, u, world, q, item)
+            y = t.x0[world, facets.point + item * facets.points + q]
+            if facets.share[q, item] > f64(0.0):
+                low = wp.min(low, wp.min(x, y))
+                high = wp.max(high, wp.max(x, y))
+        if low[0] > high[0]:
+            t.near[world, row] = 0
+            return
+        pad = vec3d(reaching, reaching, reaching)
+        calm = t.calm[world, row] == t.fits[0]
+        if calm and contains(t.calm_lower[world, row], t.calm_upper[world, row], down(low - pad), up(high + pad)):
+            t.near[world, row] = 0
+            return
+        room = f64(2.0) * reaching + f64(MARGIN) * wp.length(high - low)
+        wide = vec3d(room, room, room)
+        root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[facets.contact[item]])
+        query = wp.bvh_query_aabb(mas.tree, down(low - wide), up(high + wide), root)
+        index = wp.int32(0)
+        if wp.bvh_query_next(query, index):
+            t.near[world, row] = 1
+            t.calm[world, row] = -1
+            return
+        t.near[world, row] = 0
+        t.calm[world, row] = t.fits[0]
+        t.calm_lower[world, row] = down(low - wide)
+        t.calm_upper[world, row] = up(high + wide)
+
+    @wp.func
+    def crosses(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d) -> bool:
+        """Whether a point that moved by more than a body is thick went in through a facet on its way."""
+        kind = mas.kind[f]
+        m = middle(mas.corners[kind])
+        old = jet(mas, t.C0, t.D0, world, f, m)
+        new = jet(mas, t.C, t.D, world, f, m)
+        way = x - x0 - (new.x - old.x)
+        if wp.length(way) <= mas.limit[f]:
+            return False
+        g0 = wp.dot(x0 - old.x, outward(old))
+        g1 = wp.dot(x - new.x, outward(new))
+        if g0 <= f64(0.0) or g1 >= -mas.limit[f]:
+            return False
+        y = x - (g1 / (g1 - g0)) * way
+        there = locate(mas, t.C, t.D, world, f, y, m)
+        spot = vec3d(there[0], there[1], there[2])
+        return there[3] != f64(0.0) and outside(mas.corners[kind], spot) == f64(0.0)
+
+    @wp.func
+    def frame(s: Jet) -> wp.mat33d:
+        """Columns: along the first side of a facet, across, outward."""
+        n = wp.normalize(wp.cross(s.a, s.b))
+        a = wp.normalize(s.a)
+        return wp.matrix_from_cols(a, wp.cross(n, a), n)
+
+    @wp.func
+    def sit(
+        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock, at: Attempt, t: Touching,
+        v_n: wp.array2d(dtype=vec3), world: int, c: int, q: int, item: int, point: int, f: int, spot: vec3d,
+        shift: vec3d, live: bool,
+    ):  # fmt: skip
+        """What a point at a place of a facet has: depth, that as the attempt began, normal, motion."""
+        s = jet(mas, t.C, t.D, world, f, spot)
+        n = outward(s)
+        rise = wp.dot(n, s.c)
+        now = reach(con, his, world, c, point, clock.new_time[world], f64(0.0))
+        t.seat[world, point] = f
+        t.spot[world, point] = spot
+        stretch = rise
+        t.depth[world, point] = now - spot[2] * rise
+        if live:
+            first = seats.seat[world, point] - 1
+            from0 = t.spot0[world, point]
+            motion = shift - at.origin[world, point]
+            motion -= moved(mas, t.C, t.D, world, first, from0) - moved(mas, t.C0, t.D0, world, first, from0)
+            if f == first:
+                stretch = t.stretch[world, point]
+                change = (now - at.reach[world, point]) - stretch * (spot[2] - from0[2])
+                t.depth[world, point] = at.depth[world, point] + change
+            t.before[world, point] = at.depth[world, point]
+            spring = his.spring[world, point]
+            if con.law[c] != PAPER:
+                spring = frame(jet(mas, t.C, t.D, world, first, from0)) * spring
+            t.motion[world, point] = motion
+            t.whole[world, point] = spring + motion
+        else:
+            motion = shift - at.origin[world, point]
+            motion -= moved(mas, t.C, t.D, world, f, spot) - moved(mas, t.C0, t.D0, world, f, spot)
+            t.before[world, point] = t.depth[world, point] + wp.dot(n, motion) - (now - at.reach[world, point])
+            speed = f64(SPEED_FLOOR)
+            if clock.still == 0:
+                speed = wp.max(speed, approach(mas, facets, t, v_n, world, q, item, f, spot, n))
+            at.speed[world, point] = speed
+            t.motion[world, point] = motion
+            t.whole[world, point] = motion
+        t.normal[world, point] = (stretch / rise) * n
+
+    @wp.kernel(module=module)
+    def seek(
+        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
+        u: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: int,
+        at: Attempt, t: Touching,
+    ):  # fmt: skip
+        """The seat of each point at an iterate. `settling`: there is no step; what is inside is in contact."""
+        world, item, q = wp.tid()
+        if active[world] == 0:
+            return
+        point = facets.point + item * facets.points + q
+        t.seat[world, point] = -1
+        if facets.share[q, item] == f64(0.0):
+            return
+        live = his.speed[world, point] > f64(0.0)
+        if not live and t.near[world, facets.row + item] == 0:
+            return
+        c = facets.contact[item]
+        shift = along(facets, u, world, q, item)
+        x = facets.X[q, item] + shift
+        x0 = t.x0[world, point]
+        best = wp.int32(-1)
+        place = vec3d()
+        off = f64(OUTER)
+        height = f64(1.0e300)
+        facing = vec3d()
+        pad = wp.max(con.offset[c], f64(0.0)) + f64(1.0e-6) * wp.length(x)
+        if live:
+            f = seats.seat[world, point] - 1
+            from0 = t.spot0[world, point]
+            motion = shift - at.origin[world, point]
+            motion -= moved(mas, t.C, t.D, world, f, from0) - moved(mas, t.C0, t.D0, world, f, from0)
+            found = follow(mas, t.C, t.D, world, f, from0, motion)
+            facing = outward(jet(mas, t.C, t.D, world, f, from0))
+            spot = vec3d(found[0], found[1], found[2])
+            o = outside(mas.corners[mas.kind[f]], spot)
+            if found[3] != f64(0.0) and o <= off:
+                best = f
+                place = spot
+                off = o
+                height = wp.abs(spot[2])
+            pad += f64(2.0) * wp.abs(from0[2])
+        through = bool(False)
+        if best < 0 or off > f64(0.0):
+            low = wp.min(x, x0) - vec3d(pad, pad, pad)
+            high = wp.max(x, x0) + vec3d(pad, pad, pad)
+            root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
+            query = wp.bvh_query_aabb(mas.tree, down(low), up(high), root)
+            index = wp.int32(0)
+            left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch
+            while wp.bvh_query_next(query, index):
+                f = index - world * mas.count
+                corners = mas.corners[mas.kind[f]]
+                found = locate(mas, t.C, t.D, world, f, x, middle(corners))
+                spot = vec3d(found[0], found[1], found[2])
+                o = outside(corners, spot)
+                fits = found[3] != f64(0.0) and o <= off
+                if fits:
+                    s = jet(mas, t.C, t.D, world, f, spot)
+                    n = outward(s)
+                    gap = spot[2] * wp.dot(n, s.c)
+                    fits = -gap <= mas.limit[f]
+                    if live:
+                        fits = fits and wp.dot(n, facing) > f64(0.0)
+                    elif settling == 0:
+                        foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
+                        fits = fits and wp.dot(x0 - foot.x, outward(foot)) >= -left
+                    closer = wp.abs(spot[2]) < height or (wp.abs(spot[2]) == height and f < best)
+                    if fits and (o < off or best < 0 or closer):
+                        best = f
+                        place = spot
+                        off = o
+                        height = wp.abs(spot[2])
+                if not live and settling == 0 and crosses(mas, t, world, f, x, x0):
+                    through = True
+        if best >= 0:
+            sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, live)
+            if t.depth[world, point] > mas.limit[best]:
+                t.seat[world, point] = THROUGH
+        elif through:
+            t.seat[world, point] = THROUGH
+
+    return _types.SimpleNamespace(
+        module=module, controls=controls, check_boxes=check_boxes, adopt_boxes=adopt_boxes, begin_points=begin_points,
+        look_around=look_around, seek=seek, frame=frame, Jet=Jet,
+    )  # fmt: skip

@@ -1,0 +1,457 @@
+"""Contact of points of a body with facets of another: forces, their tangent, and what an accepted step keeps and books.
+
+The law is that of contact with obstacles. Both bodies feel the force at one place, that of the point: on its own facet
+by the functions there, on the master by those of the material that is at this place, so that sum and moment vanish. The
+depth is the master's material coordinate times a stretch that is held in an attempt: its derivative by the slots is
+what these functions give, and the force is that of a potential of the iterate.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import SMALL, kernel_module, precision
+from .contact import IDLE, LOADED, STIFF
+from .contact_books import BOOKED, SUMS
+from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
+from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
+from .contact_touch import SLIPS, touch_functions
+from .pair_data import master_struct, seat_struct, touching_struct
+from .pair_places import place_functions
+from .pair_seek import THROUGH, seek_kernels
+
+__all__ = ["pair_kernels"]
+
+
+@functools.cache
+def pair_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the displacements."""
+    p = precision(dtype)
+    T, vec3, sym = p.T, p.vec3, p.sym
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History = contact_struct(), facet_struct(dtype), history_struct()
+    Attempt, Clock = attempt_struct(dtype), clock_struct()
+    Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
+    k, places = touch_functions(dtype), place_functions(dtype)
+    Touch, in_plane, hold, pull, plane = k.Touch, k.in_plane, k.hold, k.pull, k.plane
+    friction_potential, friction_force, point_stiffness = k.friction_potential, k.friction_force, k.point_stiffness
+    rate_of, coefficient, tangent_damping = k.rate_of, k.coefficient, k.tangent_damping
+    normal_law, elastic = law_functions().normal_law, law_functions().elastic
+    jet, weigh = places.jet, places.weigh
+    frame = seek_kernels(dtype).frame
+    module = kernel_module(f"pairs_{dtype}", max_unroll=SMALL)
+
+    @wp.func
+    def touch_of(con: Contacts, at: Attempt, t: Touching, world: int, c: int, point: int, inv_h: f64) -> Touch:
+        """A point at its seat."""
+        out = Touch()
+        out.n = t.normal[world, point]
+        out.depth = t.depth[world, point]
+        out.rise = out.depth - t.before[world, point]
+        k_n = con.scale[world, c] * con.normal[c]
+        rate = rate_of(con, at, world, c, point, inv_h)
+        out.law = normal_law(con.law[c], 0, k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
+                             t.before[world, point])  # fmt: skip
+        out.motion = t.motion[world, point]
+        out.whole = t.whole[world, point]
+        return in_plane(out, wp.normalize(out.n))
+
+    @wp.kernel(module=module)
+    def explicit_forces(
+        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
+        v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt, t: Touching,
+    ):  # fmt: skip
+        """Eqs. (77)-(83) literally, at the state that the attempt begins from; of contacts that are treated so."""
+        world, item, q = wp.tid()
+        c = facets.contact[item]
+        point = facets.point + item * facets.points + q
+        if active[world] == 0 or facets.share[q, item] == f64(0.0) or con.dead[c] == 0:
+            return
+        at.dead[world, point] = vec3d()
+        at.dead_spring[world, point] = vec3d()
+        delta = at.depth[world, point]
+        if delta <= f64(0.0):
+            return
+        f = seats.seat[world, point] - 1
+        spot = t.spot0[world, point]
+        s = jet(mas, t.C0, t.D0, world, f, spot)
+        n = wp.normalize(wp.cross(s.a, s.b))
+        v = k.along(facets, v_n, world, q, item) - places.moved(mas, t.V0, t.V0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
+        v_n_rel = wp.dot(v, n)
+        v_t = v - v_n_rel * n
+        scale = con.scale[world, c]
+        gamma = con.beta[world, c] * wp.sqrt(scale) * con.normal_damping[c]
+        k_t = scale * con.tangent[c]
+        force = wp.max(elastic(0, scale * con.normal[c], delta)[0] - gamma * v_n_rel, f64(0.0))
+        stretch = plane(n, his.spring[world, point] + clock.h[world] * v_t)
+        gamma_t = tangent_damping(con, world, c, k_t)
+        pulled = -k_t * stretch - gamma_t * v_t
+        cap = coefficient(con, his, world, c, point) * force
+        size = wp.length(pulled)
+        if size > cap:
+            pulled = (cap / size) * pulled
+            stretch = (f64(-1.0) / k_t) * (pulled + gamma_t * v_t)
+        at.dead_spring[world, point] = stretch
+        at.dead[world, point] = force * n + pulled
+
+    @wp.kernel(module=module)
+    def forces(
+        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
+        active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
+    ):  # fmt: skip
+        """Forces on points, their stiffness and potential; caps are held as with obstacles."""
+        world, item, q = wp.tid()
+        if active[world] == 0:
+            return
+        c = facets.contact[item]
+        point = facets.point + item * facets.points + q
+        share = facets.share[q, item]
+        at.state[world, point] = IDLE
+        f = t.seat[world, point]
+        if con.dead[c] != 0 and share > f64(0.0):
+            if wp.length_sq(at.dead[world, point]) > f64(0.0):
+                work = -share * wp.dot(at.dead[world, point], t.motion[world, point])
+                at.state[world, point] = LOADED
+                at.force[world, point] = -share * at.dead[world, point]
+                at.energy[world, point] = wp.vec2d(work, wp.abs(work))
+                f = seats.seat[world, point] - 1
+                for i in range(mas.conn.shape[0]):
+                    t.weight[world, point, i] = T(weigh(mas, f, i, t.spot0[world, point]))
+        elif f == THROUGH:
+            at.through[world] = point + 1
+            at.state[world, point] = LOADED
+            at.force[world, point] = vec3d()
+            at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
+            f = -1
+        elif f >= 0 and share > f64(0.0):
+            inv_h = f64(0.0)
+            if clock.still == 0:
+                inv_h = f64(1.0) / clock.h[world]
+            s = touch_of(con, at, t, world, c, point, inv_h)
+            held = at.held[world, point]
+            new = hold(con, his, at, world, c, point, s)
+            if fresh != 0:
+                at.plane[world, point] = s.m
+                held = new
+                held[0] = wp.min(new[0], his.cap[world, point])
+                at.held[world, point] = held
+            held[1] = new[1]
+            held[2] = f64(1.0)
+            at.next_plane[world, point] = s.m
+            at.next[world, point] = new
+            m = at.plane[world, point]
+            if wp.dot(m, s.m) <= f64(0.5):  # it has passed to another facet since
+                m = s.m
+                at.plane[world, point] = m
+            s = in_plane(s, m)
+            if s.depth > f64(0.0) or held[0] > f64(0.0):
+                rub = friction_potential(con, world, c, s, held, inv_h)
+                K = point_stiffness(con, world, c, s, held, inv_h)
+                at.state[world, point] = STIFF
+                at.force[world, point] = share * (friction_force(con, world, c, s, held, inv_h) - s.law[0] * s.n)
+                at.energy[world, point] = wp.vec2d(share * (s.law[2] + rub), share * (s.law[3] + wp.abs(rub)))
+                at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),
+                    T(share * K[1, 2]), T(share * K[0, 2]), T(share * K[0, 1]))  # fmt: skip
+                for i in range(mas.conn.shape[0]):
+                    t.weight[world, point, i] = T(weigh(mas, f, i, t.spot[world, point]))
+        elif share > f64(0.0):
+            held = vec3d()
+            at.next[world, point] = held
+            if fresh != 0:
+                at.held[world, point] = held
+                at.plane[world, point] = held
+        wanted = wp.int32(0)
+        if at.state[world, point] != IDLE and f >= 0:
+            wanted = f + 1
+        if t.listed[world, point] != wanted:
+            t.listed[world, point] = wanted
+            t.changed[0] = 1
+
+    # lists of the points of each master facet
+
+    @wp.kernel(module=module)
+    def clear_lists(t: Touching):
+        """No points."""
+        i = wp.tid()
+        t.count[i] = 0
+        if i == 0:
+            t.changed[0] = 0
+
+    @wp.kernel(module=module)
+    def count_points(mas: Masters, t: Touching):
+        """How many points a facet has."""
+        world, point = wp.tid()
+        f = t.listed[world, point] - 1
+        if f >= 0:
+            wp.atomic_add(t.count, world * mas.count + f, 1)
+
+    @wp.kernel(module=module)
+    def place_lists(mas: Masters, scan: wp.array(dtype=wp.int32), t: Touching):
+        """Where the lists begin, in each world, from the sums of counts up to each; and no points again."""
+        world, f = wp.tid()
+        i = world * mas.count + f
+        before = wp.int32(0)
+        if world > 0:
+            before = scan[world * mas.count - 1]
+        t.start[world, f] = scan[i] - t.count[i] - before
+        t.points[world, f] = t.count[i]
+        t.count[i] = 0
+
+    @wp.kernel(module=module)
+    def fill_lists(mas: Masters, t: Touching):
+        """Points into their lists, in any order."""
+        world, point = wp.tid()
+        f = t.listed[world, point] - 1
+        if f >= 0:
+            k = wp.atomic_add(t.count, world * mas.count + f, 1)
+            t.entry[world, t.start[world, f] + k] = point
+
+    @wp.kernel(module=module)
+    def sort_lists(t: Touching):
+        """Points of a list in their order: sums are the same every time."""
+        world, f = wp.tid()
+        first = t.start[world, f]
+        for k in range(1, t.points[world, f]):
+            point = t.entry[world, first + k]
+            j = first + k - 1
+            while j >= first and t.entry[world, j] > point:
+                t.entry[world, j + 1] = t.entry[world, j]
+                j -= 1
+            t.entry[world, j + 1] = point
+
+    @wp.kernel(module=module)
+    def gather_masters(
+        mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=vec3)
+    ):  # fmt: skip
+        """Forces of points on the slots of their master facets."""
+        world, f = wp.tid()
+        if active[world] == 0:
+            return
+        count = t.points[world, f]
+        if count == 0 and t.loaded[world, f] == 0:
+            return
+        t.loaded[world, f] = count
+        for i in range(mas.conn.shape[0]):
+            total = vec3()
+            for k in range(count):
+                point = t.entry[world, t.start[world, f] + k]
+                total -= t.weight[world, point, i] * vec3(at.force[world, point])
+            pool[world, mas.pool + i * mas.count + f] = total
+
+    @wp.func
+    def times(k: sym, p: vec3) -> vec3:
+        """The symmetric matrix k (Voigt) times p."""
+        return vec3(k[0] * p[0] + k[5] * p[1] + k[4] * p[2], k[5] * p[0] + k[1] * p[1] + k[3] * p[2],
+                    k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
+
+    @wp.kernel(module=module)
+    def product_points(
+        mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), at: Attempt,
+        t: Touching,
+    ):  # fmt: skip
+        """K times the relative displacement of each point."""
+        world, item, q = wp.tid()
+        if active[world] == 0:
+            return
+        point = facets.point + item * facets.points + q
+        if at.state[world, point] != STIFF:
+            return
+        f = t.listed[world, point] - 1
+        d = vec3()
+        for i in range(facets.conn.shape[0]):
+            d += facets.shape[q, i, item] * p[world, facets.conn[i, item]]
+        for i in range(mas.conn.shape[0]):
+            d -= t.weight[world, point, i] * p[world, mas.conn[i, f]]
+        t.flux[world, point] = times(at.stiffness[world, point], d)
+
+    @wp.kernel(module=module)
+    def product_facets(
+        facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=vec3)
+    ):  # fmt: skip
+        """Their sums on the slots of the points' own facets."""
+        world, item, i = wp.tid()
+        if active[world] == 0:
+            return
+        out = vec3()
+        if at.touched[world, facets.row + item] == STIFF:
+            for q in range(facets.points):
+                point = facets.point + item * facets.points + q
+                if at.state[world, point] == STIFF:
+                    out += facets.shape[q, i, item] * t.flux[world, point]
+        pool[world, facets.pool + i * facets.count + item] = out
+
+    @wp.kernel(module=module)
+    def product_masters(
+        mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=vec3)
+    ):  # fmt: skip
+        """Their sums on the slots of master facets."""
+        world, f, i = wp.tid()
+        if active[world] == 0:
+            return
+        out = vec3()
+        for k in range(t.points[world, f]):
+            point = t.entry[world, t.start[world, f] + k]
+            if at.state[world, point] == STIFF:
+                out -= t.weight[world, point, i] * t.flux[world, point]
+        pool[world, mas.pool + i * mas.count + f] = out
+
+    @wp.kernel(module=module)
+    def diagonal_masters(
+        mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=sym)
+    ):  # fmt: skip
+        """3x3 blocks on the diagonal of master facets."""
+        world, f, i = wp.tid()
+        if active[world] == 0:
+            return
+        out = sym()
+        for k in range(t.points[world, f]):
+            point = t.entry[world, t.start[world, f] + k]
+            if at.state[world, point] == STIFF:
+                s = t.weight[world, point, i]
+                out += s * s * at.stiffness[world, point]
+        pool[world, mas.pool + i * mas.count + f] = out
+
+    # after a step
+
+    @wp.func
+    def add(rows: wp.array3d(dtype=f64), j: int, world: int, row: int, value: f64):
+        """rows[j, world, row] += value."""
+        rows[j, world, row] = rows[j, world, row] + value
+
+    @wp.func
+    def forget(his: History, seats: Seats, world: int, point: int):
+        """A point is in contact no longer."""
+        his.spring[world, point] = vec3d()
+        his.stored[world, point] = f64(0.0)
+        his.cap[world, point] = f64(0.0)
+        his.speed[world, point] = f64(0.0)
+        his.mark[world, point] = 0
+        seats.seat[world, point] = 0
+        seats.spot[world, point] = vec3d()
+
+    @wp.kernel(module=module)
+    def finish(
+        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
+        accepted: wp.array(dtype=wp.int32), at: Attempt, t: Touching, booked: wp.array3d(dtype=f64),
+    ):  # fmt: skip
+        """Books of an accepted substep and the record of it per facet, and the history after it."""
+        world, item = wp.tid()
+        if accepted[world] == 0:
+            return
+        c = facets.contact[item]
+        law = con.law[c]
+        row = facets.row + item
+        for j in range(BOOKED):
+            booked[j, world, row] = f64(0.0)
+        for j in range(SUMS + 1):
+            at.rows[j, world, row] = f64(0.0)
+        inv_h = f64(0.0)
+        if clock.still == 0:
+            inv_h = f64(1.0) / clock.h[world]
+        for q in range(facets.points):
+            point = facets.point + item * facets.points + q
+            share = facets.share[q, item]
+            live = his.speed[world, point] > f64(0.0)
+            f = t.seat[world, point]
+            if share == f64(0.0) or (f < 0 and not live):
+                continue
+            stored = f64(0.0)
+            kept = vec3d()
+            base = vec3d()
+            if f < 0:  # beyond an edge of the surface
+                at.state[world, point] = IDLE
+                add(booked, 1, world, row, share * his.stored[world, point])
+                forget(his, seats, world, point)
+                continue
+            s = touch_of(con, at, t, world, c, point, inv_h)
+            held = at.held[world, point]
+            held[2] = f64(1.0)
+            s = in_plane(s, at.plane[world, point])
+            normal = s.law[0]
+            pulled = friction_force(con, world, c, s, held, inv_h)
+            w = pull(con, world, c, s, held, inv_h)
+            trial = vec3d(w[0], w[1], w[2])
+            slips = wp.where(wp.length(trial) > held[0], 1, 0)
+            if live:
+                base = plane(s.m, t.whole[world, point] - t.motion[world, point])
+            force = normal * s.n - pulled
+            if con.dead[c] != 0:
+                force = at.dead[world, point]
+                normal = wp.dot(force, s.m)
+                pulled = normal * s.m - force
+                kept = at.dead_spring[world, point]
+                held = vec3d(coefficient(con, his, world, c, point) * normal, con.scale[world, c] * con.tangent[c],
+                             f64(1.0))  # fmt: skip
+                slips = wp.where(wp.length(pulled) >= f64(0.999999) * held[0], 1, 0)
+            elif normal > f64(0.0) and held[1] > f64(0.0):
+                kept = s.q
+                if slips != 0:
+                    kept = vec3d()
+                    if held[0] > f64(0.0):
+                        size = wp.length(trial)
+                        kept = s.q - ((size - held[0]) / (w[3] * size)) * trial
+                        if law == PAPER:
+                            kept = (f64(1.0) / held[1]) * pulled - ((w[3] - held[1]) / held[1]) * s.slip
+            spring = elastic(0, con.scale[world, c] * con.normal[c], s.depth)
+            stored = spring[1] + f64(0.5) * held[1] * wp.dot(kept, kept)
+            slid = s.slip - (kept - base)
+            rubbed = wp.dot(pulled - held[1] * kept, kept - base) + wp.dot(pulled, slid)
+            add(booked, 0, world, row, share * stored)
+            add(booked, 1, world, row, share * (normal - spring[0]) * s.rise)
+            add(booked, 2, world, row, share * rubbed)
+            x = facets.X[q, item] + at.origin[world, point]
+            place = jet(mas, t.C, t.D, world, f, t.spot[world, point])
+            x = place.x
+            moment = wp.cross(x, force)
+            side = mas.sign[c]
+            for j in range(3):
+                add(at.rows, j, world, row, side * share * force[j])
+                add(at.rows, 3 + j, world, row, side * share * moment[j])
+            add(at.rows, 6, world, row, share * normal)
+            if s.depth > f64(0.0):
+                area = facets.area[q, item]
+                add(at.rows, 7, world, row, area * f64(slips) * wp.length(slid))
+                add(at.rows, 8, world, row, area)
+                add(at.rows, 9, world, row, area * f64(1 - slips))
+            at.rows[14, world, row] = wp.max(at.rows[14, world, row], s.depth)
+            if s.depth <= f64(0.0):
+                forget(his, seats, world, point)
+            else:
+                speed = at.speed[world, point]
+                if clock.still == 0:
+                    speed = wp.max(speed, s.rise / clock.h[world])
+                if law != PAPER:
+                    kept = wp.transpose(frame(place)) * kept
+                his.spring[world, point] = kept
+                his.stored[world, point] = stored
+                his.cap[world, point] = held[0]
+                his.speed[world, point] = speed
+                mark = wp.int32(1)
+                if slips != 0 and held[0] > f64(0.0):
+                    mark += SLIPS
+                his.mark[world, point] = mark
+                seats.seat[world, point] = f + 1
+                seats.spot[world, point] = t.spot[world, point]
+        for j in range(4):
+            at.rows[10 + j, world, row] = booked[j, world, row]
+
+    @wp.kernel(module=module)
+    def close(
+        clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
+        accepted: wp.array(dtype=wp.int32), his: History, at: Attempt,
+    ):  # fmt: skip
+        """The energy of contact counts in the bound of the next first iterate."""
+        world = wp.tid()
+        if accepted[world] == 0:
+            return
+        his.posed[world] = clock.new_time[world]
+        at.elapsed[world] = at.elapsed[world] + clock.h[world]
+        potential[world] = potential[world] + term_sums[1, world]
+
+    return _types.SimpleNamespace(
+        module=module, explicit_forces=explicit_forces, forces=forces, clear_lists=clear_lists,
+        count_points=count_points, place_lists=place_lists, fill_lists=fill_lists, sort_lists=sort_lists,
+        gather_masters=gather_masters, product_points=product_points, product_facets=product_facets,
+        product_masters=product_masters, diagonal_masters=diagonal_masters, finish=finish, close=close,
+    )  # fmt: skip

@@ -1,0 +1,263 @@
+"""Contact between bodies as a builder describes it, and the facets of its master surfaces."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..elements import Rule
+from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
+from . import assembly
+from .contact_points import ContactPoints, body_mass_total, effective_modulus, points_by_rules
+from .discretisation import Discretisation, element_functions
+from .handles import SurfaceSet
+
+__all__ = ["PAIR_RULES", "MasterFacets", "PairContact", "choose_master", "master_facets", "pair_points"]
+
+PAIR_RULES: dict[int, dict[int, Rule]] = {
+    3: {7: triangle_7(), 16: triangle_16()},
+    4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
+}
+"""Rules of points between bodies: 16 by default, and so many because meshes need not match."""
+SIZES = 1.25
+"""Ratio of element sizes beyond which the coarser surface is the master."""
+MITRE = 2.0
+"""Longest outward vector, over a normal: of a corner it has the length that keeps layers parallel to all faces."""
+STEEP = 0.1
+"""Singular values below this part of the largest do not tell the normals of a node apart."""
+
+
+@dataclass(eq=False)
+class PairContact:
+    """Contact of two surfaces; made by ModelBuilder.add_contact, which says what each value means.
+
+    Attributes:
+        first, second: faces of two bodies; forces of reports are those on the first.
+        slave, master: the same two: contact acts at points of the slave, against facets of the master.
+        others: as of contacts.Contact.
+    """
+
+    first: SurfaceSet
+    second: SurfaceSet
+    name: str
+    slave: SurfaceSet
+    master: SurfaceSet
+    mu: float = 0.0
+    mu_static: float = 0.0
+    restitution: float = 1.0
+    law: str = "default"
+    treatment: str = "implicit"
+    stiffness: float = 1.0
+    model: str = "patch"
+    radius: float | None = None
+    offset: float = 0.0
+    points: int | None = None
+    smoothing: float | tuple[float, float] | None = None
+    overlap: str = "refuse"
+    overlap_time: float = 0.1
+    index: int = -1
+
+    @property
+    def body(self) -> Discretisation:
+        """The body of the slave surface."""
+        return self.slave.body
+
+    def __repr__(self) -> str:
+        return f"PairContact({self.name!r}, bodies {self.first.body.name!r} and {self.second.body.name!r})"
+
+
+@dataclass(frozen=True, eq=False)
+class MasterFacets:
+    """Facets as polynomials, see kernels/terms/pair_data.py.
+
+    Attributes:
+        conn: (F, L) body slots of the facets' elements.
+        shape, rise: (F, M, L) coefficients of functions, and of their derivatives along the outward vectors, 1/m.
+        X, N: (F, M, 3) coefficients of the reference place, m, and of the outward vector.
+        corners, degree: of the polynomials of all facets.
+        size: (F,) length of a side, m.
+        limit: (F,) half the thickness of the body behind it, m.
+    """
+
+    conn: np.ndarray
+    shape: np.ndarray
+    rise: np.ndarray
+    X: np.ndarray
+    N: np.ndarray
+    corners: int
+    degree: int
+    size: np.ndarray
+    limit: np.ndarray
+
+
+def pair_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:
+    """The points of a slave surface: 16 of each face, corners included."""
+    return points_by_rules(surface, PAIR_RULES, {3: 16, 4: 16}, points)
+
+
+def choose_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, SurfaceSet]:
+    """Slave and master: the coarser surface is the master; of as fine ones the stiffer, then the second."""
+    sides = []
+    for surface in (first, second):
+        area = pair_points(surface).area.sum(axis=1)
+        sides.append((math.sqrt(float(area.mean())), effective_modulus(surface.body, surface)[0]))
+    (size_1, modulus_1), (size_2, modulus_2) = sides
+    if size_1 > SIZES * size_2 or (size_2 <= SIZES * size_1 and modulus_1 > modulus_2):
+        return second, first
+    return first, second
+
+
+def exponents(corners: int, degree: int) -> np.ndarray:
+    """(M, 2) of the monomials: of triangles up to a total degree, of squares up to a degree in each direction."""
+    return np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1) if corners == 4 or i + j <= degree])
+
+
+def nodes_of(corners: int, degree: int) -> np.ndarray:
+    """(M, 2) points that determine such a polynomial."""
+    return exponents(corners, degree) / degree
+
+
+def monomials(points: np.ndarray, corners: int, degree: int) -> np.ndarray:
+    """(Q, M) values at points."""
+    return np.asarray(np.prod(points[:, None, :] ** exponents(corners, degree), axis=2))
+
+
+def bernstein(corners: int, degree: int) -> np.ndarray:
+    """(M, M): control points of Bernstein's form, whose convex hull holds the facet, from monomial coefficients."""
+    powers = exponents(corners, degree)
+    nodes = nodes_of(corners, degree)
+    if corners == 4:
+        values = [math.comb(degree, i) * math.comb(degree, j) * nodes[:, 0] ** i * (1 - nodes[:, 0]) ** (degree - i)
+                  * nodes[:, 1] ** j * (1 - nodes[:, 1]) ** (degree - j) for i, j in powers]  # fmt: skip
+    else:
+        rest = 1.0 - nodes.sum(axis=1)
+        values = [math.factorial(degree) / (math.factorial(i) * math.factorial(j) * math.factorial(degree - i - j))
+                  * nodes[:, 0] ** i * nodes[:, 1] ** j * rest ** (degree - i - j) for i, j in powers]  # fmt: skip
+    return np.linalg.solve(np.stack(values, axis=1), monomials(nodes, corners, degree))
+
+
+def _functions(surface: SurfaceSet, ab: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Functions (F, Q, S) of all slots of the elements at points of their faces, their gradients (F, Q, S, 3) by the
+    reference, and outward unit normals (F, Q, 3)."""
+    body, faces = surface.body, surface.faces
+    S = body.family.slots
+    shape = np.zeros((len(faces), len(ab), S))
+    gradient = np.zeros((*shape.shape, 3))
+    normal = np.zeros((len(faces), len(ab), 3))
+    for face in np.unique(faces[:, 1]):
+        rows = np.flatnonzero(faces[:, 1] == face)
+        xi, dxi = body.family.face_points(int(face), ab)
+        s, ds = element_functions(body, faces[rows, 0], xi)
+        e = body.reference[body.connectivity[faces[rows, 0]]]
+        J = np.einsum("esk,eqsd->eqkd", e, np.broadcast_to(ds, (len(rows), *ds.shape[1:])))
+        shape[rows] = s
+        gradient[rows] = np.einsum("eqsd,eqdk->eqsk", np.broadcast_to(ds, (len(rows), *ds.shape[1:])), np.linalg.inv(J))
+        tangents = np.einsum("eqkd,qdj->eqkj", J, dxi)
+        n = np.cross(tangents[..., 0], tangents[..., 1])
+        normal[rows] = n / np.linalg.norm(n, axis=2, keepdims=True)
+    return shape, gradient, normal
+
+
+def _outward(places: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
+    """(F, Q, 3) vectors of the nodes of facets whose product with the normal of each facet that meets there is 1."""
+    key = np.round(places.reshape(-1, 3) / (1e-7 * size)).astype(np.int64)
+    _, inverse = np.unique(key, axis=0, return_inverse=True)
+    inverse = inverse.ravel()
+    flat = normal.reshape(-1, 3)
+    order = np.argsort(inverse, kind="stable")
+    ends = np.cumsum(np.bincount(inverse))
+    out = np.empty_like(flat)
+    for rows in np.split(order, ends[:-1]):
+        n = flat[rows]
+        vector = np.linalg.lstsq(n, np.ones(len(n)), rcond=STEEP)[0] if len(n) > 1 else n[0]
+        length = np.linalg.norm(vector)
+        if not length > 0.0 or (n @ vector).min() <= 0.0:
+            out[rows] = n
+        else:
+            out[rows] = vector * min(1.0, MITRE / length)
+    return out.reshape(normal.shape)
+
+
+def master_facets(surface: SurfaceSet) -> MasterFacets:
+    """The facets of a surface as polynomials of the lowest degree that holds their functions.
+
+    Raises:
+        ModelError: faces of triangles and squares in one surface, or functions of degree above 3.
+    """
+    body, faces = surface.body, surface.faces
+    kinds = {len(body.family.faces[int(k)]) for k in np.unique(faces[:, 1])}
+    if len(kinds) > 1:
+        raise ModelError(f"body {body.name!r}: a master surface of triangles and squares; name surfaces of one kind")
+    corners = kinds.pop()
+    check = PAIR_RULES[corners][16].points
+    wanted = _functions(surface, check)[0]
+    for degree in (1, 2, 3):
+        ab = nodes_of(corners, degree)
+        inverse = np.linalg.inv(monomials(ab, corners, degree))
+        shape, gradient, normal = _functions(surface, ab)
+        fitted = np.einsum("qm,mn,fns->fqs", monomials(check, corners, degree), inverse, shape)
+        if np.abs(fitted - wanted).max() <= 1e-10 * np.abs(wanted).max():
+            break
+    else:
+        raise ModelError(f"body {body.name!r}: faces of {body.family.name} are no polynomials of degree 3")
+    conn = body.connectivity[faces[:, 0]]
+    e = body.reference[conn]
+    places = np.einsum("fqs,fsk->fqk", shape, e) + body.origin
+    area = pair_points(surface).area.sum(axis=1)
+    outward = _outward(places, normal, float(np.sqrt(area.max())))
+    rise = np.einsum("fqsk,fqk->fqs", gradient, outward)
+    used = (np.abs(shape).max(axis=(0, 1)) > 0.0) | (np.abs(rise).max(axis=(0, 1)) > 0.0)
+    conn, e, shape, rise = conn[:, used], e[:, used], shape[:, :, used], rise[:, :, used]
+    shape, rise = (np.einsum("mq,fqs->fms", inverse, x) for x in (shape, rise))
+    X = np.einsum("mq,fqk->fmk", inverse, places)
+    N = np.einsum("fms,fsk->fmk", rise, e)
+    return MasterFacets(conn, shape, rise, X, N, corners, degree, np.sqrt(area), 0.5 * thickness(surface))
+
+
+def thickness(surface: SurfaceSet) -> np.ndarray:
+    """(F,) distance, m, from the middle of each facet to the other side of its body, straight inward."""
+    import warp as wp
+
+    from ..kernels.terms.pair_thickness import thickness_kernel
+    from .surfaces import make_skin, reference_points
+
+    body = surface.body
+    corners = len(body.family.faces[int(surface.faces[0, 1])])
+    middle = np.full((1, 2), 1.0 / 3.0 if corners == 3 else 0.5)
+    shape, _, normal = _functions(surface, middle)
+    e = body.reference[body.connectivity[surface.faces[:, 0]]]
+    places = np.einsum("fqs,fsk->fqk", shape, e)[:, 0] + body.origin
+    skin = make_skin(body)
+    points = reference_points(body, skin.slot_weights)
+    center, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    with wp.ScopedDevice("cpu"):
+        mesh = wp.Mesh(
+            wp.array((points - center) / size, dtype=wp.vec3),
+            wp.array(skin.triangles.ravel(), dtype=wp.int32),
+        )
+        out = wp.zeros(len(places), dtype=float)
+        x = wp.array((places - center) / size, dtype=wp.vec3)
+        n = wp.array(normal[:, 0], dtype=wp.vec3)
+        wp.launch(thickness_kernel(), len(places), [mesh.id, x, n, out], device="cpu")
+        return np.asarray(out.numpy(), dtype=float) * size
+
+
+def pair_numbers(contact: PairContact, area: float) -> dict[str, float]:
+    """Constants of Eqs. (74)-(76), (79) and (80) of two bodies whose region has an area, m^2."""
+    compliance = shear = mass = 0.0
+    for surface in (contact.slave, contact.master):
+        E, nu = effective_modulus(surface.body, surface)
+        compliance += (1.0 - nu**2) / E
+        shear += 2.0 * (2.0 - nu) * (1.0 + nu) / E
+        total = body_mass_total(surface.body)
+        mass += 1.0 / total if total > 0.0 else math.inf
+    a = contact.radius or math.sqrt(area / math.pi)
+    return {
+        "normal": 4.0 / 3.0 * a / compliance,
+        "tangent": 8.0 * a / shear,
+        "modulus": 2.0 * a / compliance,
+        "mass": 1.0 / mass,
+    }
