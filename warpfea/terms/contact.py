@@ -15,9 +15,9 @@ from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
+from .contact_exact import Exact
 from .contact_fields import contact_field, nodal_force
 from .contact_parameters import contact_parameters
-from .contact_exact import Exact
 from .contact_places import Places, at_points
 from .contact_tables import ContactTables
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
