@@ -13,6 +13,7 @@ from .bodies import Body
 from .contacts import Collider, Contact
 from .handles import NodeSet, SurfaceSet
 from .joints import Joint
+from .pairs import PairContact
 
 __all__ = [
     "BodyForce",

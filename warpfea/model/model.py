@@ -162,7 +162,7 @@ class Model:
             self.free_host[rows] *= 1.0 - support.components
             if support.law is None and support.node_laws is None:
                 self.clamped_host[rows] |= support.components.astype(bool)
-        if not self.free_host.any() and not self.description.contacts:
+        if not self.free_host.any() and not self.description.contacts and not self.description.pairs:
             raise ModelError("every component of every node is prescribed: nothing is left to solve for")
 
     def _assemble_mass(self) -> None:
@@ -282,7 +282,7 @@ class Model:
                 {"name": j.name, "kind": j.kind, "rows": len(j.rows), "between": j.between}
                 for j in (self.constraints.joints if self.constraints else ())
             ],
-            "contacts": self.terms.contact.facts() if self.terms.contact else [],
+            "contacts": [fact for term in (self.terms.contact, self.terms.pairs) if term for fact in term.facts()],
             "features": [k for k, on in features.items() if on],
             "left_out": [k for k, on in features.items() if not on] + list(self.terms.later),
             "blocks": [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from ..kernels.step.control import REPORT
 from ..kernels.terms.constraints import JOINT_COLUMNS
 from ..kernels.terms.contact_data import RECORD
 from ..model.contacts import Contact
+from ..model.pairs import PairContact
 from ..model.joints import Joint
 from .reports import ContactRecord, JointRecord, ProbeRecord
 from .results import Results
@@ -101,7 +102,7 @@ class Records(Results):
             f"got {joint!r}; it has: {listing(names)}{did_you_mean(joint, names) if isinstance(joint, str) else ''}"
         )
 
-    def contact_record(self, contact: Contact | str) -> ContactRecord:
+    def contact_record(self, contact: Contact | PairContact | str) -> ContactRecord:
         """What has been recorded of a contact (handle or name), one entry per step."""
         first = 1 + self._contact_column(contact) - len(REPORT)
         table = self._table([0, *range(first, first + len(RECORD))])
@@ -109,7 +110,7 @@ class Records(Results):
         scalars = {name: table[:, :, 1 + RECORD.index(name)] for name in names}
         return ContactRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], **scalars)
 
-    def contact_force(self, contact: Contact | str) -> np.ndarray:
+    def contact_force(self, contact: Contact | PairContact | str) -> np.ndarray:
         """Force (N) and moment about the origin (N m) of a contact on its body over the last accepted step.
 
         (B, 6) in world axes; `contact_record` has them over time. NaN as for `reaction`.
@@ -119,13 +120,13 @@ class Records(Results):
         out[~self._stepped] = np.nan
         return out
 
-    def _contact_column(self, contact: Contact | str) -> int:
+    def _contact_column(self, contact: Contact | PairContact | str) -> int:
         """First column of a contact in the report of a step."""
-        contacts = self.model.description.contacts
+        d, terms = self.model.description, self.model.terms
+        contacts = [*d.contacts, *d.pairs]
         for other in contacts:
             if other is contact or other.name == contact:
-                term = self.model.terms.contact
-                assert term is not None
+                term: Any = terms.contact if isinstance(other, Contact) else terms.pairs
                 return term.report_offset + len(RECORD) * term.tables.number[other.index]
         names = [c.name for c in contacts]
         raise ModelError(

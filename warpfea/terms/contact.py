@@ -19,7 +19,7 @@ from .contact_exact import Exact
 from .contact_fields import contact_field, nodal_force
 from .contact_parameters import contact_parameters
 from .contact_places import Places, at_points
-from .contact_tables import ContactTables
+from .contact_tables import ContactTables, block_entries
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
 from .time_laws import TimeLaws
 
@@ -326,23 +326,8 @@ class Contact(Term):
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
         if "contact blocks" not in self.model.cache:
-            self.model.cache["contact blocks"] = [self._entries(group.conn, matrix.pattern) for group in
-                                                  self.tables.groups]  # fmt: skip
-
-    def _entries(self, conn: np.ndarray, pattern: Any) -> tuple[wp.array, wp.array, wp.array, int]:
-        """Entries of the pattern that facets add to: which, where their items begin, and (facet, slot, slot)."""
-        a, b = (x.ravel() for x in np.indices((conn.shape[1],) * 2))
-        facet = np.repeat(np.arange(len(conn)), len(a))
-        a, b = np.tile(a, len(conn)), np.tile(b, len(conn))
-        index = pattern.find(conn[facet, a], conn[facet, b])
-        chosen = np.flatnonzero(index >= 0)
-        chosen = chosen[np.argsort(index[chosen], kind="stable")]
-        entry, count = np.unique(index[chosen], return_counts=True)
-        source = np.stack([facet[chosen], a[chosen], b[chosen]], axis=1)
-        m = self.model
-        start = np.concatenate([[0], np.cumsum(count)])
-        arrays = (m.array("contact", x, t) for x, t in ((entry, wp.int32), (start, wp.int32), (source, wp.vec3i)))
-        return (*arrays, len(entry))  # type: ignore[return-value]
+            conns = [group.conn for group in self.tables.groups]
+            self.model.cache["contact blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
 
     def blocks(
         self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,

@@ -27,7 +27,7 @@ from .time_laws import TimeLaws
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["PER_WORLD", "ContactTables", "FacetGroup", "beta_of", "hunt_crossley_damping"]
+__all__ = ["PER_WORLD", "ContactTables", "block_entries", "FacetGroup", "beta_of", "hunt_crossley_damping"]
 
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
 SMOOTHING = (1e-3, 1e-4)
@@ -287,3 +287,18 @@ def law_numbers(contact: Contact) -> dict[str, float]:
         "force_eps": pair[0],
         "speed_eps": pair[1],
     }
+
+
+def block_entries(model: Model, conn: np.ndarray, pattern: Any) -> tuple[wp.array, wp.array, wp.array, int]:
+    """Entries of the pattern that facets add to: which, where their items begin, and (facet, slot, slot)."""
+    a, b = (x.ravel() for x in np.indices((conn.shape[1],) * 2))
+    facet = np.repeat(np.arange(len(conn)), len(a))
+    a, b = np.tile(a, len(conn)), np.tile(b, len(conn))
+    index = pattern.find(conn[facet, a], conn[facet, b])
+    chosen = np.flatnonzero(index >= 0)
+    chosen = chosen[np.argsort(index[chosen], kind="stable")]
+    entry, count = np.unique(index[chosen], return_counts=True)
+    source = np.stack([facet[chosen], a[chosen], b[chosen]], axis=1)
+    start = np.concatenate([[0], np.cumsum(count)])
+    arrays = (model.array("contact", x, t) for x, t in ((entry, wp.int32), (start, wp.int32), (source, wp.vec3i)))
+    return (*arrays, len(entry))  # type: ignore[return-value]

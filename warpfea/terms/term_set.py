@@ -24,6 +24,7 @@ from .damping import Damping
 from .dead_loads import DeadLoads
 from .elements import Elements
 from .followers import Followers
+from .pairs import Pairs
 from .supports import Supports
 from .term import At, FieldSpec, Term
 from .time_laws import TimeLaws, control_array
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["KINDS", "TermSet", "all_parts"]
 
-KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Constraints)
+KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Pairs, Constraints)
 """The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
 LATER = ("materials per world",)
 """Features of later versions, which `info` lists as left out."""
@@ -222,6 +223,11 @@ class TermSet:
     def contact(self) -> Contact | None:
         """The term of contact with obstacles, or None."""
         return self.find(Contact)
+
+    @property
+    def pairs(self) -> Pairs | None:
+        """The term of contact between bodies, or None."""
+        return self.find(Pairs)
 
     def set_parameter(self, name: Any, values: Any) -> None:
         """See Model.set_parameter."""

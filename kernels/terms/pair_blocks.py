@@ -1,0 +1,47 @@
+"""What contact between bodies adds to a matrix: the blocks of each side by itself."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.entries import add_block_function
+from ..common.structs import pattern_struct, topology_struct
+from ..common.types import SMALL, kernel_module, precision
+
+__all__ = ["pair_block_kernels"]
+
+
+@functools.cache
+def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
+    """The kernel for master facets; slave facets have that of contact with obstacles."""
+    p = precision(dtype)
+    T, mat33, sym = p.T, p.mat33, p.sym
+    f64 = wp.float64
+    Topology, Pattern = topology_struct(dtype), pattern_struct()
+    add_block = add_block_function(dtype)
+    module = kernel_module(f"pair_blocks_{dtype}", max_unroll=SMALL)
+
+    @wp.kernel(module=module)
+    def add_masters(
+        topo: Topology, pattern: Pattern, entry: wp.array(dtype=wp.int32), start: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.vec3i), stiffness: wp.array2d(dtype=sym), weight: wp.array3d(dtype=T),
+        points: wp.array2d(dtype=wp.int32), first: wp.array2d(dtype=wp.int32), listed: wp.array2d(dtype=wp.int32),
+        dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), value: wp.array2d(dtype=mat33),
+    ):  # fmt: skip
+        """value += (dq/dv) sum over the points of a facet of w_a w_b K; `source`: facet and two of its slots."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        k6 = sym()
+        for e in range(start[index], start[index + 1]):
+            at = source[e]
+            begin = first[world, at[0]]
+            for k in range(points[world, at[0]]):
+                point = listed[world, begin + k]
+                k6 += (weight[world, point, at[1]] * weight[world, point, at[2]]) * stiffness[world, point]
+        k6 = T(dq_dv[world]) * k6
+        A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
+        add_block(topo, pattern.upper[entry[index]], A, world, value)
+
+    return _types.SimpleNamespace(module=module, add_masters=add_masters)

@@ -1,0 +1,246 @@
+"""Tables of contacts between bodies on the device: points of slave surfaces, facets of master surfaces."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.terms.contact_data import contact_struct, facet_struct
+from ..kernels.terms.pair_data import master_struct
+from ..model.contact_points import ContactPoints
+from ..model.handles import SurfaceSet
+from ..model.pairs import (
+    MasterFacets,
+    PairContact,
+    bernstein,
+    exponents,
+    master_facets,
+    pair_numbers,
+    pair_points,
+)
+from .contact_tables import CONSTANT, LAWS, SMOOTHING, FacetGroup, beta_of, hunt_crossley_damping
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["PairTables"]
+
+TOUCH = 1e-9
+"""Depth over the size of a model that counts as touch where a step begins."""
+
+
+class PairTables:
+    """Contacts between bodies, in the order of the device: by the kind of their slave facets.
+
+    Attributes:
+        contacts: handles in that order; number: of a handle's index.
+        groups: slave facets. surfaces, masters: master surfaces, each once, and their facets.
+        host: points of each contact. shares: (F, P) area of each point over that of the region.
+        points, rows, facets: points and slave facets in all; master facets.
+        first, row_start: first point and row of each contact.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        described: list[PairContact] = list(model.description.pairs)
+        found = [pair_points(contact.slave, contact.points) for contact in described]
+        kinds = [(p.conn.shape[1], p.area.shape[1]) for p in found]
+        self.kinds = sorted(set(kinds))
+        order = sorted(range(len(found)), key=lambda k: (self.kinds.index(kinds[k]), k))
+        self.contacts = [described[k] for k in order]
+        self.host: list[ContactPoints] = [found[k] for k in order]
+        self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
+        self.surfaces: list[SurfaceSet] = []
+        self.of: list[int] = []
+        for contact in self.contacts:
+            same = [k for k, other in enumerate(self.surfaces) if other.body is contact.master.body
+                    and np.array_equal(other.faces, contact.master.faces)]  # fmt: skip
+            if not same:
+                self.surfaces.append(contact.master)
+            self.of.append(same[0] if same else len(self.surfaces) - 1)
+        self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
+        self.regions = [self._region(contact) for contact in self.contacts]
+        self.shares = [p.area / region for p, region in zip(self.host, self.regions)]
+        self.facets = sum(len(m.conn) for m in self.masters)
+        self.points = self.rows = 0
+        self.groups: list[FacetGroup] = []
+
+    @property
+    def explicit(self) -> bool:
+        """Whether a contact has the force of the last state."""
+        return any(contact.treatment == "explicit" for contact in self.contacts)
+
+    def _region(self, contact: PairContact) -> float:
+        """Area that the stiffness of a contact is spread over, m^2: the smaller of both surfaces'."""
+        if contact.radius:
+            return math.pi * contact.radius**2
+        return min(float(pair_points(surface).area.sum()) for surface in (contact.slave, contact.master))
+
+    @property
+    def slots(self) -> list[np.ndarray]:
+        """Of each contact the model's slots of both surfaces."""
+        out = []
+        for contact, p, k in zip(self.contacts, self.host, self.of):
+            slave = np.unique(p.conn) + contact.slave.body.slot_offset
+            master = np.unique(self.masters[k].conn) + contact.master.body.slot_offset
+            out.append(np.concatenate([slave, master]))
+        return out
+
+    def build(self, pool: int) -> None:
+        """Upload; `pool`: the first entry of the term in the pool."""
+        m = self.model
+        entries = 0
+        self.first = np.zeros(len(self.contacts) + 1, dtype=np.int64)
+        self.row_start = np.zeros(len(self.contacts) + 1, dtype=np.int64)
+        for kind in self.kinds:
+            chosen = [k for k, p in enumerate(self.host) if (p.conn.shape[1], p.area.shape[1]) == kind]
+            for k in chosen:
+                self.first[k + 1] = self.first[k] + self.host[k].area.size
+                self.row_start[k + 1] = self.row_start[k] + len(self.host[k].conn)
+            group = self._group(chosen, pool + entries)
+            self.groups.append(group)
+            entries += group.conn.size
+            self.rows += group.count
+            self.points += group.count * kind[1]
+        self.pool = pool + entries
+        self.data = self._contacts()
+        self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
+            max(contact.offset, 0.0) for contact in self.contacts
+        )
+        self.master_conn = self._master_conn()
+        self.size = m.size
+
+    def _group(self, chosen: list[int], pool: int) -> FacetGroup:
+        m = self.model
+        parts = [self.host[k] for k in chosen]
+        offset = [self.contacts[k].slave.body.slot_offset for k in chosen]
+        conn = np.concatenate([p.conn + o for p, o in zip(parts, offset)])
+        data = facet_struct(m.dtype)()
+
+        def put(name: str, values: Any, dtype: Any) -> None:
+            setattr(data, name, m.array("contact", np.ascontiguousarray(values), dtype))
+
+        put("conn", conn.T, wp.int32)
+        put("shape", np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2), m.types.T)
+        put("X", np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1), wp.vec3d)
+        put("share", np.concatenate([self.shares[k] for k in chosen]).T, wp.float64)
+        put("area", np.concatenate([p.area for p in parts]).T, wp.float64)
+        put("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
+        data.pool, data.row, data.point = pool, self.rows, self.points
+        data.count, data.points = len(conn), parts[0].area.shape[1]
+        return FacetGroup(conn, data, False)
+
+    def _contacts(self) -> Any:
+        m, C = self.model, self.contacts
+        out = contact_struct()()
+
+        def put(name: str, values: Any, dtype: Any) -> None:
+            setattr(out, name, m.array("contact", np.asarray(values), dtype))
+
+        numbers = [pair_numbers(c, region) for c, region in zip(C, self.regions)]
+        pairs = [c.smoothing if isinstance(c.smoothing, tuple) else SMOOTHING for c in C]
+        put("law", [LAWS[c.law] for c in C], wp.int32)
+        put("lumped", [0 for _ in C], wp.int32)
+        put("dead", [int(c.treatment == "explicit") for c in C], wp.int32)
+        put("first", self.first, wp.int32)
+        put("normal", [row["normal"] for row in numbers], wp.float64)
+        put("tangent", [row["tangent"] for row in numbers], wp.float64)
+        put("normal_damping", [CONSTANT * math.sqrt(row["modulus"] * row["mass"]) for row in numbers], wp.float64)
+        put("mass", [row["mass"] for row in numbers], wp.float64)
+        put("ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C], wp.float64)
+        put("force_eps", [pair[0] for pair in pairs], wp.float64)
+        put("speed_eps", [pair[1] for pair in pairs], wp.float64)
+        put("offset", [c.offset for c in C], wp.float64)
+        put("decay", [c.overlap_time for c in C], wp.float64)
+        per_world = {
+            "mu": [c.mu for c in C],
+            "mu_static": [c.mu_static for c in C],
+            "damping": [hunt_crossley_damping(c.restitution) for c in C],
+            "beta": [beta_of(c.restitution) for c in C],
+            "scale": [c.stiffness for c in C],
+        }
+        for name, values in per_world.items():
+            put(name, np.tile(values, (m.worlds, 1)), wp.float64)
+        return out
+
+    def _padded(self, values: list[np.ndarray], axis: int, width: int, mode: str = "constant") -> np.ndarray:
+        """Facets of all surfaces, with one axis padded to a width."""
+        out = []
+        for x in values:
+            pad = [(0, 0)] * x.ndim
+            pad[axis] = (0, width - x.shape[axis])
+            out.append(np.pad(x, pad, mode=mode))  # type: ignore[call-overload]
+        return np.concatenate(out)
+
+    def _master_conn(self) -> np.ndarray:
+        """(facets, L) model slots; facets that use fewer repeat their last one, with functions of zero."""
+        width = max(mas.conn.shape[1] for mas in self.masters)
+        conns = [mas.conn + surface.body.slot_offset for mas, surface in zip(self.masters, self.surfaces)]
+        return self._padded(conns, 1, width, "edge")
+
+    def masters_of(self, tree: Any) -> Any:
+        """The device struct, for a tree of boxes."""
+        m, all_of = self.model, self.masters
+        if "pair masters" not in m.cache:
+            width = self.master_conn.shape[1]
+            kinds = sorted({(mas.corners, mas.degree) for mas in all_of})
+            most = max(len(exponents(*kind)) for kind in kinds)
+
+            def whole(name: str) -> np.ndarray:
+                values = [getattr(mas, name) for mas in all_of]
+                if values[0].ndim == 3 and name in ("shape", "rise"):
+                    values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, width - x.shape[2]))) for x in values]
+                elif values[0].ndim == 3:
+                    values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, 0))) for x in values]
+                return np.concatenate(values)
+
+            def put(values: Any, dtype: Any) -> wp.array:
+                return m.array("contact", np.ascontiguousarray(values), dtype)
+
+            power = np.zeros((len(kinds), most, 2), dtype=np.int32)
+            hull = np.zeros((len(kinds), most, most))
+            for k, kind in enumerate(kinds):
+                count = len(exponents(*kind))
+                power[k, :count] = exponents(*kind)
+                hull[k, :count, :count] = bernstein(*kind)
+            counts = [len(mas.conn) for mas in all_of]
+            m.cache["pair masters"] = {
+                "of": put(self.of, wp.int32),
+                "sign": put([1.0 if c.slave is c.first else -1.0 for c in self.contacts], wp.float64),
+                "conn": put(self.master_conn.T, wp.int32),
+                "shape": put(np.moveaxis(whole("shape"), 0, 2), m.types.T),
+                "rise": put(np.moveaxis(whole("rise"), 0, 2), m.types.T),
+                "X": put(np.swapaxes(whole("X"), 0, 1), wp.vec3d),
+                "N": put(np.swapaxes(whole("N"), 0, 1), wp.vec3d),
+                "kind": put(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
+                "terms": put([len(exponents(*kind)) for kind in kinds], wp.int32),
+                "corners": put([kind[0] for kind in kinds], wp.int32),
+                "power": put(power, wp.vec2i),
+                "hull": put(hull, wp.float64),
+                "limit": put(whole("limit"), wp.float64),
+                "size": put(whole("size"), wp.float64),
+                "surface": put(np.repeat(np.arange(len(counts)), counts), wp.int32),
+                "most": most,
+                "surfaces": len(self.surfaces),
+                "touch": TOUCH * self.size,
+                "pool": self.pool,
+                "count": self.facets,
+            }
+        out = master_struct(m.dtype)()
+        for name, value in m.cache["pair masters"].items():
+            setattr(out, name, value)
+        out.tree = tree
+        return out
+
+    def hash(self, h: Any) -> None:
+        """Feed what defines the contacts into a hash."""
+        for contact, p, k in zip(self.contacts, self.host, self.of):
+            fixed = ("first", "second", "slave", "master", "mu", "mu_static", "restitution", "stiffness")
+            values = {name: v for name, v in vars(contact).items() if name not in fixed}
+            h.update(f"{contact.first.body.name} {contact.second.body.name} {sorted(values.items())}".encode())
+            h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())
+        for name in ("mu", "mu_static", "damping", "beta", "scale"):
+            h.update(getattr(self.data, name).numpy().tobytes())

@@ -1,0 +1,415 @@
+"""Contact between bodies: a term whose potential is that of the points of slave surfaces, see kernels/terms/pairs.py."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError, PenetrationError
+from ..kernels.common.traits import Traits
+from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
+from ..kernels.terms.contact import RELAX_LANES, contact_kernels
+from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
+from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
+from ..kernels.terms.pair_blocks import pair_block_kernels
+from ..kernels.terms.pair_data import seat_struct, touching_struct
+from ..kernels.terms.pair_seek import seek_kernels
+from ..kernels.terms.pairs import pair_kernels
+from ..model.pairs import bernstein
+from .contact import TOUCHING
+from .contact_tables import block_entries
+from .pair_tables import PairTables
+from .term import LOSS, STORED, At, Column, Term, part
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from .time_laws import TimeLaws
+    from .workspace import Workspace
+
+__all__ = ["Pairs"]
+
+KEPT = ("angle", "grown", "lead", "place", "turn")
+"""History of colliders and of lumped contacts."""
+
+
+class Pairs(Term):
+    """All contacts of a model between its bodies.
+
+    Attributes:
+        tables: points and facets on the device.
+    """
+
+    name = "pairs"
+    columns = (Column("contact", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
+    parts = {"pairs": "contact between bodies: search, forces, products, history"}
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.traits = Traits(walls=True)
+        self.tables = PairTables(model)
+        self.shared, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        self.seek, self.kernels = seek_kernels(model.dtype), pair_kernels(model.dtype)
+        self.report_columns = len(RECORD) * len(self.tables.contacts)
+
+    @classmethod
+    def of(cls, model: Model) -> Pairs | None:
+        return cls(model) if model.description.pairs else None
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {"contact between bodies": bool(model.description.pairs)}
+
+    def ties(self) -> list[np.ndarray]:
+        """Bodies that may touch are one component."""
+        return self.tables.slots
+
+    def build(self, laws: TimeLaws) -> None:
+        self.tables.build(self.offset)
+        self.connectivity = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
+        self.rows = self.booked_rows = self.tables.rows
+
+    def hash(self, h: Any) -> None:
+        self.tables.hash(h)
+
+    # for one simulation
+
+    def _attempt(self, work: Workspace) -> Any:
+        t, B = self.tables, self.model.worlds
+        C, P = len(t.contacts), t.points
+        point = (B, P)
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("origin", "reach", "depth", "speed", "held", "next", "plane", "next_plane", "asked", "state", "force",
+             "energy", "stiffness"), point)  # fmt: skip
+        shapes |= dict.fromkeys(("dead", "dead_spring"), point if t.explicit else (1, 1))
+        shapes |= dict.fromkeys(("through", "elapsed", "omega", "changes", "asked_size"), (B,))
+        shapes |= {"asked_sums": (B, RELAX_LANES), "total": (B, C, len(RECORD)), "touched": (B, t.rows)}
+        shapes |= {"rows": (len(RECORD), B, t.rows), "weight": (1, 1, 1)}
+        out = attempt_struct(self.model.dtype)()
+        for name, shape in shapes.items():
+            dtype = attempt_struct(self.model.dtype).vars[name].type.dtype
+            setattr(out, name, work.array(f"pairs {name}", shape, dtype))
+        out.omega.fill_(1.0)
+        return out
+
+    def _touching(self, work: Workspace) -> Any:
+        t, B = self.tables, self.model.worlds
+        most = t.masters_of(wp.uint64(0)).most
+        F, P, R = t.facets, t.points, t.rows
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("C", "D", "C0", "D0", "V0"), (B, F * most))
+        shapes |= dict.fromkeys(("lower", "upper", "wanted_lower", "wanted_upper", "count"), (B * F,))
+        shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
+        shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
+        shapes |= dict.fromkeys(("points", "start", "loaded"), (B, F))
+        shapes |= {"weight": (B, P, t.master_conn.shape[1])}
+        out = touching_struct(self.model.dtype)()
+        for name, var in touching_struct(self.model.dtype).vars.items():
+            setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))
+        out.fits.fill_(1)
+        return out
+
+    def allocate(self, work: Workspace, at: At) -> None:
+        t, m = self.tables, self.model
+        C, R, B = len(t.contacts), t.rows, m.worlds
+        attempt, touching = self._attempt(work), self._touching(work)
+        clock = clock_struct()()
+        for name in ("time", "new_time", "h", "part"):
+            setattr(clock, name, getattr(work.step, name))
+        clock.time, clock.still = at.state.time, int(not at.inertia)
+        tree = self._tree(touching)
+        scratch = {
+            "attempt": attempt,
+            "touching": touching,
+            "tree": tree,
+            "masters": t.masters_of(tree.id),
+            "clock": clock,
+            "active": work.newton.touching,
+            "booked": work.array("pairs booked", (BOOKED, B, R), wp.float64),
+            "parts": work.array("pairs parts", (B, C, len(RECORD), LANES), wp.float64),
+            "scan": work.array("pairs scan", (B * t.facets,), wp.int32),
+            "row_start": m.array("contact", t.row_start, wp.int32),
+        }
+        at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
+
+    def _tree(self, touching: Any) -> wp.Bvh:
+        """Boxes of the facets in the reference; worlds and surfaces are groups."""
+        t, B = self.tables, self.model.worlds
+        low, high = [], []
+        for mas in t.masters:
+            nodes = np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X)
+            low.append(nodes.min(axis=1))
+            high.append(nodes.max(axis=1))
+        counts = [len(mas.conn) for mas in t.masters]
+        group = np.repeat(np.arange(len(counts)), counts)
+        groups = (np.arange(B)[:, None] * len(counts) + group).ravel()
+        touching.lower.assign(np.tile(np.concatenate(low), (B, 1)).astype(np.float32))
+        touching.upper.assign(np.tile(np.concatenate(high), (B, 1)).astype(np.float32))
+        array = wp.array(groups, dtype=wp.int32, device=self.model.device)
+        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=array)
+
+    def register(self, at: At) -> None:
+        history, seats = history_struct()(), seat_struct()()
+        points = (self.tables.points,)
+        for name, var in history_struct().vars.items():
+            if name not in KEPT:
+                shape = () if name in ("born", "posed") else points
+                setattr(history, name, at.state.register(f"pairs_{name}", var.type.dtype, shape))
+        for name, var in seat_struct().vars.items():
+            setattr(seats, name, at.state.register(f"pairs_{name}", var.type.dtype, points))
+        at.scratch[self.name] = {"history": history, "seats": seats}
+
+    def modules(self, at: At) -> Iterable[wp.Module]:
+        return [self.shared.module, self.seek.module, self.kernels.module]
+
+    def start(self, at: At, active: wp.array) -> None:
+        """What overlaps at the state.
+
+        Raises:
+            ModelError: bodies that were not in contact overlap, and `overlap` is "refuse".
+        """
+        s, t = at.scratch[self.name], self.tables
+        history = s["history"]
+        new = (active.numpy() != 0) & ~(history.speed.numpy() > 0.0).any(axis=1)
+        if not new.any():
+            return
+        flags = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
+        overlap, born = history.overlap.numpy(), history.born.numpy()
+        overlap[new] = 0.0
+        born[new] = at.state.time.numpy()[new]
+        history.overlap.assign(overlap)
+        history.born.assign(born)
+        self._begin(at, flags)
+        self._seek(at, at.state.displacement, flags, settling=1)
+        seat = s["touching"].seat.numpy()
+        depth = np.where((seat >= 0) & new[:, None], s["touching"].depth.numpy(), 0.0)
+        u = at.state.displacement.numpy()
+        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
+        for k, contact in enumerate(t.contacts):
+            first, last = t.first[k], t.first[k + 1]
+            part_of = depth[:, first:last]
+            deep = part_of.max(axis=1) > touching
+            if not deep.any():
+                continue
+            if contact.overlap == "refuse":
+                world, point = np.unravel_index(int(part_of.argmax()), part_of.shape)
+                raise ModelError(
+                    f"contact {contact.name!r}: body {contact.slave.body.name!r} begins {part_of.max():.3g} m inside "
+                    f"body {contact.master.body.name!r} (world {world}, reference point {self._where(k, int(point))}); "
+                    "move one of them, or take overlap='offset', which stores the overlap and lets it decay"
+                )
+            overlap[deep, first:last] = np.maximum(part_of[deep], 0.0)
+        history.overlap.assign(overlap)
+
+    def _where(self, k: int, point: int) -> str:
+        """Reference place of a point of a contact."""
+        X = self.tables.host[k].X.reshape(-1, 3)[point]
+        return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
+
+    # in a step
+
+    @part("pairs")
+    def begin(self, at: At, active: wp.array) -> None:
+        """Facets and points as the attempt begins."""
+        at.scratch[self.name]["finished"] = False
+        self._begin(at, active)
+
+    def _begin(self, at: At, active: wp.array) -> None:
+        s, m, t = at.scratch[self.name], self.model, self.tables
+        touching, masters = s["touching"], s["masters"]
+        u, v = at.state.displacement, at.state.velocity
+        dim = (m.worlds, t.facets, masters.most)
+        at.launch(self.seek.controls, dim, [masters, v, active, touching.V0, touching.D0])
+        at.launch(self.seek.controls, dim, [masters, u, active, touching.C0, touching.D0])
+        for group in t.groups:
+            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"]]
+            dim = (m.worlds, group.count, group.data.points)
+            at.launch(self.seek.begin_points, dim, [*args, u, v, active, s["attempt"], touching])
+            if t.explicit:
+                at.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], touching])
+
+    def _refit(self, at: At) -> None:
+        s = at.scratch[self.name]
+        at.launch(self.seek.adopt_boxes, self.model.worlds * self.tables.facets, [s["touching"]])
+        s["tree"].refit()
+
+    def _seek(self, at: At, u: wp.array, active: wp.array, *, settling: int) -> None:
+        """Seats of all points at u."""
+        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.seek
+        touching, masters = s["touching"], s["masters"]
+        dim = (m.worlds, t.facets, masters.most)
+        at.launch(k.controls, dim, [masters, u, active, touching.C, touching.D])
+        at.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, touching])
+        wp.capture_if(touching.stale, self._refit, at=at)
+        for group in t.groups:
+            args = [t.data, masters, group.data]
+            at.launch(k.look_around, (m.worlds, group.count), [*args, u, active, t.reaching, touching])
+            args += [s["history"], s["seats"], s["clock"], u, at.state.velocity, active, settling]
+            at.launch(k.seek, (m.worlds, group.count, group.data.points), [*args, s["attempt"], touching])
+
+    def prepare(self, at: At, active: wp.array) -> None:
+        """The first caps, and the stiffness that blocks are made from."""
+        self._forces(at, active, fresh=1)
+
+    def force(self, at: At, active: wp.array) -> None:
+        self._forces(at, active, fresh=0)
+
+    @part("pairs")
+    def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
+        s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
+        touching, masters = s["touching"], s["masters"]
+        self._seek(at, w.u, active, settling=0)
+        for group in t.groups:
+            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], active, fresh]
+            dim = (m.worlds, group.count, group.data.points)
+            at.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
+        wp.capture_if(touching.changed, self._list, at=at)
+        for group in t.groups:
+            args = [group.data, active, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
+            at.launch(self.shared.gather_points, (m.worlds, group.count), args)
+        args = [masters, active, s["attempt"], touching, w.pool_force]
+        at.launch(self.kernels.gather_masters, (m.worlds, t.facets), args)
+
+    def _list(self, at: At) -> None:
+        """Lists of the points of each master facet."""
+        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.kernels
+        touching, masters = s["touching"], s["masters"]
+        at.launch(k.clear_lists, m.worlds * t.facets, [touching])
+        at.launch(k.count_points, (m.worlds, t.points), [masters, touching])
+        wp.utils.array_scan(touching.count, s["scan"], inclusive=True)
+        at.launch(k.place_lists, (m.worlds, t.facets), [masters, s["scan"], touching])
+        at.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
+        at.launch(k.sort_lists, (m.worlds, t.facets), [touching])
+
+    @part("pairs")
+    def refresh(self, at: At, flags: wp.array) -> None:
+        k, m, attempt = self.shared, self.model, at.scratch[self.name]["attempt"]
+        at.launch(k.partial_asked, (m.worlds, RELAX_LANES), [flags, attempt])
+        at.launch(k.relax, m.worlds, [flags, at.work.newton.tol, attempt, at.work.newton.unsettled])
+        at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
+
+    @part("pairs")
+    def product(self, at: At, p: wp.array, active: wp.array) -> None:
+        s, m, w, t, k = at.scratch[self.name], self.model, at.work, self.tables, self.kernels
+        attempt, touching, masters = s["attempt"], s["touching"], s["masters"]
+        for group in t.groups:
+            dim = (m.worlds, group.count, group.data.points)
+            at.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
+        for group in t.groups:
+            dim = (m.worlds, group.count, group.conn.shape[1])
+            at.launch(k.product_facets, dim, [group.data, active, attempt, touching, w.pool_product])
+        dim = (m.worlds, t.facets, t.master_conn.shape[1])
+        at.launch(k.product_masters, dim, [masters, active, attempt, touching, w.pool_product])
+
+    @part("pairs")
+    def diagonal(self, at: At, active: wp.array) -> None:
+        s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
+        for group in t.groups:
+            args = [group.data, active, s["attempt"], w.pool_block]
+            at.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
+        args = [s["masters"], active, s["attempt"], s["touching"], w.pool_block]
+        at.launch(self.kernels.diagonal_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
+
+    def book(self, at: At, accepted: wp.array) -> wp.array:
+        self._finish(at, accepted)
+        at.scratch[self.name]["finished"] = True
+        return at.scratch[self.name]["booked"]
+
+    @part("pairs")
+    def _finish(self, at: At, accepted: wp.array) -> None:
+        """History, books and records of an accepted substep."""
+        s, m, t = at.scratch[self.name], self.model, self.tables
+        C = len(t.contacts)
+        self._seek(at, at.work.u, accepted, settling=0)
+        for group in t.groups:
+            args = [t.data, s["masters"], group.data, s["history"], s["seats"], s["clock"], accepted]
+            args += [s["attempt"], s["touching"], s["booked"]]
+            at.launch(self.kernels.finish, (m.worlds, group.count), args)
+        args = [t.data, s["row_start"], accepted, s["attempt"], s["parts"]]
+        at.launch(self.books.partial_records, (m.worlds, C, len(RECORD), LANES), args)
+        args = [s["clock"], accepted, s["parts"], s["attempt"]]
+        at.launch(self.books.total_records, (m.worlds, C, len(RECORD)), args)
+
+    @part("pairs")
+    def commit(self, at: At, accepted: wp.array) -> None:
+        s, w = at.scratch[self.name], at.work
+        if not s["finished"]:  # without a ledger nothing is booked
+            self._finish(at, accepted)
+        args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
+        at.launch(self.kernels.close, self.model.worlds, args)
+
+    def report(self, at: At) -> None:
+        args = [at.scratch[self.name]["attempt"], self.report_offset, at.work.report]
+        at.launch(self.books.write_records, (self.model.worlds, len(self.tables.contacts)), args)
+
+    def measure(self, at: At) -> dict[str, np.ndarray]:
+        """Energy that the history says is stored, by points."""
+        weights = np.concatenate([share.ravel() for share in self.tables.shares])
+        return {"contact": at.scratch[self.name]["history"].stored.numpy() @ weights}
+
+    # in a linear solve
+
+    def keep(self, at: At) -> list[tuple[str, wp.array]]:
+        s = at.scratch[self.name]
+        t = s["touching"]
+        arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight}
+        return [("stiffness", s["attempt"].stiffness), *arrays.items()]
+
+    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
+        if "pair blocks" not in self.model.cache:
+            conns = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
+            self.model.cache["pair blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
+
+    def blocks(
+        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        *, projected: bool,
+    ) -> None:  # fmt: skip
+        """The points' stiffness on their own facets and on master facets; not what couples both."""
+        m, t = self.model, self.tables
+        stiffness, points, start, entry, weight = kept
+        *slaves, masters = m.cache["pair blocks"]
+        add = contact_block_kernels(m.dtype).add_contact
+        for group, (index, begin, source, count) in zip(t.groups, slaves):
+            args = [m.topology, matrix.pattern.data, group.data, index, begin, source, stiffness, weight]
+            at.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
+        index, begin, source, count = masters
+        args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, points, start, entry]
+        add = pair_block_kernels(m.dtype).add_masters
+        at.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
+
+    def block_modules(self) -> set[wp.Module]:
+        dtype = self.model.dtype
+        return {contact_block_kernels(dtype).module, pair_block_kernels(dtype).module}
+
+    # results
+
+    def explain(self, at: At, world: int) -> tuple[type[PenetrationError], str] | None:
+        found = int(at.scratch[self.name]["attempt"].through.numpy()[world])
+        if found == 0 or int(at.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
+            return None
+        t = self.tables
+        k = int(np.searchsorted(t.first, found - 1, side="right")) - 1
+        contact = t.contacts[k]
+        return PenetrationError, (
+            f"contact {contact.name!r}: a point of body {contact.slave.body.name!r} (reference place "
+            f"{self._where(k, found - 1 - int(t.first[k]))}) went through body {contact.master.body.name!r}; take a "
+            "smaller dt, a larger stiffness= of the contact, or a thicker body"
+        )
+
+    def remark(self, at: At, world: int) -> str:
+        touched = at.scratch[self.name]["attempt"].touched.numpy()[world] > 0
+        t = self.tables
+        names = [repr(c.name) for k, c in enumerate(t.contacts) if touched[t.row_start[k] : t.row_start[k + 1]].any()]
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        return f"; in touch: contact {', '.join(names[:3])}{more}" if names else ""
+
+    def facts(self) -> list[dict[str, Any]]:
+        """Of each contact, in the order they were added, what `Model.info` tells."""
+        t, out = self.tables, []
+        for contact in self.model.description.pairs:
+            k = t.number[contact.index]
+            names = {"name": contact.name, "body": contact.first.body.name, "with": contact.second.body.name}
+            numbers = {"points": int((t.shares[k] > 0.0).sum()), "facets": len(t.masters[t.of[k]].conn), "left_out": 0}
+            out.append(names | {"law": contact.law, "model": contact.model} | numbers)
+        return out
