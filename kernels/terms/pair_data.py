@@ -80,7 +80,8 @@ def touching_struct(dtype: str):
         calm_upper: wp.array2d(dtype=wp.vec3)
         calm: wp.array2d(dtype=wp.int32)
         x0: wp.array2d(dtype=wp.vec3d)  # [world, point] place as the attempt began
-        spot0: wp.array2d(dtype=wp.vec3d)  # of points in contact then
+        first: wp.array2d(dtype=wp.int32)  # facet + 1 from which its motion is measured, 0: none yet
+        spot0: wp.array2d(dtype=wp.vec3d)  # where it was on that
         stretch: wp.array2d(dtype=wp.float64)  # gap over the coordinate along the outward vector, held in an attempt
         seat: wp.array2d(dtype=wp.int32)  # master facet at the iterate, -1: none; -2: went through
         spot: wp.array2d(dtype=wp.vec3d)
@@ -90,6 +91,11 @@ def touching_struct(dtype: str):
         motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material
         whole: wp.array2d(dtype=wp.vec3d)  # that and the friction spring
         weight: wp.array3d(dtype=T)  # [world, point, local] functions of the master's slots
+        held_weight: wp.array3d(dtype=T)  # functions that friction acts by, held with its cap
+        held_whole: wp.array2d(dtype=wp.vec3d)  # motion and spring when they were taken, and the relative displacement by them
+        held_shift: wp.array2d(dtype=wp.vec3d)
+        held_facet: wp.array2d(dtype=wp.int32)
+        friction: wp.array2d(dtype=wp.vec3d)  # part of a point's force that acts by them, N
         listed: wp.array2d(dtype=wp.int32)  # [world, point] facet + 1 whose list it is in
         changed: wp.array(dtype=wp.int32)  # a point belongs into another list
         count: wp.array(dtype=wp.int32)  # [world facet] of lists in the making

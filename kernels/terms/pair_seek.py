@@ -131,6 +131,30 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         foot = vec3d(spot[0], spot[1], f64(0.0))
         return wp.dot(n, moved(mas, t.V0, t.V0, world, f, foot) - along(facets, v, world, q, item))
 
+    @wp.func
+    def anchor(
+        mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock, at: Attempt, t: Touching,
+        v_n: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int, f: int, guess: vec3d,
+    ):  # fmt: skip
+        """Measure the motion of a point from a facet: its place on it as the attempt began, depth and speed then."""
+        found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], guess)
+        spot = vec3d(found[0], found[1], found[2])
+        live = his.speed[world, point] > f64(0.0)
+        if found[3] == f64(0.0):
+            if not live:
+                return
+            spot = guess
+        s = jet(mas, t.C0, t.D0, world, f, spot)
+        n = outward(s)
+        t.first[world, point] = f + 1
+        t.spot0[world, point] = spot
+        t.stretch[world, point] = wp.dot(n, s.c)
+        at.depth[world, point] = at.reach[world, point] - spot[2] * wp.dot(n, s.c)
+        speed = wp.max(his.speed[world, point], f64(SPEED_FLOOR))
+        if clock.still == 0:
+            speed = wp.max(speed, approach(mas, facets, t, v_n, world, q, item, f, spot, n))
+        at.speed[world, point] = speed
+
     @wp.kernel(module=module)
     def begin_points(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
@@ -156,22 +180,11 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         at.origin[world, point] = shift
         at.depth[world, point] = f64(-1.0e30)
         at.speed[world, point] = f64(SPEED_FLOOR)
+        t.first[world, point] = 0
         at.reach[world, point] = reach(con, his, world, c, point, clock.time[world], f64(0.0))
         if his.speed[world, point] > f64(0.0):
-            f = seats.seat[world, point] - 1
-            found = locate(mas, t.C0, t.D0, world, f, x, seats.spot[world, point])
-            spot = vec3d(found[0], found[1], found[2])
-            if found[3] == f64(0.0):
-                spot = seats.spot[world, point]
-            s = jet(mas, t.C0, t.D0, world, f, spot)
-            n = outward(s)
-            t.spot0[world, point] = spot
-            t.stretch[world, point] = wp.dot(n, s.c)
-            at.depth[world, point] = at.reach[world, point] - spot[2] * wp.dot(n, s.c)
-            speed = wp.max(his.speed[world, point], f64(SPEED_FLOOR))
-            if clock.still == 0:
-                speed = wp.max(speed, approach(mas, facets, t, v_n, world, q, item, f, spot, n))
-            at.speed[world, point] = speed
+            anchor(mas, facets, his, seats, clock, at, t, v_n, world, q, item, point, seats.seat[world, point] - 1,
+                   seats.spot[world, point])  # fmt: skip
 
     @wp.kernel(module=module)
     def look_around(
@@ -243,7 +256,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     def sit(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock, at: Attempt, t: Touching,
         v_n: wp.array2d(dtype=vec3), world: int, c: int, q: int, item: int, point: int, f: int, spot: vec3d,
-        shift: vec3d, live: bool,
+        shift: vec3d, settling: int,
     ):  # fmt: skip
         """What a point at a place of a facet has: depth, that as the attempt began, normal, motion."""
         s = jet(mas, t.C, t.D, world, f, spot)
@@ -254,31 +267,28 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         t.spot[world, point] = spot
         stretch = rise
         t.depth[world, point] = now - spot[2] * rise
-        if live:
-            first = seats.seat[world, point] - 1
+        if t.first[world, point] == 0 and settling == 0:
+            anchor(mas, facets, his, seats, clock, at, t, v_n, world, q, item, point, f, spot)
+        motion = shift - at.origin[world, point]
+        spring = vec3d()
+        if t.first[world, point] > 0:
+            first = t.first[world, point] - 1
             from0 = t.spot0[world, point]
-            motion = shift - at.origin[world, point]
             motion -= moved(mas, t.C, t.D, world, first, from0) - moved(mas, t.C0, t.D0, world, first, from0)
             if f == first:
                 stretch = t.stretch[world, point]
                 change = (now - at.reach[world, point]) - stretch * (spot[2] - from0[2])
                 t.depth[world, point] = at.depth[world, point] + change
             t.before[world, point] = at.depth[world, point]
-            spring = his.spring[world, point]
-            if con.law[c] != PAPER:
-                spring = frame(jet(mas, t.C, t.D, world, first, from0)) * spring
-            t.motion[world, point] = motion
-            t.whole[world, point] = spring + motion
+            if his.speed[world, point] > f64(0.0):
+                spring = his.spring[world, point]
+                if con.law[c] != PAPER:
+                    spring = frame(jet(mas, t.C, t.D, world, first, from0)) * spring
         else:
-            motion = shift - at.origin[world, point]
             motion -= moved(mas, t.C, t.D, world, f, spot) - moved(mas, t.C0, t.D0, world, f, spot)
             t.before[world, point] = t.depth[world, point] + wp.dot(n, motion) - (now - at.reach[world, point])
-            speed = f64(SPEED_FLOOR)
-            if clock.still == 0:
-                speed = wp.max(speed, approach(mas, facets, t, v_n, world, q, item, f, spot, n))
-            at.speed[world, point] = speed
-            t.motion[world, point] = motion
-            t.whole[world, point] = motion
+        t.motion[world, point] = motion
+        t.whole[world, point] = spring + motion
         t.normal[world, point] = (stretch / rise) * n
 
     @wp.kernel(module=module)
@@ -308,12 +318,15 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         height = f64(1.0e300)
         facing = vec3d()
         pad = wp.max(con.offset[c], f64(0.0)) + f64(1.0e-6) * wp.length(x)
-        if live:
-            f = seats.seat[world, point] - 1
+        anchored = t.first[world, point] > 0
+        if anchored:
+            f = t.first[world, point] - 1
             from0 = t.spot0[world, point]
             motion = shift - at.origin[world, point]
             motion -= moved(mas, t.C, t.D, world, f, from0) - moved(mas, t.C0, t.D0, world, f, from0)
             found = follow(mas, t.C, t.D, world, f, from0, motion)
+            if found[3] == f64(0.0):
+                found = locate(mas, t.C, t.D, world, f, x, middle(mas.corners[mas.kind[f]]))
             facing = outward(jet(mas, t.C, t.D, world, f, from0))
             spot = vec3d(found[0], found[1], found[2])
             o = outside(mas.corners[mas.kind[f]], spot)
@@ -343,7 +356,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     n = outward(s)
                     gap = spot[2] * wp.dot(n, s.c)
                     fits = -gap <= mas.limit[f]
-                    if live:
+                    if anchored:
                         fits = fits and wp.dot(n, facing) > f64(0.0)
                     elif settling == 0:
                         foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
@@ -354,10 +367,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                         place = spot
                         off = o
                         height = wp.abs(spot[2])
-                if not live and settling == 0 and crosses(mas, t, world, f, x, x0):
+                if not anchored and settling == 0 and crosses(mas, t, world, f, x, x0):
                     through = True
         if best >= 0:
-            sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, live)
+            sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, settling)
             if t.depth[world, point] > mas.limit[best]:
                 t.seat[world, point] = THROUGH
         elif through:

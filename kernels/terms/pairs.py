@@ -95,12 +95,40 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         at.dead_spring[world, point] = stretch
         at.dead[world, point] = force * n + pulled
 
+    @wp.func
+    def relative(
+        mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int,
+        f: int,
+    ) -> vec3d:  # fmt: skip
+        """Displacement of a point relative to the held functions of a facet."""
+        out = k.along(facets, u, world, q, item)
+        for i in range(mas.conn.shape[0]):
+            out -= f64(t.held_weight[world, point, i]) * vec3d(u[world, mas.conn[i, f]])
+        return out
+
+    @wp.kernel(module=module)
+    def take_functions(
+        mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3), flags: wp.array(dtype=wp.int32), at: Attempt,
+        t: Touching,
+    ):  # fmt: skip
+        """Friction acts by the functions of the iterate from now on."""
+        world, item, q = wp.tid()
+        point = facets.point + item * facets.points + q
+        if flags[world] == 0 or at.state[world, point] != STIFF:
+            return
+        f = t.seat[world, point]
+        for i in range(mas.conn.shape[0]):
+            t.held_weight[world, point, i] = t.weight[world, point, i]
+        t.held_whole[world, point] = t.whole[world, point]
+        t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
+        t.held_facet[world, point] = f
+
     @wp.kernel(module=module)
     def forces(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
+        u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
     ):  # fmt: skip
-        """Forces on points, their stiffness and potential; caps are held as with obstacles."""
+        """Forces on points, their stiffness and potential; caps, and the functions that friction acts by, are held."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
@@ -116,12 +144,14 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 at.force[world, point] = -share * at.dead[world, point]
                 at.energy[world, point] = wp.vec2d(work, wp.abs(work))
                 f = seats.seat[world, point] - 1
+                t.friction[world, point] = vec3d()
                 for i in range(mas.conn.shape[0]):
                     t.weight[world, point, i] = T(weigh(mas, f, i, t.spot0[world, point]))
         elif f == THROUGH:
             at.through[world] = point + 1
             at.state[world, point] = LOADED
             at.force[world, point] = vec3d()
+            t.friction[world, point] = vec3d()
             at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
             f = -1
         elif f >= 0 and share > f64(0.0):
@@ -144,17 +174,31 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             if wp.dot(m, s.m) <= f64(0.5):  # it has passed to another facet since
                 m = s.m
                 at.plane[world, point] = m
+            for i in range(mas.conn.shape[0]):
+                w = weigh(mas, f, i, t.spot[world, point])
+                t.weight[world, point, i] = T(w)
+                if fresh != 0 or held[0] <= f64(0.0):
+                    t.held_weight[world, point, i] = T(w)
+            if fresh != 0:
+                t.held_whole[world, point] = s.whole
+                t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
+                t.held_facet[world, point] = f
+            if held[0] > f64(0.0):  # by functions that are held, it has a potential
+                shift = relative(mas, facets, t, u, world, q, item, point, t.held_facet[world, point])
+                s.motion = s.motion - s.whole
+                s.whole = t.held_whole[world, point] + (shift - t.held_shift[world, point])
+                s.motion += s.whole
             s = in_plane(s, m)
             if s.depth > f64(0.0) or held[0] > f64(0.0):
                 rub = friction_potential(con, world, c, s, held, inv_h)
                 K = point_stiffness(con, world, c, s, held, inv_h)
+                pulled = share * friction_force(con, world, c, s, held, inv_h)
                 at.state[world, point] = STIFF
-                at.force[world, point] = share * (friction_force(con, world, c, s, held, inv_h) - s.law[0] * s.n)
+                t.friction[world, point] = pulled
+                at.force[world, point] = pulled - (share * s.law[0]) * s.n
                 at.energy[world, point] = wp.vec2d(share * (s.law[2] + rub), share * (s.law[3] + wp.abs(rub)))
                 at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),
                     T(share * K[1, 2]), T(share * K[0, 2]), T(share * K[0, 1]))  # fmt: skip
-                for i in range(mas.conn.shape[0]):
-                    t.weight[world, point, i] = T(weigh(mas, f, i, t.spot[world, point]))
         elif share > f64(0.0):
             held = vec3d()
             at.next[world, point] = held
@@ -236,7 +280,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             total = vec3()
             for k in range(count):
                 point = t.entry[world, t.start[world, f] + k]
-                total -= t.weight[world, point, i] * vec3(at.force[world, point])
+                rest = at.force[world, point] - t.friction[world, point]
+                total -= t.weight[world, point, i] * vec3(rest) + t.held_weight[world, point, i] * vec3(t.friction[world, point])
             pool[world, mas.pool + i * mas.count + f] = total
 
     @wp.func
@@ -450,7 +495,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         potential[world] = potential[world] + term_sums[1, world]
 
     return _types.SimpleNamespace(
-        module=module, explicit_forces=explicit_forces, forces=forces, clear_lists=clear_lists,
+        module=module, explicit_forces=explicit_forces, forces=forces, take_functions=take_functions, clear_lists=clear_lists,
         count_points=count_points, place_lists=place_lists, fill_lists=fill_lists, sort_lists=sort_lists,
         gather_masters=gather_masters, product_points=product_points, product_facets=product_facets,
         product_masters=product_masters, diagonal_masters=diagonal_masters, finish=finish, close=close,

@@ -66,6 +66,9 @@ class Pairs(Term):
         """Bodies that may touch are one component."""
         return self.tables.slots
 
+    def hold(self, free: np.ndarray) -> None:
+        """Nothing: the forces of a pair are in balance at any translation of both."""
+
     def build(self, laws: TimeLaws) -> None:
         self.tables.build(self.offset)
         self.connectivity = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
@@ -103,7 +106,7 @@ class Pairs(Term):
         shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
         shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
         shapes |= dict.fromkeys(("points", "start", "loaded"), (B, F))
-        shapes |= {"weight": (B, P, t.master_conn.shape[1])}
+        shapes |= dict.fromkeys(("weight", "held_weight"), (B, P, t.master_conn.shape[1]))
         out = touching_struct(self.model.dtype)()
         for name, var in touching_struct(self.model.dtype).vars.items():
             setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))
@@ -261,7 +264,7 @@ class Pairs(Term):
         touching, masters = s["touching"], s["masters"]
         self._seek(at, w.u, active, settling=0)
         for group in t.groups:
-            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], active, fresh]
+            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], w.u, active, fresh]
             dim = (m.worlds, group.count, group.data.points)
             at.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
         wp.capture_if(touching.changed, self._list, at=at)
@@ -288,6 +291,10 @@ class Pairs(Term):
         at.launch(k.partial_asked, (m.worlds, RELAX_LANES), [flags, attempt])
         at.launch(k.relax, m.worlds, [flags, at.work.newton.tol, attempt, at.work.newton.unsettled])
         at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
+        s = at.scratch[self.name]
+        for group in self.tables.groups:
+            args = [s["masters"], group.data, at.work.u, flags, attempt, s["touching"]]
+            at.launch(self.kernels.take_functions, (m.worlds, group.count, group.data.points), args)
 
     @part("pairs")
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
