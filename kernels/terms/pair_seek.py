@@ -275,10 +275,9 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             first = t.first[world, point] - 1
             from0 = t.spot0[world, point]
             motion -= moved(mas, t.C, t.D, world, first, from0) - moved(mas, t.C0, t.D0, world, first, from0)
-            if f == first:
-                stretch = t.stretch[world, point]
-                change = (now - at.reach[world, point]) - stretch * (spot[2] - from0[2])
-                t.depth[world, point] = at.depth[world, point] + change
+            stretch = t.stretch[world, point]  # of other facets too: it must not vary with the iterate
+            change = (now - at.reach[world, point]) - stretch * (spot[2] - from0[2])
+            t.depth[world, point] = at.depth[world, point] + change
             t.before[world, point] = at.depth[world, point]
             if his.speed[world, point] > f64(0.0):
                 spring = his.spring[world, point]
