@@ -92,6 +92,7 @@ def touching_struct(dtype: str):
         whole: wp.array2d(dtype=wp.vec3d)  # that and the friction spring
         weight: wp.array3d(dtype=T)  # [world, point, local] functions of the master's slots
         held_weight: wp.array3d(dtype=T)  # functions that friction acts by, held with its cap
+        held_motion: wp.array2d(dtype=wp.vec3d)
         held_whole: wp.array2d(dtype=wp.vec3d)  # motion and spring when they were taken, and the relative displacement by them
         held_shift: wp.array2d(dtype=wp.vec3d)
         held_facet: wp.array2d(dtype=wp.int32)

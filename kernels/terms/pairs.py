@@ -119,6 +119,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         f = t.seat[world, point]
         for i in range(mas.conn.shape[0]):
             t.held_weight[world, point, i] = t.weight[world, point, i]
+        t.held_motion[world, point] = t.motion[world, point]
         t.held_whole[world, point] = t.whole[world, point]
         t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
         t.held_facet[world, point] = f
@@ -180,14 +181,14 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 if fresh != 0 or held[0] <= f64(0.0):
                     t.held_weight[world, point, i] = T(w)
             if fresh != 0:
+                t.held_motion[world, point] = s.motion
                 t.held_whole[world, point] = s.whole
                 t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
                 t.held_facet[world, point] = f
             if held[0] > f64(0.0):  # by functions that are held, it has a potential
                 shift = relative(mas, facets, t, u, world, q, item, point, t.held_facet[world, point])
-                s.motion = s.motion - s.whole
+                s.motion = t.held_motion[world, point] + (shift - t.held_shift[world, point])
                 s.whole = t.held_whole[world, point] + (shift - t.held_shift[world, point])
-                s.motion += s.whole
             s = in_plane(s, m)
             if s.depth > f64(0.0) or held[0] > f64(0.0):
                 rub = friction_potential(con, world, c, s, held, inv_h)
