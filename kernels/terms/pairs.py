@@ -97,7 +97,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def relative(
-        mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int,
+        mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int, point: int,
         f: int,
     ) -> vec3d:  # fmt: skip
         """Displacement of a point relative to the held functions of a facet."""
@@ -108,7 +108,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def take_functions(
-        mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3), flags: wp.array(dtype=wp.int32), at: Attempt,
+        mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), flags: wp.array(dtype=wp.int32), at: Attempt,
         t: Touching,
     ):  # fmt: skip
         """Friction acts by the functions of the iterate from now on."""
@@ -127,7 +127,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def forces(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
+        u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
     ):  # fmt: skip
         """Forces on points, their stiffness and potential; caps, and the functions that friction acts by, are held."""
         world, item, q = wp.tid()

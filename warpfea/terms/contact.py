@@ -17,7 +17,7 @@ from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, h
 from ..model.state import State
 from .contact_exact import Exact
 from .contact_fields import contact_field, nodal_force
-from .contact_parameters import contact_parameters
+from .contact_parameters import collider_parameters, contact_parameters
 from .contact_places import Places, at_points
 from .contact_tables import ContactTables, block_entries
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
@@ -133,7 +133,7 @@ class Contact(Term):
             "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
-            "u": self.exact.allocate(work) if self.exact else work.u,
+            "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
@@ -374,7 +374,7 @@ class Contact(Term):
         return f"; in touch: contact {', '.join(pairs[:3])}{more}" if pairs else ""
 
     def parameters(self) -> dict[str, Callable[[Any], None]]:
-        return contact_parameters(self.tables)
+        return contact_parameters(self.tables) | collider_parameters(self.tables)
 
     def facts(self) -> list[dict[str, Any]]:
         """Of each contact, in the order they were added, what `Model.info` tells: with the points that count, and those

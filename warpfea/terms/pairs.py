@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +20,8 @@ from ..kernels.terms.pair_seek import seek_kernels
 from ..kernels.terms.pairs import pair_kernels
 from ..model.pairs import bernstein
 from .contact import TOUCHING
+from .contact_exact import Exact
+from .contact_parameters import contact_parameters
 from .contact_tables import block_entries
 from .pair_tables import PairTables
 from .term import LOSS, STORED, At, Column, Term, part
@@ -72,6 +74,7 @@ class Pairs(Term):
     def build(self, laws: TimeLaws) -> None:
         self.tables.build(self.offset)
         self.connectivity = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
+        self.exact = Exact(self.model, self.connectivity) if self.model.dtype == "float32" else None
         self.rows = self.booked_rows = self.tables.rows
 
     def hash(self, h: Any) -> None:
@@ -133,6 +136,7 @@ class Pairs(Term):
             "parts": work.array("pairs parts", (B, C, len(RECORD), LANES), wp.float64),
             "scan": work.array("pairs scan", (B * t.facets,), wp.int32),
             "row_start": m.array("contact", t.row_start, wp.int32),
+            "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
@@ -164,7 +168,8 @@ class Pairs(Term):
         at.scratch[self.name] = {"history": history, "seats": seats}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
-        return [self.shared.module, self.seek.module, self.kernels.module]
+        exact = [self.exact.kernels.module] if self.exact else []
+        return [self.shared.module, self.seek.module, self.kernels.module, *exact]
 
     def start(self, at: At, active: wp.array) -> None:
         """What overlaps at the state.
@@ -184,11 +189,15 @@ class Pairs(Term):
         history.overlap.assign(overlap)
         history.born.assign(born)
         self._begin(at, flags)
-        self._seek(at, at.state.displacement, flags, settling=1)
+        u = at.state.displacement
+        if self.exact:
+            u = s["u"]
+            self.exact.widen(at.launch, at.state.displacement, flags, u)
+        self._seek(at, u, flags, settling=1)
         seat = s["touching"].seat.numpy()
         depth = np.where((seat >= 0) & new[:, None], s["touching"].depth.numpy(), 0.0)
-        u = at.state.displacement.numpy()
-        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
+        u_n = at.state.displacement.numpy()
+        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u_n.dtype).eps * np.abs(u_n).max(axis=(1, 2))
         for k, contact in enumerate(t.contacts):
             first, last = t.first[k], t.first[k + 1]
             part_of = depth[:, first:last]
@@ -223,8 +232,7 @@ class Pairs(Term):
         touching, masters = s["touching"], s["masters"]
         u, v = at.state.displacement, at.state.velocity
         dim = (m.worlds, t.facets, masters.most)
-        at.launch(self.seek.controls, dim, [masters, v, active, touching.V0, touching.D0])
-        at.launch(self.seek.controls, dim, [masters, u, active, touching.C0, touching.D0])
+        at.launch(self.seek.controls_before, dim, [masters, u, v, active, touching])
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"]]
             dim = (m.worlds, group.count, group.data.points)
@@ -262,9 +270,11 @@ class Pairs(Term):
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
         touching, masters = s["touching"], s["masters"]
-        self._seek(at, w.u, active, settling=0)
+        if self.exact:
+            self.exact.follow(at, s["u"], active)
+        self._seek(at, s["u"], active, settling=0)
         for group in t.groups:
-            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], w.u, active, fresh]
+            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], s["u"], active, fresh]
             dim = (m.worlds, group.count, group.data.points)
             at.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
         wp.capture_if(touching.changed, self._list, at=at)
@@ -293,7 +303,7 @@ class Pairs(Term):
         at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
         s = at.scratch[self.name]
         for group in self.tables.groups:
-            args = [s["masters"], group.data, at.work.u, flags, attempt, s["touching"]]
+            args = [s["masters"], group.data, s["u"], flags, attempt, s["touching"]]
             at.launch(self.kernels.take_functions, (m.worlds, group.count, group.data.points), args)
 
     @part("pairs")
@@ -328,7 +338,7 @@ class Pairs(Term):
         """History, books and records of an accepted substep."""
         s, m, t = at.scratch[self.name], self.model, self.tables
         C = len(t.contacts)
-        self._seek(at, at.work.u, accepted, settling=0)
+        self._seek(at, s["u"], accepted, settling=0)
         for group in t.groups:
             args = [t.data, s["masters"], group.data, s["history"], s["seats"], s["clock"], accepted]
             args += [s["attempt"], s["touching"], s["booked"]]
@@ -410,6 +420,9 @@ class Pairs(Term):
         names = [repr(c.name) for k, c in enumerate(t.contacts) if touched[t.row_start[k] : t.row_start[k + 1]].any()]
         more = f" and {len(names) - 3} more" if len(names) > 3 else ""
         return f"; in touch: contact {', '.join(names[:3])}{more}" if names else ""
+
+    def parameters(self) -> dict[str, Callable[[Any], None]]:
+        return contact_parameters(self.tables)
 
     def facts(self) -> list[dict[str, Any]]:
         """Of each contact, in the order they were added, what `Model.info` tells."""
