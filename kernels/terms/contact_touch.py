@@ -6,25 +6,22 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
+from .contact_colliders import collider_functions
 from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
-from .contact_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
 
-__all__ = ["SLIPS", "touch_functions"]
-
-SLIPS = 16
-"""Of a point's mark: it slips; below are the sides."""
+__all__ = ["touch_functions"]
 
 
 @functools.cache
-def touch_functions(dtype: str) -> _types.SimpleNamespace:
-    """Device functions in one precision of the displacements; all but these is float64."""
+def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+    """Device functions in one precision of the displacements; all but these is float64. `meshes`: a collider is one."""
     T, vec3 = precision(dtype).T, precision(dtype).vec3
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
-    Contacts, Facets = contact_struct(), facet_struct(dtype)
+    Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, Attempt = history_struct(), attempt_struct(dtype)
-    shapes, laws = shape_functions(), law_functions()
-    distance, sweep = shapes.distance, shapes.sweep
+    colliders, laws = collider_functions(meshes), law_functions()
+    distance, sweep, deepening, SLIPS = colliders.distance, colliders.sweep, colliders.deepening, colliders.SLIPS
     normal_law, friction, smooth_friction = laws.normal_law, laws.friction, laws.smooth_friction
 
     @wp.struct
@@ -117,31 +114,6 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return con.offset[c] + grown - allowance(con, his, world, c, point, time)
 
     @wp.func
-    def deepening(con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, depth: f64) -> wp.vec2d:
-        """Change of the depth by a motion, from the motion itself where that is exact, and 1; else 0.
-
-        As a difference of places it would be rounded as those are, by more than a stiff body at rest moves.
-        """
-        kind = con.kind[k]
-        if kind == HALF_SPACE:
-            return wp.vec2d(-local[2], f64(1.0))
-        if kind == SPHERE:
-            return wp.vec2d(
-                -wp.dot(y + start, local) / wp.max(wp.length(y) + wp.length(start), f64(1.0e-300)), f64(1.0)
-            )
-        if kind == BOX and side >= 0:
-            h = con.size[k]
-            axis = side / 2
-            sign = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
-            flat = wp.abs(h[axis] - sign * start[axis] - depth) <= f64(1.0e-12) * h[axis]
-            for j in range(3):
-                if j != axis and wp.abs(start[j]) > h[j]:
-                    flat = False
-            if flat:
-                return wp.vec2d(-sign * local[axis], f64(1.0))
-        return wp.vec2d()
-
-    @wp.func
     def depth_before(con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, point: int) -> f64:
         """Depth as the step began: of a live contact whose place moves, of the deepest place then."""
         if facets.moving != 0:
@@ -189,8 +161,8 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         live = his.speed[world, rec] > f64(0.0)
         if live:
             side = his.mark[world, rec] % SLIPS - 1
-        out.side = sweep(con.kind[k], con.size[k], at.start[world, point], out.y, side)
-        d = distance(con.kind[k], con.size[k], out.y, out.side)
+        out.side = sweep(con, k, at.start[world, point], out.y, side)
+        d = distance(con, k, out.y, out.side)
         out.n = turn * vec3d(d[0], d[1], d[2])
         shape = con.grow[world, k]
         out.depth = reach(con, his, world, c, point, time, shape) - d[3]
@@ -199,7 +171,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
             motion -= at.spin[world, k] * (his.turn[world, k] * at.start[world, point])
         before = at.depth[world, point]
         change = deepening(con, k, out.side, at.start[world, point], out.y, wp.transpose(turn) * motion,
-                           before - at.reach[world, point])  # fmt: skip
+                           at.reach[world, point] - before, d[3])  # fmt: skip
         if change[1] != f64(0.0):
             out.depth = before + change[0] + (reach(con, his, world, c, point, time, shape) - at.reach[world, point])
         rate = rate_of(con, at, world, c, point, inv_h)

@@ -15,6 +15,7 @@ from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
+from ..model.triangle_mesh import TriMesh
 from .contact_fields import contact_field, nodal_force
 from .contact_parameters import contact_parameters
 from .contact_places import Places, at_points
@@ -57,7 +58,8 @@ class Contact(Term):
         super().__init__(model)
         self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
-        self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        meshes = self.tables.meshes
+        self.kernels, self.books = contact_kernels(model.dtype, meshes), book_kernels(model.dtype, meshes)
         self.places = Places(self.tables) if self.tables.lumped else None
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
@@ -393,6 +395,8 @@ class Contact(Term):
             k = t.number[contact.index]
             facts = {"name": contact.name, "body": contact.body.name, "collider": contact.collider.name}
             numbers = {"points": int((t.shares[k] > 0.0).sum()), "left_out": t.left_out[k]}
+            if isinstance(contact.collider.shape, TriMesh):
+                numbers["triangles"] = len(contact.collider.shape.triangles)
             out.append(facts | {"law": contact.law, "model": contact.model} | numbers)
         return out
 

@@ -22,6 +22,8 @@ from ..model.contact_points import (
     lagrange_basis,
 )
 from ..model.contacts import Collider, Contact
+from ..model.triangle_mesh import TriMesh
+from .collider_meshes import mesh_tables
 from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
@@ -127,6 +129,11 @@ class ContactTables:
         return any(group.data.moving for group in self.groups)
 
     @property
+    def meshes(self) -> bool:
+        """Whether a collider is a mesh of triangles."""
+        return any(isinstance(collider.shape, TriMesh) for collider in self.colliders)
+
+    @property
     def explicit(self) -> bool:
         """Whether a contact has the force of the last state."""
         return any(contact.treatment == "explicit" for contact in self.contacts)
@@ -203,7 +210,7 @@ class ContactTables:
 
     def _contacts(self, laws: TimeLaws) -> Any:
         m, C, K = self.model, self.contacts, self.colliders
-        out = contact_struct()()
+        out = contact_struct(self.meshes)()
 
         def put(name: str, values: Any, dtype: Any) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
@@ -237,6 +244,8 @@ class ContactTables:
         put("spin", [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K], wp.int32)
         put("anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)
         put("axis", [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K], wp.vec3d)
+        if self.meshes:
+            out.mesh = mesh_tables(m, [k.shape for k in K])
         return out
 
     def hash(self, h: Any) -> None:
@@ -245,6 +254,8 @@ class ContactTables:
             center, axes = collider.shape.frame()
             h.update(f"{collider.name} {collider.shape.kind}".encode())
             h.update(np.concatenate([collider.shape.sizes, center, axes.ravel()]).tobytes())
+            if isinstance(collider.shape, TriMesh):
+                h.update(collider.shape.points.tobytes() + collider.shape.triangles.tobytes())
             if collider.rotation is not None:
                 h.update(np.concatenate([collider.rotation.anchor, collider.rotation.axis]).tobytes())
         for contact, p in zip(self.contacts, self.host):
