@@ -61,8 +61,8 @@ from .model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noq
 from .model.joints import Joint  # noqa: E402
 from .model.model import Model  # noqa: E402
 from .model.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere  # noqa: E402
-from .model.triangle_mesh import TriMesh  # noqa: E402
 from .model.state import State  # noqa: E402
+from .model.triangle_mesh import TriMesh  # noqa: E402
 from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402

@@ -53,7 +53,7 @@ def mesh_struct():
 
 @functools.cache
 def mesh_functions(Contacts) -> _types.SimpleNamespace:
-    """Device functions for contacts of a struct with `mesh`; `size` holds the mesh's size, its thickness, 1 if closed."""
+    """Device functions for contacts of a struct with `mesh`; `size`: the mesh's size, its thickness, 1 if closed."""
     f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
     ints = wp.types.vector(length=STACK, dtype=wp.int32)
 
@@ -75,7 +75,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def closest_on(a: vec3d, b: vec3d, c: vec3d, n: vec3d, y: vec3d) -> vec4d:
-        """The place of a triangle that is nearest to y, and its part (Ericson, Real-Time Collision Detection, 5.1.5)."""
+        """The place of a triangle nearest to y, and its part (Ericson, Real-Time Collision Detection, 2005, 5.1.5)."""
         zero = f64(0.0)
         ab = b - a
         ac = c - a
@@ -324,7 +324,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
     def deepening(
         con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
     ) -> wp.vec2d:  # fmt: skip
-        """Change of the depth by a motion along one plane of the mesh, and 1; else 0; with the distances of its ends."""
+        """Change of the depth by a motion along one plane, and 1; else 0. Last the distances of its ends."""
         if side < 0:
             return wp.vec2d()
         n = sense_of(side) * con.mesh.normal[0, side / 2]

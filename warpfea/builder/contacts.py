@@ -89,8 +89,8 @@ def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: 
     o = _checked(f"contact {name!r}", surface, dict(options))
     if o["model"] == "sphere" and isinstance(collider.shape, TriMesh) and not collider.shape.closed:
         raise ModelError(
-            f"contact {name!r}: collider {collider.name!r} is a sheet of triangles, and model = 'sphere' needs an obstacle "
-            "with an inside: take model = 'patch', or a closed mesh"
+            f"contact {name!r}: collider {collider.name!r} is a sheet of triangles, and model = 'sphere' needs an "
+            "obstacle with an inside: take model = 'patch', or a closed mesh"
         )
     return Contact(surface, collider, name, index=len(d.contacts), **o)
 

@@ -60,9 +60,9 @@ class TriMesh(Shape):
         scale: m per unit of the points.
 
     Raises:
-        ModelError: a file that can't be read, no triangles, a triangle without an area, a point number out of range or a
-            value that is not finite; an edge of more than two triangles, or run through twice in one direction, or where
-            the surface folds back on itself; a closed mesh that is inside out.
+        ModelError: a file that can't be read, no triangles, a triangle without an area, a point number out of range or
+            a value that is not finite; an edge of more than two triangles, or run through twice in one direction, or
+            where the surface folds back on itself; a closed mesh that is inside out.
     """
 
     points: Any
@@ -266,7 +266,5 @@ def _triangles(values: Any, points: np.ndarray) -> np.ndarray:
     longest = np.einsum("tki,tki->tk", edges, edges).max(axis=1)
     flat = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) <= NEEDLE * longest
     for k in np.flatnonzero(flat)[:1]:
-        raise ModelError(
-            f"TriMesh: triangle {k} = {out[k].tolist()} has no area ({int(flat.sum())} such); leave it out"
-        )
+        raise ModelError(f"TriMesh: triangle {k} = {out[k].tolist()} has no area ({int(flat.sum())} such)")
     return out.astype(np.int64)
