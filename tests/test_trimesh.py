@@ -2,16 +2,15 @@
 
 import functools
 import math
-import re
 
 import numpy as np
 import pytest
 import warp as wp
+from warpfea.kernels.terms.contact_colliders import collider_functions
+from warpfea.kernels.terms.contact_data import contact_struct
 
 import warpfea as wf
 from warpfea.base.launch import Launcher
-from warpfea.kernels.terms.contact_colliders import collider_functions
-from warpfea.kernels.terms.contact_data import contact_struct
 from warpfea.simulation.checkpoint import save_checkpoint
 from warpfea.terms.collider_meshes import mesh_tables
 
@@ -195,12 +194,12 @@ def test_a_sheet_is_felt_from_both_sides():
 def test_motions_through_a_sheet_are_seen():
     mesh = wf.TriMesh(*sheet(height=0.0))
     rng = np.random.default_rng(7)
-    a, b = (np.column_stack([rng.uniform(-0.29, 0.29, (300, 2)), z * rng.uniform(1e-9, 5.0, 300)]) for z in (1, -1))
+    a, b = (np.column_stack([rng.uniform(-0.29, 0.29, (300, 2)), z * rng.uniform(1e-9, 0.8, 300)]) for z in (1, -1))
     grid = np.linspace(-0.3, 0.3, 5)[1:-1]
     corners = np.array([(x, y, 0.0) for x in grid for y in grid])  # through corners of triangles
     a, b = (
         np.concatenate([a, corners + (0, 0, 0.3), corners]),
-        np.concatenate([b, corners - (0, 0, 0.3), corners - (0, 0, 1)]),
+        np.concatenate([b, corners - (0, 0, 0.3), corners - (0, 0, 0.5)]),
     )
     for start, end, behind in ((a, b, 0), (b, a, 1)):
         _, _, side = search(mesh, end, start)
@@ -300,7 +299,10 @@ def test_a_fine_ball_is_a_sphere_with_an_error_of_the_second_order():
     force, place = pressed(wf.Sphere(middle, radius))
     assert force[2] > 10.0
     forces, places = zip(*(pressed(ball(radius, middle, n)) for n in (4, 5, 6, 7)))
-    for errors in (np.abs(np.array(forces) - force)[:, 2] / force[2], np.abs(np.array(places) - place).max(axis=(1, 2))):
+    for errors in (
+        np.abs(np.array(forces) - force)[:, 2] / force[2],
+        np.abs(np.array(places) - place).max(axis=(1, 2)),
+    ):
         assert errors[-1] < 3e-3
         assert np.log2(errors[0] / errors[-1]) / 3 > 1.85
     rng = np.random.default_rng(1).normal(size=(200, 3))
@@ -314,14 +316,16 @@ def rolled(shape, *, dtype="float64", spin=10.0, law="default", **options):
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     mesh = wf.mesh.sphere(0.05, cells=2, center=(0, 0, 0.05))
     body = b.add_solid(mesh, material=wf.NeoHookean.from_E_nu(E=1e5, nu=0.3, density=1000.0), name="ball")
-    b.set_initial(body, velocity=(0.5, 0.2, 0), angular_velocity=(-0.4 * spin, spin, 0), center=(0, 0, 0.05))
+    b.set_initial(body, velocity=(0.5, 0.2, 0), angular_velocity=(-0.4 * spin, spin, 0))
     b.add_contact(body, b.add_collider(shape), mu=0.3, restitution=0.3, law=law, name="pad", **options)
     sim = wf.Simulation(b.finalize(device="cpu", dtype=dtype), dt=1e-3)
     sim.step(25)
     return sim.contact_record("pad"), sim.positions(body)[0]
 
 
-@pytest.mark.parametrize("options", [{}, {"spin": 0.0}, {"model": "sphere", "radius": 0.05}], ids=["rolls", "slides", "sphere"])
+@pytest.mark.parametrize(
+    "options", [{}, {"spin": 0.0}, {"model": "sphere", "radius": 0.05}], ids=["rolls", "slides", "sphere"]
+)
 def test_borders_of_a_flat_mesh_are_not_felt(options):
     lumped = "model" in options
     mesh = boxed((0.32, 0.32, 0.1), (0.011, 0.007, -0.05), cells=64) if lumped else wf.TriMesh(*sheet(64, 0.16, 0.0))
@@ -331,7 +335,9 @@ def test_borders_of_a_flat_mesh_are_not_felt(options):
     jump = np.abs(on_mesh.force - on_plane.force)[0, :, :2].max(axis=1)
     assert (jump <= 1e-3 * 0.3 * normal + 1e-12).all()
     assert jump.max() < 1e-6 * normal.max()  # it is far below
-    assert np.abs(on_mesh.force[0, :, 2] - on_mesh.normal_force[0]).max() < 1e-12 * normal.max()  # normals are that of the plane
+    assert (
+        np.abs(on_mesh.force[0, :, 2] - on_mesh.normal_force[0]).max() < 1e-12 * normal.max()
+    )  # normals are that of the plane
     assert np.abs(place - wanted).max() < 1e-9 * SIDE
 
 
@@ -346,10 +352,12 @@ def test_a_sheet_is_not_passed_at_100_m_per_s(E, way):
     points, triangles = sheet(6, 0.5, height=0.3 if way > 0 else -0.2)
     b.add_contact(cube, b.add_collider(wf.TriMesh(points, triangles)), mu=0.3, restitution=0.5, name="pad")
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2)
-    try:
+    if E == 1e6:  # an element of 50 mm is crushed
+        with pytest.raises(wf.ConvergenceError, match="inside out"):
+            sim.step(4)
+    else:
         sim.step(4)
-    except wf.ConvergenceError as error:  # inside out, or deeper than the penalty holds
-        assert re.search("inside out|went through|J <= 0", str(error))
+        assert way * sim.state.velocity.numpy()[0, :, 2].mean() < 0.0
     middle = sim.positions(cube)[0, :, 2].mean()
     assert middle < 0.3 if way > 0 else middle > -0.2
 
@@ -380,15 +388,157 @@ def test_a_run_goes_on_from_a_checkpoint(tmp_path):
     assert sim.contact_record("pad").normal_force[0, -1] > 0.0
     save_checkpoint(sim, tmp_path / "half.npz")
     cube, model = thrown(dented_floor(), TURN)
-    again = wf.Simulation.resume(model, tmp_path / "half.npz") if hasattr(wf.Simulation, "resume") else None
+    again = wf.Simulation(model, dt=DT)
+    again.resume(tmp_path / "half.npz")
     again.step(10)
     assert (again.positions(cube) == whole).all()
     _, other = thrown(wf.TriMesh(*sheet(16, 0.35, shape=lambda x, y: -0.004)), TURN)
     with pytest.raises(wf.CheckpointError):
-        wf.Simulation.resume(other, tmp_path / "half.npz")
+        wf.Simulation(other, dt=DT).resume(tmp_path / "half.npz")
 
 
 def test_energies_close_on_a_hilly_sheet_that_turns():
     _, sim = moved(40, dented_floor(), TURN, E=1e6)
     assert sim.contact_record("pad").normal_force.max() > 5.0
     assert abs(sim.energies()["ledger_residual"][0]) < 1e-6
+
+
+def test_an_impact_beyond_the_penalty_is_a_penetration_error():
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(2, 2, 2))
+    cube = b.add_solid(mesh, material=wf.SVK(E=1e4, nu=0.3, density=1000), name="cube")
+    b.set_initial(cube, velocity=(0, 0, -100.0))
+    b.add_contact(cube, b.add_collider(wf.TriMesh(*sheet(6, 0.5, -0.2)), name="sheet"), name="pad")
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    with pytest.raises(wf.PenetrationError, match=r"'pad': a point of body 'cube' .* went through collider 'sheet'"):
+        sim.step(10)
+    assert sim.positions(cube)[0, :, 2].max() > -0.2
+
+
+def placed(shape, height, turn=None):
+    """A cube that rests with its lower corner at (0, 0, height): a simulation of it without gravity."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    transform = (np.eye(3) if turn is None else turn, (0, 0, height))
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(1, 1, 1))
+    cube = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000), transform=transform, name="cube")
+    b.add_contact(cube, b.add_collider(shape, name="sheet"), name="pad")
+    return wf.Simulation(b.finalize(device="cpu"), dt=DT)
+
+
+@pytest.mark.parametrize("height", [-0.05, -1e-3, -0.0999, -SIDE])
+def test_bodies_that_begin_across_a_sheet_are_refused(height):
+    with pytest.raises(
+        wf.ModelError, match=r"body 'cube' begins on both sides of collider 'sheet', or on it and behind"
+    ):
+        placed(wf.TriMesh(*sheet(6, 0.3, 0.0)), height)
+
+
+@pytest.mark.parametrize("height", [0.0, 1e-6, -SIDE - 1e-6])
+def test_bodies_beside_a_sheet_begin(height):
+    c, s = math.cos(0.3), math.sin(0.3)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0, 0, 1.0]])
+    for sim in (placed(wf.TriMesh(*sheet(6, 0.3, 0.0)), height), placed(wf.TriMesh(*sheet(6, 0.3, 0.0)), height, turn)):
+        sim.step(3)
+        assert np.abs(sim.state.velocity.numpy()).max() < 1e-12
+
+
+def test_bodies_inside_of_a_closed_mesh_are_refused_or_pushed_out():
+    mesh = boxed((0.6, 0.6, 0.2), (0.05, 0.05, -0.09))
+    with pytest.raises(wf.ModelError, match=r"begins 0\.01 m inside collider 'floor'"):
+        moved(1, mesh)
+    wanted, _ = moved(30, wf.Box((0.05, 0.05, -0.09), (0.6, 0.6, 0.2)), overlap="offset", overlap_time=0.02)
+    found, _ = moved(30, mesh, overlap="offset", overlap_time=0.02)
+    assert np.abs(found - wanted).max() < 1e-9 * SIDE
+
+
+# bad input
+
+
+def point_meshes():
+    points, triangles = octahedron()
+    extra = np.array([(0, 1, 5)])
+    turned = triangles.copy()
+    turned[2] = turned[2][::-1]
+    third = np.concatenate([points, [(3.0, 3.0, 0.0)]])
+    nan = points.copy()
+    nan[4, 1] = np.nan
+    return {
+        "none": (points, np.zeros((0, 3), dtype=int), "there are no triangles"),
+        "nothing": (points, None, "there are no triangles"),
+        "quads": (points, [(0, 1, 2, 3)], r"triangles have shape \(1, 4\)"),
+        "fractions": (points, [(0.0, 1.0, 2.0)], "type float64, expected"),
+        "flat points": (points[:, :2], triangles, r"points have shape \(6, 2\)"),
+        "words": ([("a", "b", "c")], triangles, "must be"),
+        "range": (points, [(0, 1, 6)], r"triangle 0 = \[0, 1, 6\] has a point number out of range, 0 \.\. 5"),
+        "negative": (points, [(0, 1, -1)], "out of range"),
+        "nan": (nan, triangles, r"point 4 = \[.*nan.*\] is not finite"),
+        "degenerate": (points, [(0, 1, 2), (0, 1, 0)], r"triangle 1 = \[0, 1, 0\] has no area"),
+        "in a line": ([(0, 0, 0), (1, 0, 0), (3, 0, 0)], [(0, 1, 2)], "triangle 0 .* has no area"),
+        "orientation": (
+            points,
+            turned,
+            r"points \d and \d is run through in one direction by triangles",
+        ),
+        "three": (
+            third,
+            [(0, 1, 2), (1, 0, 5), (0, 1, 6)],
+            "points 0 and 1 has more than two triangles",
+        ),
+        "inside out": (points, triangles[:, ::-1], r"closed and inside out, its volume is -1\.33 m\^3"),
+        "folded": ([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 2, 0)], [(0, 1, 2), (1, 0, 3)], "folds back on itself"),
+        "many": (points, np.concatenate([triangles, extra]), "more than two triangles"),
+    }
+
+
+@pytest.mark.parametrize("name", point_meshes())
+def test_bad_meshes_are_named(name):
+    points, triangles, message = point_meshes()[name]
+    with pytest.raises(wf.ModelError, match="^TriMesh: .*" + message):
+        wf.TriMesh(points, triangles)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, "big"])
+def test_bad_scales_are_named(scale):
+    with pytest.raises(wf.ModelError, match="TriMesh: scale = "):
+        wf.TriMesh(*octahedron(), scale=scale)
+
+
+def test_a_lumped_contact_needs_an_inside():
+    with pytest.raises(wf.ModelError, match="collider 'floor' is a sheet of triangles, and model = 'sphere'"):
+        thrown(wf.TriMesh(*sheet()), model="sphere", radius=0.05)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtu"])
+def test_files(tmp_path, suffix):
+    meshio = pytest.importorskip("meshio")
+    points, triangles = octahedron()
+    file = tmp_path / f"rock{suffix}"
+    meshio.Mesh(points, [("triangle", triangles)]).write(file)
+    mesh = wf.TriMesh(file, scale=1e-3)
+    assert mesh.closed
+    assert mesh.volume == pytest.approx(4.0 / 3.0 * 1e-9, rel=1e-6)
+    assert len(mesh.triangles) == 8
+
+
+def test_bad_files_are_named(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    with pytest.raises(wf.ModelError, match=r"TriMesh: .*none\.stl: no such mesh file"):
+        wf.TriMesh(tmp_path / "none.stl")
+    (tmp_path / "bad.vtu").write_text("nothing")
+    with pytest.raises(wf.ModelError, match=r"TriMesh: .*bad\.vtu: can't be read"):
+        wf.TriMesh(str(tmp_path / "bad.vtu"))
+    meshio.Mesh(np.eye(3), [("line", [[0, 1]])]).write(tmp_path / "line.vtk")
+    with pytest.raises(wf.ModelError, match=r"has no triangles, but line"):
+        wf.TriMesh(tmp_path / "line.vtk")
+    with pytest.raises(wf.ModelError, match="triangles = must be left out"):
+        wf.TriMesh(tmp_path / "line.vtk", [(0, 1, 2)])
+    meshio.Mesh(sheet(2)[0], [("quad", [[0, 1, 4, 3]])]).write(tmp_path / "quad.vtk")
+    assert len(wf.TriMesh(tmp_path / "quad.vtk").triangles) == 2
+
+
+def test_corners_in_one_place_are_one():
+    """As files hold them that tell each triangle's corners: the mesh is closed all the same."""
+    points, triangles = octahedron()
+    mesh = wf.TriMesh(points[triangles].reshape(-1, 3), np.arange(24).reshape(8, 3))
+    assert mesh.closed
+    assert mesh.volume == pytest.approx(4.0 / 3.0)

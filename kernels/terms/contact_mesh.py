@@ -53,7 +53,7 @@ def mesh_struct():
 
 @functools.cache
 def mesh_functions(Contacts) -> _types.SimpleNamespace:
-    """Device functions for contacts of a struct with `mesh`; `size`: the mesh's size, its thickness, 1 if closed."""
+    """Device functions for contacts of a struct with `mesh`; `size`: its size, thickness, 1 if closed."""
     f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
     ints = wp.types.vector(length=STACK, dtype=wp.int32)
 
@@ -291,6 +291,12 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return turn < f64(ALIKE) and deep > f64(0.5) * thick
 
     @wp.func
+    def passed(con: Contacts, k: int, side: int, y: vec3d) -> bool:
+        """Whether a point is so far behind a sheet that it is beyond it."""
+        deep = sense_of(side) * wp.dot(con.mesh.normal[0, side / 2], con.mesh.corner[0, side / 2] - y)
+        return con.size[k][2] == f64(0.0) and deep > con.size[k][1]
+
+    @wp.func
     def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
         """See `contact_shapes`: the side through which a motion has passed the surface at its end, -1: none or any,
         -2: it went through."""
@@ -300,7 +306,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
             leave = wp.where(side % 2 == 0, h.out, h.into)
             last = wp.where(side % 2 == 0, h.out_triangle, h.into_triangle)
             if leave > f64(1.0):
-                return side
+                return wp.where(passed(con, k, side, end), -2, side)
             entry = con.mesh.corner[0, side / 2]
             if passes(con, k, side / 2, entry, last, start + leave * d, sense_of(side)):
                 return -2
@@ -315,7 +321,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         if t0 > f64(1.0) or t1 < t0:
             return -1
         if t1 > f64(1.0):
-            return 2 * first + behind
+            return wp.where(passed(con, k, 2 * first + behind, end), -2, 2 * first + behind)
         if passes(con, k, first, start + t0 * d, last, start + t1 * d, sense_of(behind)):
             return -2
         return -1

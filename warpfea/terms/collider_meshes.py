@@ -15,7 +15,7 @@ from ..model.triangle_mesh import TriMesh
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["mesh_tables"]
+__all__ = ["mesh_tables", "sizes"]
 
 
 def mesh_tables(model: Model, shapes: Sequence[Shape]) -> Any:
@@ -39,4 +39,13 @@ def mesh_tables(model: Model, shapes: Sequence[Shape]) -> Any:
     put("corner", np.concatenate([p.corner for p in parts], axis=1), wp.vec3d)
     put("normal", np.concatenate([p.normal for p in parts], axis=1), wp.vec3d)
     put("border", np.concatenate([p.border for p in parts], axis=1), wp.int32)
+    return out
+
+
+def sizes(shape: Shape, surfaces: Sequence[np.ndarray]) -> np.ndarray:
+    """`Shape.sizes`; the thickness of a sheet is how deep bodies may come: the second largest edge of the smallest box
+    around a surface that touches it, m. `surfaces`: their points, (n, 3)."""
+    out = shape.sizes
+    if isinstance(shape, TriMesh) and not shape.closed:
+        out[1] = min((np.sort(np.ptp(X, axis=0))[1] for X in surfaces), default=out[0])
     return out

@@ -23,7 +23,7 @@ from ..model.contact_points import (
 )
 from ..model.contacts import Collider, Contact
 from ..model.triangle_mesh import TriMesh
-from .collider_meshes import mesh_tables
+from .collider_meshes import mesh_tables, sizes
 from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
@@ -134,6 +134,11 @@ class ContactTables:
         return any(isinstance(collider.shape, TriMesh) for collider in self.colliders)
 
     @property
+    def sheets(self) -> bool:
+        """Whether one of these has no inside."""
+        return any(isinstance(k.shape, TriMesh) and not k.shape.closed for k in self.colliders)
+
+    @property
     def explicit(self) -> bool:
         """Whether a contact has the force of the last state."""
         return any(contact.treatment == "explicit" for contact in self.contacts)
@@ -237,7 +242,7 @@ class ContactTables:
             put(name, np.tile(values, (m.worlds, 1)), wp.float64)
         frames = [k.shape.frame() for k in K]
         put("kind", [k.shape.kind for k in K], wp.int32)
-        put("size", [k.shape.sizes for k in K], wp.vec3d)
+        put("size", [sizes(k.shape, self._touching(k)) for k in K], wp.vec3d)
         put("center", [center for center, _ in frames], wp.vec3d)
         put("axes", [axes for _, axes in frames], wp.mat33d)
         put("path", [laws.add(k.law) if k.law is not None else -1 for k in K], wp.int32)
@@ -247,6 +252,10 @@ class ContactTables:
         if self.meshes:
             out.mesh = mesh_tables(m, [k.shape for k in K])
         return out
+
+    def _touching(self, collider: Collider) -> list[np.ndarray]:
+        """Points of the surfaces that may touch a collider, (n, 3), m."""
+        return [p.X.reshape(-1, 3) for c, p in zip(self.contacts, self.host) if c.collider is collider]
 
     def hash(self, h: Any) -> None:
         """Feed what defines the contacts into a hash."""
