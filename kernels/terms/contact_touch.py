@@ -9,6 +9,7 @@ from ..common.types import precision
 from .contact_colliders import collider_functions
 from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
+from .contact_mesh import MESH
 
 __all__ = ["touch_functions"]
 
@@ -161,11 +162,18 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         live = his.speed[world, rec] > f64(0.0)
         if live:
             side = his.mark[world, rec] % SLIPS - 1
-        out.side = sweep(con, k, at.start[world, point], out.y, side)
-        d = distance(con, k, out.y, out.side)
+        begins = reach(con, his, world, c, point, time, con.grow[world, k])
+        d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
+        out.side = -1
+        far = bool(False)
+        if wp.static(meshes):  # no nearer than it was, less its way: a mesh need not be searched
+            d[3] = at.reach[world, point] - at.depth[world, point] - wp.length(out.y - at.start[world, point])
+            far = con.kind[k] == MESH and con.law[c] != SMOOTH and not live and d[3] > wp.max(begins, f64(0.0))
+        if not far:
+            out.side = sweep(con, k, at.start[world, point], out.y, side)
+            d = distance(con, k, out.y, out.side)
         out.n = turn * vec3d(d[0], d[1], d[2])
-        shape = con.grow[world, k]
-        out.depth = reach(con, his, world, c, point, time, shape) - d[3]
+        out.depth = begins - d[3]
         motion = moved - at.origin[world, point] - at.shift[world, k]
         if con.spin[k] >= 0:
             motion -= at.spin[world, k] * (his.turn[world, k] * at.start[world, point])
@@ -173,7 +181,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         change = deepening(con, k, out.side, at.start[world, point], out.y, wp.transpose(turn) * motion,
                            at.reach[world, point] - before, d[3])  # fmt: skip
         if change[1] != f64(0.0):
-            out.depth = before + change[0] + (reach(con, his, world, c, point, time, shape) - at.reach[world, point])
+            out.depth = before + change[0] + (begins - at.reach[world, point])
         rate = rate_of(con, at, world, c, point, inv_h)
         k_n = con.scale[world, c] * con.normal[c]
         led = depth_before(con, facets, his, at, world, c, point)
