@@ -2,6 +2,7 @@
 
 import functools
 import math
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from warpfea.kernels.terms.contact_data import contact_struct
 
 import warpfea as wf
 from warpfea.base.launch import Launcher
+from warpfea.cli import main
+from warpfea.outputs.obstacles import Obstacles
 from warpfea.simulation.checkpoint import save_checkpoint
 from warpfea.terms.collider_meshes import mesh_tables
 
@@ -96,27 +99,30 @@ def probing():
 class Model:
     """As much of a model as tables need."""
 
+    def __init__(self, device):
+        self.device = device
+
     def array(self, _, values, dtype):
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device="cpu")
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
 
-def search(mesh, ends, starts=None, sides=None, others=()):
+def search(mesh, ends, starts=None, sides=None, others=(), device="cpu"):
     """Normals, gaps and swept sides of places in the world; `others`: meshes before and after it in the tables."""
     probe, Contacts = probing()
     shapes = [*others, mesh, *others]
     con, k = Contacts(), len(others)
-    con.mesh = mesh_tables(Model(), shapes)
-    con.kind = wp.array([s.kind for s in shapes], dtype=wp.int32, device="cpu")
-    con.size = wp.array([s.sizes for s in shapes], dtype=wp.vec3d, device="cpu")
+    con.mesh = mesh_tables(Model(device), shapes)
+    con.kind = wp.array([s.kind for s in shapes], dtype=wp.int32, device=device)
+    con.size = wp.array([s.sizes for s in shapes], dtype=wp.vec3d, device=device)
     center = mesh.frame()[0]
     count = len(ends)
     a, b = (
-        wp.array(np.asarray(x) - center, dtype=wp.vec3d, device="cpu")
+        wp.array(np.asarray(x) - center, dtype=wp.vec3d, device=device)
         for x in (ends if starts is None else starts, ends)
     )
-    side = wp.array(np.full(count, -1) if sides is None else sides, dtype=wp.int32, device="cpu")
-    gap, swept = wp.zeros(count, dtype=wp.vec4d, device="cpu"), wp.zeros(count, dtype=wp.int32, device="cpu")
-    Launcher(wp.get_device("cpu"))(probe, count, [con, k, a, b, side, gap, swept])
+    side = wp.array(np.full(count, -1) if sides is None else sides, dtype=wp.int32, device=device)
+    gap, swept = wp.zeros(count, dtype=wp.vec4d, device=device), wp.zeros(count, dtype=wp.int32, device=device)
+    Launcher(wp.get_device(device))(probe, count, [con, k, a, b, side, gap, swept])
     return gap.numpy()[:, :3], gap.numpy()[:, 3], swept.numpy()
 
 
@@ -168,6 +174,17 @@ def test_nearest_places_and_sides_of_closed_meshes(name):
     assert np.abs(np.abs(gap) - wanted).max() < 1e-14 * size
     assert ((gap < 0.0) == inside).all()
     assert np.abs(places - gap[:, None] * normal - near).max() < 1e-13 * size
+
+
+@pytest.mark.cuda
+def test_a_deep_tree_is_searched_alike_on_cuda():
+    mesh = ball(1.0, (0, 0, 0), 7)
+    rng = np.random.default_rng(2).normal(size=(5000, 3))
+    ends = rng * (np.linspace(0.5, 2.0, 5000) / np.linalg.norm(rng, axis=1))[:, None]
+    starts = 1.3 * ends
+    host, device = (search(mesh, ends, starts, device=d) for d in ("cpu", "cuda:0"))
+    assert np.abs(device[1] - host[1]).max() < 1e-14
+    assert (device[2] == host[2]).mean() > 0.999  # on a border either triangle may be met first
 
 
 def test_places_over_edges_and_corners_are_told_in_or_out():
@@ -237,7 +254,7 @@ SLIDE = ([0, 0.01, 0.02, 0.05], [(0, 0, 0), (0, 0.01, 0.003), (0.01, 0, -0.002),
 TURN = wf.Rotation(anchor=(0.05, 0.05, 0), axis=(0, 0.2, 1), angle=([0, 1], [0, 10.0]))
 
 
-def thrown(shape, path=None, *, dtype="float64", worlds=1, speed=-0.3, E=1e6, **options):
+def thrown(shape, path=None, *, device="cpu", dtype="float64", worlds=1, speed=-0.3, E=1e6, **options):
     """A cube of 0.1 m and 1 kg that spins and slides onto an obstacle: cube, model."""
     b = wf.ModelBuilder()
     law = wf.SVK(E=E, nu=0.3, density=1000)
@@ -245,7 +262,7 @@ def thrown(shape, path=None, *, dtype="float64", worlds=1, speed=-0.3, E=1e6, **
     b.set_initial(cube, velocity=(1.0, 0.2, speed), angular_velocity=(0, 3, 5))
     floor = b.add_collider(shape, path=path, name="floor")
     b.add_contact(cube, floor, **({"mu": 0.5, "restitution": 0.5, "name": "pad"} | options))
-    return cube, b.finalize(device="cpu", dtype=dtype, worlds=worlds)
+    return cube, b.finalize(device=device, dtype=dtype, worlds=worlds)
 
 
 def moved(steps, *args, dt=DT, integrator="backward_euler", **options):
@@ -362,6 +379,14 @@ def test_a_sheet_is_not_passed_at_100_m_per_s(E, way):
     assert middle < 0.3 if way > 0 else middle > -0.2
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", MESHES)
+def test_cuda_is_as_a_box_and_as_the_cpu(name):
+    wanted, _ = moved(30, BOX, TURN)
+    found, _ = moved(30, MESHES[name](), TURN, device="cuda:0")
+    assert np.abs(found - wanted).max() < 1e-9 * SIDE
+
+
 def test_float32_follows_float64():
     wanted, _ = moved(20, boxed(cells=4))
     found, sim = moved(20, boxed(cells=4), dtype="float32")
@@ -369,10 +394,11 @@ def test_float32_follows_float64():
     assert np.abs(found - wanted).max() < 1e-5 * SIDE
 
 
-def test_worlds_are_bit_equal_to_their_own_run():
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+def test_worlds_are_bit_equal_to_their_own_run(device):
     mesh = dented_floor()
-    alone, _ = moved(20, mesh)
-    together, sim = moved(20, mesh, worlds=3)
+    alone, _ = moved(20, mesh, device=device)
+    together, sim = moved(20, mesh, worlds=3, device=device)
     assert sim.contact_record("pad").normal_force.max() > 5.0
     assert all((together[k] == alone[0]).all() for k in range(3))
 
@@ -542,3 +568,96 @@ def test_corners_in_one_place_are_one():
     mesh = wf.TriMesh(points[triangles].reshape(-1, 3), np.arange(24).reshape(8, 3))
     assert mesh.closed
     assert mesh.volume == pytest.approx(4.0 / 3.0)
+
+
+# what is shown, and what it costs
+
+
+def test_writers_draw_it_where_it_is(tmp_path):
+    from pxr import Usd, UsdGeom
+
+    cube, model = thrown(boxed(cells=2), TURN)
+    sim = wf.Simulation(model, dt=DT)
+    path = tmp_path / "mesh.usda"
+    sim.run(0.004, outputs=[wf.USDWriter(path, fps=500.0), wf.VTUWriter(tmp_path / "vtu", every=2)])
+    stage = Usd.Stage.Open(str(path))
+    prim = stage.GetPrimAtPath("/World/world_0000/floor/shape")
+    drawn = UsdGeom.Mesh(prim)
+    assert prim.GetCustomDataByKey("warpfea:collider") == "TriMesh"
+    assert len(drawn.GetFaceVertexCountsAttr().Get()) == 48
+    last = stage.GetEndTimeCode()
+    matrix = np.array(UsdGeom.XformCache(last).GetLocalToWorldTransform(prim))
+    points = np.asarray(drawn.GetPointsAttr().Get(last)) @ matrix[:3, :3] + matrix[3, :3]
+    place, turn, _ = sim.collider_poses()
+    shape = model.description.colliders[0].shape
+    wanted = (shape.points - shape.frame()[0]) @ turn[0, 0].T + place[0, 0]
+    assert np.abs(points[:, None] - wanted).max(axis=2).min(axis=1).max() < 1e-6
+    assert np.abs(turn[0, 0] - np.eye(3)).max() > 0.01
+    assert (tmp_path / "vtu" / "vtu_colliders.pvd").exists()
+
+
+def test_a_surface_that_lies_further_out():
+    """`model.set_parameter("floor.offset", ...)` moves it along its normals, and its picture with it."""
+    wanted, found = [], []
+    for shape, out in ((BOX, wanted), (boxed(cells=4), found)):
+        cube, model = thrown(shape)
+        model.set_parameter("floor.offset", 0.0015)
+        sim = wf.Simulation(model, dt=DT)
+        sim.step(15)
+        out += [
+            sim.positions(cube),
+            np.sort(Obstacles(sim, np.zeros(3), np.full(3, SIDE)).points()[0][0, :, 2])[[0, -1]],
+        ]
+    assert np.abs(found[0] - wanted[0]).max() < 1e-9 * SIDE
+    np.testing.assert_allclose(found[1], wanted[1], atol=1e-12)
+
+
+def test_info_counts_triangles(capfd, tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np, warpfea as wf\n"
+        "@wf.scene(dt=1e-3, t_end=0.01)\n"
+        "def drop():\n"
+        "    b = wf.ModelBuilder()\n"
+        "    law = wf.SVK(E=1e6, nu=.3, density=1000)\n"
+        "    cube = b.add_solid(wf.mesh.box((.1,) * 3, cells=(1, 1, 1)), material=law, name='cube')\n"
+        "    rock = wf.TriMesh(*wf.Box((.05, .05, -.1), (1, 1, .2)).mesh())\n"
+        "    b.add_contact(cube, b.add_collider(rock), name='pad')\n"
+        "    return b\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    capfd.readouterr()
+    assert main(["info", "mine.py:drop", "--device", "cpu"]) == 0
+    out = capfd.readouterr().out
+    assert "body cube on mesh (12 triangles), law default, patch" in out
+    assert "contact_float64_meshes" in out
+
+
+def test_a_scene_without_a_mesh_has_nothing_of_it():
+    names = {}
+    for name, shape in (("box", BOX), ("closed", boxed()), ("sheet", wf.TriMesh(*sheet()))):
+        sim = moved(2, shape)[1]
+        names[name] = {module.name.rpartition(".")[2] for module in sim.stepper.modules()}
+        assert hasattr(sim.model.terms.contact.tables.data, "mesh") == (name != "box")
+    assert not any("meshes" in module for module in names["box"])
+    assert {m.replace("_meshes", "") for m in names["closed"]} == names["box"]
+    assert names["sheet"] == names["closed"]
+
+
+def test_no_search_goes_over_all_triangles():
+    """64 times as many triangles cost far less than 8 times the time; the machine may be busy."""
+    rng = np.random.default_rng(1).normal(size=(20000, 3))
+    around = 1.001 * rng / np.linalg.norm(rng, axis=1, keepdims=True)
+    small, large = (seconds(ball(1.0, (0, 0, 0), halvings), around) for halvings in (3, 6))
+    assert large < 8.0 * small, (small, large)
+
+
+def seconds(mesh, places):
+    """Least of a few times of a search, less that of what surrounds it."""
+    mesh.tables  # noqa: B018
+
+    def once(count):
+        start = time.perf_counter()
+        search(mesh, places[:count], places[:count] * 1.001)
+        return time.perf_counter() - start
+
+    return min(once(len(places)) for _ in range(4)) - min(once(1) for _ in range(4))

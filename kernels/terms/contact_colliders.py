@@ -26,8 +26,8 @@ MESH_SLIPS = 1 << 30
 
 @functools.cache
 def collider_functions(meshes: bool) -> _types.SimpleNamespace:
-    """Device functions `distance`, `sweep`, `deepening`, `side_after`, and the number SLIPS; the first two as of
-    `contact_shapes`, of collider k."""
+    """Device functions `distance`, `sweep`, `deepening`, `side_after`, and the number SLIPS; see
+    `contact_shapes` and `contact_mesh`."""
     f64, vec3d = wp.float64, wp.vec3d
     Contacts = contact_struct(meshes)
     shapes = shape_functions()
@@ -37,6 +37,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def distance(con: Contacts, k: int, y: vec3d, side: int) -> wp.vec4d:
+        """Outward unit normal and signed distance of a place in the frame of collider k."""
         if wp.static(meshes):
             if con.kind[k] == MESH:
                 return of_mesh(con, k, y, side)
@@ -44,6 +45,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
+        """Side through which a motion is inside at its end, -1: any; -2: it went through."""
         if wp.static(meshes):
             if con.kind[k] == MESH:
                 return sweep_mesh(con, k, start, end, side)
