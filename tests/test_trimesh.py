@@ -232,6 +232,16 @@ def test_motions_through_a_sheet_are_seen():
     assert (side == -1).all()
 
 
+def test_a_point_that_rounding_has_put_beyond_a_sheet_is_where_it_was():
+    mesh = wf.TriMesh(*sheet(height=0.0))
+    start = np.array([(0.1, 0.02, -1e-8), (0.1, 0.02, 1e-8)])  # one was in front, one behind
+    _, _, side = search(mesh, start + ((0, 0, -1e-3), (0, 0, 1e-3)), start, sides=[-3, -4])
+    assert (side >= 0).all()
+    assert (side % 2).tolist() == [0, 1]
+    _, _, side = search(mesh, start + ((0, 0, 1e-3), (0, 0, -1e-3)), start, sides=[-3, -4])
+    assert side.tolist() == [-1, -1]
+
+
 def test_motions_through_a_plate_are_refused_and_those_over_its_edge_are_not():
     mesh = boxed(size=(1, 1, 0.02), center=(0, 0, -0.01), cells=8)
     start = np.array([(0.1, 0.1, 0.5), (0.1, 0.13, 0.5), (0.495, 0, 0.003), (0.499, 0.2, 0.02), (0.1, 0.1, 0.001)])
@@ -439,6 +449,24 @@ def test_an_impact_beyond_the_penalty_is_a_penetration_error():
     with pytest.raises(wf.PenetrationError, match=r"'pad': a point of body 'cube' .* went through collider 'sheet'"):
         sim.step(10)
     assert sim.positions(cube)[0, :, 2].max() > -0.2
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("way", [-1.0, 1.0], ids=["front", "behind"])
+def test_a_cube_bounces_on_either_side_of_a_sheet(way, dtype):
+    """Pulled to it, with a corner ahead: points touch and part in every step; none is taken to the other side."""
+    b = wf.ModelBuilder(gravity=(0, 0, 100.0 * way))
+    turn = np.array([(1, 0, 0), (0, 0.8, -0.6), (0, 0.6, 0.8)])
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(1, 1, 1))
+    body = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000), transform=(turn, (0, 0, 0.0)), name="cube")
+    height = body.mesh.points[:, 2].max() + 1e-3 if way > 0 else body.mesh.points[:, 2].min() - 1e-3
+    b.add_contact(body, b.add_collider(wf.TriMesh(*sheet(6, 0.6, height))), mu=0.2, restitution=0.8, name="pad")
+    sim = wf.Simulation(b.finalize(device="cpu", dtype=dtype), dt=1e-3)
+    for _ in range(150):
+        sim.step()
+        assert way * sim.contact_force("pad")[0, 2] <= 0.0 or np.isnan(sim.contact_force("pad")).any()
+    assert (sim.contact_record("pad").normal_force[0] > 1.0).sum() > 20
+    assert way * (sim.positions(body)[0, :, 2].mean() - height) < 0.0
 
 
 def placed(shape, height, turn=None):

@@ -43,7 +43,8 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
     elastic = law_functions().elastic
-    distance, SLIPS = collider_functions(meshes).distance, collider_functions(meshes).SLIPS
+    g = collider_functions(meshes)
+    distance, known_side, beside = g.distance, g.known_side, g.beside
     module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
@@ -98,9 +99,10 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         turn = his.turn[world, k]
         y = wp.transpose(turn) * (x - his.place[world, k])
         live = his.speed[world, rec] > f64(0.0)
-        side = wp.int32(-1)
-        if live:
-            side = his.mark[world, rec] % SLIPS - 1
+        if wp.static(meshes):
+            if not live:
+                his.mark[world, rec] = beside(con, k, y, his.mark[world, rec])
+        side = known_side(con, k, live, his.mark[world, rec])
         d = distance(con, k, y, side)
         at.start[world, point] = y
         begins = reach(con, his, world, c, point, clock.time[world], his.grown[world, k])
@@ -153,7 +155,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             return
         turn = his.turn[world, k]
         y = at.start[world, point]
-        side = his.mark[world, rec] % SLIPS - 1
+        side = known_side(con, k, True, his.mark[world, rec])
         d = distance(con, k, y, side)
         n = turn * vec3d(d[0], d[1], d[2])
         x = turn * y + his.place[world, k]
@@ -185,7 +187,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def dead_work(
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
-        u: wp.array2d(dtype=vec3),
+        u: wp.array2d(dtype=vec3d),
     ) -> f64:  # fmt: skip
         """Minus the work of an explicit force on the step so far."""
         k = con.collider[c]
@@ -195,7 +197,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def forces(
-        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3),
+        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), fresh: int, at: Attempt,
     ):  # fmt: skip
         """Forces of points, their stiffness and potential.

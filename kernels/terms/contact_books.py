@@ -26,8 +26,6 @@ FORCES = 7
 @functools.cache
 def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     """Kernels in the module of `contact_kernels`."""
-    p = precision(dtype)
-    vec3 = p.vec3
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
@@ -36,7 +34,8 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
     coefficient, lagrange = k.coefficient, k.lagrange
     elastic = law_functions().elastic
-    side_after, SLIPS = collider_functions(meshes).side_after, collider_functions(meshes).SLIPS
+    g = collider_functions(meshes)
+    side_after, released, SLIPS = g.side_after, g.released, g.SLIPS
     module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SMALL)
 
     @wp.struct
@@ -74,7 +73,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def outcome(
         con: Contacts, facets: Facets, his: History, clock: Clock, at: Attempt, world: int, c: int, q: int, item: int,
-        point: int, u: wp.array2d(dtype=vec3),
+        point: int, u: wp.array2d(dtype=vec3d),
     ) -> Outcome:  # fmt: skip
         """What a point leaves.
 
@@ -145,24 +144,26 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         rec = record_of(con, c, point)
         if facets.moving != 0:
             his.lead[world, rec] = o.touch.depth
+        kc = con.collider[c]
         if o.touch.depth <= f64(0.0):
+            mark = released(con, kc, his.speed[world, rec] > f64(0.0), his.mark[world, rec])
             his.spring[world, rec] = vec3d()
             his.stored[world, rec] = f64(0.0)
             his.cap[world, rec] = f64(0.0)
             his.speed[world, rec] = f64(0.0)
-            his.mark[world, rec] = 0
+            his.mark[world, rec] = mark
             return
         speed = at.speed[world, point]
         if clock.still == 0:
             speed = wp.max(speed, o.touch.rise / clock.h[world])
         kept = o.kept
         if con.law[c] != PAPER:
-            kept = wp.transpose(at.turn[world, con.collider[c]]) * kept
+            kept = wp.transpose(at.turn[world, kc]) * kept
         his.spring[world, rec] = kept
         his.stored[world, rec] = o.stored
         his.cap[world, rec] = o.cap
         his.speed[world, rec] = speed
-        mark = side_after(con, con.collider[c], o.touch.y, o.touch.side) + 1
+        mark = side_after(con, kc, o.touch.y, o.touch.side) + 1
         if o.slips != 0 and o.cap > f64(0.0):
             mark += SLIPS
         his.mark[world, rec] = mark
@@ -174,7 +175,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def finish(
-        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3),
+        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         accepted: wp.array(dtype=wp.int32), at: Attempt, booked: wp.array3d(dtype=f64),
     ):  # fmt: skip
         """Books of an accepted substep and the record of it per facet, and the history after it."""
@@ -291,7 +292,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def at_points(
-        con: Contacts, facets: Facets, his: History, u: wp.array2d(dtype=vec3), time: wp.array(dtype=f64),
+        con: Contacts, facets: Facets, his: History, u: wp.array2d(dtype=vec3d), time: wp.array(dtype=f64),
         at: Attempt, places: int, gap: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
         """At a state, without rates: gap, m, and the elastic force on the point, N; with `places` the gap of a place

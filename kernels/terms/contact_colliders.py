@@ -19,21 +19,21 @@ MESHES = "_meshes"
 
 SLIPS = 16
 """Of a point's mark: it slips; below are the sides."""
-NAMES = ("distance", "sweep", "side_after", "deepening")
+NAMES = ("distance", "sweep", "side_after", "deepening", "beside")
 MESH_SLIPS = 1 << 30
 """The same where sides are triangles."""
 
 
 @functools.cache
 def collider_functions(meshes: bool) -> _types.SimpleNamespace:
-    """Device functions `distance`, `sweep`, `deepening`, `side_after`, and the number SLIPS; see
-    `contact_shapes` and `contact_mesh`."""
+    """Device functions, see `contact_shapes` and `contact_mesh`, and the number SLIPS."""
+    slips = MESH_SLIPS if meshes else SLIPS
     f64, vec3d = wp.float64, wp.vec3d
     Contacts = contact_struct(meshes)
     shapes = shape_functions()
     of_shape, sweep_shape = shapes.distance, shapes.sweep
     mesh = mesh_functions(Contacts) if meshes else _types.SimpleNamespace(**dict.fromkeys(NAMES))
-    of_mesh, sweep_mesh, side_on_mesh, along_mesh = (getattr(mesh, name) for name in NAMES)
+    of_mesh, sweep_mesh, side_on_mesh, along_mesh, beside_mesh = (getattr(mesh, name) for name in NAMES)
 
     @wp.func
     def distance(con: Contacts, k: int, y: vec3d, side: int) -> wp.vec4d:
@@ -50,6 +50,34 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
             if con.kind[k] == MESH:
                 return sweep_mesh(con, k, start, end, side)
         return sweep_shape(con.kind[k], con.size[k], start, end, side)
+
+    @wp.func
+    def known_side(con: Contacts, k: int, live: bool, mark: int) -> int:
+        """The side that a mark tells, -1: none; of a point that touches no sheet -3 in front of it, -4 behind."""
+        if live:
+            return mark % slips - 1
+        if wp.static(meshes):
+            if mark % slips > 0:
+                return -2 - mark % slips
+        return -1
+
+    @wp.func
+    def beside(con: Contacts, k: int, y: vec3d, mark: int) -> int:
+        """The mark of a point that touches nothing: where on a sheet it is, as before if rounding hides that."""
+        if wp.static(meshes):
+            if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
+                return beside_mesh(con, k, y, mark)
+        return 0
+
+    @wp.func
+    def released(con: Contacts, k: int, live: bool, mark: int) -> int:
+        """The mark of a point that touches no more."""
+        if wp.static(meshes):
+            if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
+                if live and mark % slips > 0:
+                    return 1 + (mark % slips - 1) % 2
+                return wp.where(live, 0, mark)
+        return 0
 
     @wp.func
     def side_after(con: Contacts, k: int, y: vec3d, side: int) -> int:
@@ -91,6 +119,6 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
         return wp.vec2d()
 
     return _types.SimpleNamespace(
-        distance=distance, sweep=sweep, side_after=side_after, deepening=deepening,
-        SLIPS=MESH_SLIPS if meshes else SLIPS,
+        distance=distance, sweep=sweep, known_side=known_side, side_after=side_after, beside=beside, released=released,
+        deepening=deepening, SLIPS=slips,
     )  # fmt: skip

@@ -28,6 +28,8 @@ ALIKE = 0.5
 """Cosine of the angle by which triangles of one side may turn."""
 FINE = 1e-12
 """Over the mesh's size: what is behind a surface by less is on it."""
+ROUNDED = 1e-6
+"""The same of a point that was on the other side: float32 rounds a step's end so far, or less."""
 SLIVER = 1e-6
 """Over its thickness: depth of a passage that is none, as over the edge of a blade."""
 
@@ -213,6 +215,17 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return 2 * s.triangle + wp.max(side, 0) % 2
 
     @wp.func
+    def beside(con: Contacts, k: int, y: vec3d, mark: int) -> int:
+        """1 in front of a sheet, 2 behind, and as before where it is closer than rounding."""
+        s = nearest(con, k, y, -1)
+        above = wp.dot(y - s.place, con.mesh.normal[s.part, s.triangle])
+        if wp.abs(above) <= f64(ROUNDED) * con.size[k][0]:
+            if mark == 0 and above < -f64(FINE) * con.size[k][0]:
+                return 2
+            return wp.max(mark, 1)
+        return wp.where(above > f64(0.0), 1, 2)
+
+    @wp.func
     def apart(low: vec3d, high: vec3d, middle: vec3d, half: vec3d) -> bool:
         """Whether a segment misses a box (separating axes)."""
         e = f64(0.5) * (high - low)
@@ -240,13 +253,17 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return True
 
     @wp.func
-    def hits(con: Contacts, k: int, a: vec3d, b: vec3d) -> Hits:
-        """Where the segment from a to b passes the surface."""
+    def hits(con: Contacts, k: int, a: vec3d, b: vec3d, side: int) -> Hits:
+        """Where the segment from a to b passes the surface, from where it begins by `side`: -3 in front, -4 behind."""
         out = Hits()
         out.into = f64(2.0)
         out.out = f64(2.0)
         tol = f64(FINE) * con.size[k][0]
-        margin = vec3d(f64(1000.0) * tol, f64(1000.0) * tol, f64(1000.0) * tol)
+        level = -tol  # from here on up it begins in front
+        if side < -2:
+            level = wp.where(side == -3, -f64(ROUNDED), f64(ROUNDED)) * con.size[k][0]
+        reach = f64(2.0) * f64(ROUNDED) * con.size[k][0]
+        margin = vec3d(reach, reach, reach)
         base = con.mesh.box[k]
         inner = con.mesh.inner[k]
         waiting = ints()
@@ -266,10 +283,10 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
                         n = con.mesh.normal[0, t]
                         before = wp.dot(a - con.mesh.corner[0, t], n)
                         after = wp.dot(b - con.mesh.corner[0, t], n)
-                        enters = before >= -tol and after < f64(0.0) and after < before
-                        leaves = before < -tol and after >= f64(0.0)
+                        enters = before >= level and after < f64(0.0) and after < before
+                        leaves = before < level and after >= f64(0.0) and after > before
                         if enters or leaves:
-                            part = wp.max(before / (before - after), f64(0.0))
+                            part = wp.clamp(before / (before - after), f64(0.0), f64(1.0))
                             if within(con, t, a + part * (b - a), f64(1000.0) * tol):
                                 if enters and part < out.into:
                                     out.into = part
@@ -300,7 +317,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
     def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
         """See `contact_shapes`: the side through which a motion has passed the surface at its end, -1: none or any,
         -2: it went through."""
-        h = hits(con, k, start, end)
+        h = hits(con, k, start, end, side)
         d = end - start
         if side >= 0:
             leave = wp.where(side % 2 == 0, h.out, h.into)
@@ -340,4 +357,6 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
             return wp.vec2d(-wp.dot(n, local), f64(1.0))
         return wp.vec2d()
 
-    return _types.SimpleNamespace(distance=distance, sweep=sweep, side_after=side_after, deepening=deepening)
+    return _types.SimpleNamespace(
+        distance=distance, sweep=sweep, side_after=side_after, deepening=deepening, beside=beside
+    )

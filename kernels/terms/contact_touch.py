@@ -2,6 +2,7 @@
 
 import functools
 import types as _types
+from typing import Any
 
 import warp as wp
 
@@ -17,12 +18,18 @@ __all__ = ["touch_functions"]
 @functools.cache
 def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     """Device functions in one precision of the displacements; all but these is float64. `meshes`: a collider is one."""
-    T, vec3 = precision(dtype).T, precision(dtype).vec3
+    T = precision(dtype).T
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, Attempt = history_struct(), attempt_struct(dtype)
     colliders, laws = collider_functions(meshes), law_functions()
-    distance, sweep, deepening, SLIPS = colliders.distance, colliders.sweep, colliders.deepening, colliders.SLIPS
+    distance, sweep, deepening, known_side = (
+        colliders.distance,
+        colliders.sweep,
+        colliders.deepening,
+        colliders.known_side,
+    )
+    SLIPS = colliders.SLIPS
     normal_law, friction, smooth_friction = laws.normal_law, laws.friction, laws.smooth_friction
 
     @wp.struct
@@ -42,7 +49,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         y: vec3d  # place in the collider's frame
 
     @wp.func
-    def along(facets: Facets, field: wp.array2d(dtype=vec3), world: int, point: int, item: int) -> vec3d:
+    def along(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
         """sum_i s_i field_i at a point."""
         out = vec3d()
         for i in range(facets.conn.shape[0]):
@@ -57,7 +64,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return facets.shape[point, i, item]
 
     @wp.func
-    def acting(facets: Facets, at: Attempt, field: wp.array2d(dtype=vec3), world: int, point: int, item: int) -> vec3d:
+    def acting(facets: Facets, at: Attempt, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
         """sum_i s_i field_i where a point, or a lumped contact, acts."""
         if facets.moving == 0:
             return along(facets, field, world, point, item)
@@ -148,9 +155,9 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def touch(
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
-        u: wp.array2d(dtype=vec3), time: f64, inv_h: f64, shrink: f64,
+        u: wp.array2d(dtype=vec3d), time: f64, inv_h: f64, shrink: f64,
     ) -> Touch:  # fmt: skip
-        """A point at displacements u."""
+        """A point at displacements u, in float64, see contact_exact.py."""
         out = Touch()
         k = con.collider[c]
         rec = record_of(con, c, point)
@@ -158,10 +165,8 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         x = reference(facets, at, world, q, item) + moved
         turn = at.turn[world, k]
         out.y = wp.transpose(turn) * (x - at.place[world, k])
-        side = wp.int32(-1)
         live = his.speed[world, rec] > f64(0.0)
-        if live:
-            side = his.mark[world, rec] % SLIPS - 1
+        side = known_side(con, k, live, his.mark[world, rec])
         begins = reach(con, his, world, c, point, time, con.grow[world, k])
         d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
         out.side = -1
