@@ -159,7 +159,18 @@ def winding(mesh, places):
     return np.arctan2(over, under).sum(axis=1) / (2.0 * np.pi)
 
 
-CLOSED = {"box": lambda: boxed(cells=4), "octahedron": lambda: wf.TriMesh(*octahedron()), "dented": dented}
+def blade():
+    """An octahedron with edges of 17 degrees and needle tips."""
+    points, triangles = octahedron()
+    return wf.TriMesh(points * (1.0, 0.15, 1.0), triangles)
+
+
+CLOSED = {
+    "box": lambda: boxed(cells=4),
+    "octahedron": lambda: wf.TriMesh(*octahedron()),
+    "dented": dented,
+    "blade": blade,
+}
 
 
 @pytest.mark.parametrize("name", CLOSED)
@@ -189,7 +200,7 @@ def test_a_deep_tree_is_searched_alike_on_cuda():
 
 def test_places_over_edges_and_corners_are_told_in_or_out():
     """Where several triangles are equally near, a face's own normal may say the wrong side."""
-    for mesh in (wf.TriMesh(*octahedron()), dented(), boxed()):
+    for mesh in (wf.TriMesh(*octahedron()), dented(), boxed(), blade()):
         p = mesh.points[mesh.triangles]
         middles = 0.5 * (p + np.roll(p, 1, axis=1)).reshape(-1, 3)
         at = np.concatenate([middles, p.reshape(-1, 3)])
