@@ -90,7 +90,7 @@ def history_struct():
         grown: wp.array2d(dtype=wp.float64)  # `Contacts.grow` of the last step
         spring: wp.array2d(dtype=wp.vec3d)  # stretch of the friction spring, in the collider's frame (paper: world), m
         speed: wp.array2d(dtype=wp.float64)  # largest approach speed since birth, m/s; 0: not in contact
-        mark: wp.array2d(dtype=wp.int32)  # side of the shape + 1, and SLIPS where it slips
+        mark: wp.array2d(dtype=wp.int32)  # side + 1, and SLIPS where it slips; see known_side
         overlap: wp.array2d(dtype=wp.float64)  # stored at the start, m
         cap: wp.array2d(dtype=wp.float64)  # mu F_n of the last step, N over the point's share
         stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's share
