@@ -100,6 +100,7 @@ def touching_struct(dtype: str):
         listed: wp.array2d(dtype=wp.int32)  # [world, point] facet + 1 whose list it is in
         changed: wp.array(dtype=wp.int32)  # a point belongs into another list
         count: wp.array(dtype=wp.int32)  # [world facet] of lists in the making
+        chunk: wp.array2d(dtype=wp.int32)  # [world, chunk of facets] points before it
         points: wp.array2d(dtype=wp.int32)  # [world, facet] points of its list, which begins at `start`
         start: wp.array2d(dtype=wp.int32)
         entry: wp.array2d(dtype=wp.int32)  # [world, point]

@@ -21,7 +21,10 @@ from .pair_data import master_struct, seat_struct, touching_struct
 from .pair_places import place_functions
 from .pair_seek import THROUGH, seek_kernels
 
-__all__ = ["pair_kernels"]
+__all__ = ["CHUNK", "pair_kernels"]
+
+CHUNK = 64
+"""Facets whose lists are placed together."""
 
 
 @functools.cache
@@ -232,16 +235,33 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             wp.atomic_add(t.count, world * mas.count + f, 1)
 
     @wp.kernel(module=module)
-    def place_lists(mas: Masters, scan: wp.array(dtype=wp.int32), t: Touching):
-        """Where the lists begin, in each world, from the sums of counts up to each; and no points again."""
-        world, f = wp.tid()
-        i = world * mas.count + f
+    def sum_chunks(mas: Masters, t: Touching):
+        """Points in the lists of each chunk of facets."""
+        world, chunk = wp.tid()
+        total = wp.int32(0)
+        for f in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, mas.count)):
+            total += t.count[world * mas.count + f]
+        t.chunk[world, chunk] = total
+
+    @wp.kernel(module=module)
+    def scan_chunks(t: Touching):
+        """Points before each chunk."""
+        world = wp.tid()
         before = wp.int32(0)
-        if world > 0:
-            before = scan[world * mas.count - 1]
-        t.start[world, f] = scan[i] - t.count[i] - before
-        t.points[world, f] = t.count[i]
-        t.count[i] = 0
+        for chunk in range(t.chunk.shape[1]):
+            here = t.chunk[world, chunk]
+            t.chunk[world, chunk] = before
+            before += here
+
+    @wp.kernel(module=module)
+    def place_lists(mas: Masters, t: Touching):
+        """Where the lists begin in each world."""
+        world, f = wp.tid()
+        start = t.chunk[world, f / CHUNK]
+        for other in range(f / CHUNK * CHUNK, f):
+            start += t.count[world * mas.count + other]
+        t.start[world, f] = start
+        t.points[world, f] = 0
 
     @wp.kernel(module=module)
     def fill_lists(mas: Masters, t: Touching):
@@ -249,7 +269,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         world, point = wp.tid()
         f = t.listed[world, point] - 1
         if f >= 0:
-            k = wp.atomic_add(t.count, world * mas.count + f, 1)
+            k = wp.atomic_add(t.points, world, f, 1)
             t.entry[world, t.start[world, f] + k] = point
 
     @wp.kernel(module=module)
@@ -497,7 +517,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module, explicit_forces=explicit_forces, forces=forces, take_functions=take_functions, clear_lists=clear_lists,
-        count_points=count_points, place_lists=place_lists, fill_lists=fill_lists, sort_lists=sort_lists,
+        count_points=count_points, sum_chunks=sum_chunks, scan_chunks=scan_chunks, place_lists=place_lists, fill_lists=fill_lists, sort_lists=sort_lists,
         gather_masters=gather_masters, product_points=product_points, product_facets=product_facets,
         product_masters=product_masters, diagonal_masters=diagonal_masters, finish=finish, close=close,
     )  # fmt: skip

@@ -354,7 +354,7 @@ class ModelBuilder:
         """Add a rigid obstacle, which bodies feel where `add_contact` says so.
 
         Args:
-            shape: HalfSpace, Sphere, Box, Capsule or Cylinder, where it is at displacement 0.
+            shape: HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh, where it is at displacement 0.
             path: time law of its displacement (3,), m, or a Rotation; None: it is fixed.
             name: unique name; by default the shape's.
 

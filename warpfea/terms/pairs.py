@@ -17,7 +17,7 @@ from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, h
 from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pair_data import seat_struct, touching_struct
 from ..kernels.terms.pair_seek import seek_kernels
-from ..kernels.terms.pairs import pair_kernels
+from ..kernels.terms.pairs import CHUNK, pair_kernels
 from ..model.pairs import bernstein
 from .contact import TOUCHING
 from .contact_exact import Exact
@@ -109,6 +109,7 @@ class Pairs(Term):
         shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
         shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
         shapes |= dict.fromkeys(("points", "start", "loaded"), (B, F))
+        shapes |= {"chunk": (B, -(-F // CHUNK))}
         shapes |= dict.fromkeys(("weight", "held_weight"), (B, P, t.master_conn.shape[1]))
         out = touching_struct(self.model.dtype)()
         for name, var in touching_struct(self.model.dtype).vars.items():
@@ -134,7 +135,6 @@ class Pairs(Term):
             "active": work.newton.touching,
             "booked": work.array("pairs booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("pairs parts", (B, C, len(RECORD), LANES), wp.float64),
-            "scan": work.array("pairs scan", (B * t.facets,), wp.int32),
             "row_start": m.array("contact", t.row_start, wp.int32),
             "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
@@ -290,8 +290,9 @@ class Pairs(Term):
         touching, masters = s["touching"], s["masters"]
         at.launch(k.clear_lists, m.worlds * t.facets, [touching])
         at.launch(k.count_points, (m.worlds, t.points), [masters, touching])
-        wp.utils.array_scan(touching.count, s["scan"], inclusive=True)
-        at.launch(k.place_lists, (m.worlds, t.facets), [masters, s["scan"], touching])
+        at.launch(k.sum_chunks, touching.chunk.shape, [masters, touching])
+        at.launch(k.scan_chunks, m.worlds, [touching])
+        at.launch(k.place_lists, (m.worlds, t.facets), [masters, touching])
         at.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
         at.launch(k.sort_lists, (m.worlds, t.facets), [touching])
 
