@@ -29,7 +29,7 @@ from .time_laws import TimeLaws
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["PER_WORLD", "ContactTables", "block_entries", "FacetGroup", "beta_of", "hunt_crossley_damping"]
+__all__ = ["PER_WORLD", "ContactTables", "FacetGroup", "beta_of", "block_entries", "hunt_crossley_damping"]
 
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
 SMOOTHING = (1e-3, 1e-4)

@@ -15,9 +15,11 @@ from ..kernels.terms.contact import RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..kernels.terms.pair_blocks import pair_block_kernels
+from ..kernels.terms.pair_books import pair_book_kernels
 from ..kernels.terms.pair_data import seat_struct, touching_struct
+from ..kernels.terms.pair_lists import CHUNK, list_kernels
 from ..kernels.terms.pair_seek import seek_kernels
-from ..kernels.terms.pairs import CHUNK, pair_kernels
+from ..kernels.terms.pairs import pair_kernels
 from ..model.pairs import bernstein
 from .contact import TOUCHING
 from .contact_exact import Exact
@@ -52,8 +54,9 @@ class Pairs(Term):
         super().__init__(model)
         self.traits = Traits(walls=True)
         self.tables = PairTables(model)
-        self.shared, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        self.shared, self.books = contact_kernels(model.dtype, False), book_kernels(model.dtype, False)
         self.seek, self.kernels = seek_kernels(model.dtype), pair_kernels(model.dtype)
+        self.lists, self.ending = list_kernels(model.dtype), pair_book_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -286,7 +289,7 @@ class Pairs(Term):
 
     def _list(self, at: At) -> None:
         """Lists of the points of each master facet."""
-        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.kernels
+        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.lists
         touching, masters = s["touching"], s["masters"]
         at.launch(k.clear_lists, m.worlds * t.facets, [touching])
         at.launch(k.count_points, (m.worlds, t.points), [masters, touching])
@@ -343,7 +346,7 @@ class Pairs(Term):
         for group in t.groups:
             args = [t.data, s["masters"], group.data, s["history"], s["seats"], s["clock"], accepted]
             args += [s["attempt"], s["touching"], s["booked"]]
-            at.launch(self.kernels.finish, (m.worlds, group.count), args)
+            at.launch(self.ending.finish, (m.worlds, group.count), args)
         args = [t.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         at.launch(self.books.partial_records, (m.worlds, C, len(RECORD), LANES), args)
         args = [s["clock"], accepted, s["parts"], s["attempt"]]
@@ -355,7 +358,7 @@ class Pairs(Term):
         if not s["finished"]:  # without a ledger nothing is booked
             self._finish(at, accepted)
         args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
-        at.launch(self.kernels.close, self.model.worlds, args)
+        at.launch(self.ending.close, self.model.worlds, args)
 
     def report(self, at: At) -> None:
         args = [at.scratch[self.name]["attempt"], self.report_offset, at.work.report]
