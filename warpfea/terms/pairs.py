@@ -1,4 +1,4 @@
-"""Contact between bodies: a term whose potential is that of the points of slave surfaces, see kernels/terms/pairs.py."""
+"""Contact between bodies: a term with the potential of points of slave surfaces, see kernels/terms/pairs.py."""
 
 from __future__ import annotations
 
