@@ -47,7 +47,7 @@ class Pairs(Term):
     """
 
     name = "pairs"
-    columns = (Column("contact", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
+    columns = (Column("contact_pairs", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
     parts = {"pairs": "contact between bodies: search, forces, products, history"}
 
     def __init__(self, model: Model) -> None:
@@ -367,7 +367,7 @@ class Pairs(Term):
     def measure(self, at: At) -> dict[str, np.ndarray]:
         """Energy that the history says is stored, by points."""
         weights = np.concatenate([share.ravel() for share in self.tables.shares])
-        return {"contact": at.scratch[self.name]["history"].stored.numpy() @ weights}
+        return {"contact_pairs": at.scratch[self.name]["history"].stored.numpy() @ weights}
 
     # in a linear solve
 
