@@ -6,6 +6,7 @@ it is inside of a facet now and was outside of it as the step began; no candidat
 
 import functools
 import types as _types
+from typing import Any
 
 import warp as wp
 
@@ -32,10 +33,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     vec3 = p.vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
-    Contacts, Facets, History = contact_struct(), facet_struct(dtype), history_struct()
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
     Attempt, Clock = attempt_struct(dtype), clock_struct()
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
-    k, f = touch_functions(dtype), place_functions(dtype)
+    k, f = touch_functions(dtype, False), place_functions(dtype)
     along, reach, allowance = k.along, k.reach, k.allowance
     jet, moved, outside, middle, locate, follow, outward = (
         f.jet, f.moved, f.outside, f.middle, f.locate, f.follow, f.outward
@@ -43,15 +44,12 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     Jet = f.Jet
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
 
-    @wp.kernel(module=module)
-    def controls(
-        mas: Masters, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
+    @wp.func
+    def control(
+        mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
         D: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """Coefficients of a field of the slots on master facets."""
-        world, item, m = wp.tid()
-        if active[world] == 0 or m >= mas.terms[mas.kind[item]]:
-            return
+        """Coefficient m of a field of the slots on a master facet."""
         c = vec3d()
         d = vec3d()
         for i in range(mas.conn.shape[0]):
@@ -60,6 +58,27 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             d += f64(mas.rise[m, i, item]) * value
         C[world, mas.most * item + m] = c
         D[world, mas.most * item + m] = d
+
+    @wp.kernel(module=module)
+    def controls(
+        mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
+        D: wp.array2d(dtype=vec3d),
+    ):  # fmt: skip
+        """Coefficients of displacements on master facets, in float64, see contact_exact.py."""
+        world, item, m = wp.tid()
+        if active[world] != 0 and m < mas.terms[mas.kind[item]]:
+            control(mas, u, world, item, m, C, D)
+
+    @wp.kernel(module=module)
+    def controls_before(
+        mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
+        t: Touching,
+    ):  # fmt: skip
+        """Those of displacements and velocities as an attempt begins."""
+        world, item, m = wp.tid()
+        if active[world] != 0 and m < mas.terms[mas.kind[item]]:
+            control(mas, v_n, world, item, m, t.V0, t.D0)
+            control(mas, u_n, world, item, m, t.C0, t.D0)
 
     @wp.func
     def down(x: vec3d) -> box3:
@@ -188,7 +207,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def look_around(
-        con: Contacts, mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
+        con: Contacts, mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32),
         reaching: f64, t: Touching,
     ):  # fmt: skip
         """Whether a box of a master facet is near a slave facet; where none is, the box in which that holds."""
@@ -293,7 +312,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def seek(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        u: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: int,
+        u: wp.array2d(dtype=vec3d), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: int,
         at: Attempt, t: Touching,
     ):  # fmt: skip
         """The seat of each point at an iterate. `settling`: there is no step; what is inside is in contact."""
@@ -376,6 +395,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             t.seat[world, point] = THROUGH
 
     return _types.SimpleNamespace(
-        module=module, controls=controls, check_boxes=check_boxes, adopt_boxes=adopt_boxes, begin_points=begin_points,
-        look_around=look_around, seek=seek, frame=frame, Jet=Jet,
+        module=module, controls=controls, controls_before=controls_before,
+        check_boxes=check_boxes, adopt_boxes=adopt_boxes,
+        begin_points=begin_points, look_around=look_around, seek=seek, frame=frame,
     )  # fmt: skip

@@ -177,10 +177,15 @@ def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
         left = sum(c["left_out"] for c in contacts)
         return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_clamped(left)}"]]
     return [
-        [f"contact {c['name']}", f"body {c['body']} on {c['collider']}, law {c['law']}, {c['model']}, "
+        [f"contact {c['name']}", f"body {c['body']} on {c['collider']}{_triangles(c)}, law {c['law']}, {c['model']}, "
          f"{c['points']} points{_clamped(c['left_out'])}"]
         for c in contacts
     ]  # fmt: skip
+
+
+def _triangles(contact: dict[str, Any]) -> str:
+    """What to say of a collider that is a mesh."""
+    return f" ({contact['triangles']} triangles)" if "triangles" in contact else ""
 
 
 def _clamped(count: int) -> str:

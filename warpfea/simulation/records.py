@@ -12,8 +12,8 @@ from ..kernels.step.control import REPORT
 from ..kernels.terms.constraints import JOINT_COLUMNS
 from ..kernels.terms.contact_data import RECORD
 from ..model.contacts import Contact
-from ..model.pairs import PairContact
 from ..model.joints import Joint
+from ..model.pairs import PairContact
 from .reports import ContactRecord, JointRecord, ProbeRecord
 from .results import Results
 

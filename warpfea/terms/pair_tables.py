@@ -135,7 +135,7 @@ class PairTables:
 
     def _contacts(self) -> Any:
         m, C = self.model, self.contacts
-        out = contact_struct()()
+        out = contact_struct(False)()
 
         def put(name: str, values: Any, dtype: Any) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
