@@ -14,6 +14,9 @@ TURNS = 16
 OUTER = 0.05
 """Part of a side by which a place may lie beyond a facet: the outward vectors of two elements differ."""
 INNER = 1e-9
+STAY = 0.01
+"""By so much of a side a point may pass the border of the facet that it was on as the attempt began: one that lies on a
+border does not change facets from iterate to iterate."""
 
 
 @functools.cache
