@@ -30,9 +30,7 @@ def body(b, kind, name, z, side, cells, top=False):
         mesh = wf.mesh.grid((side, side), cells=(cells, cells), origin=(low, low, middle))
         return b.add_shell(mesh, thickness=thin, material=SOFT, name=name)
     element = kind if kind in ("T10", "H3843") else "T4"
-    mesh = wf.mesh.box(
-        (side,) * 3, cells=(cells,) * 3, origin=(low, low, z - side if top else z), element=element
-    )
+    mesh = wf.mesh.box((side,) * 3, cells=(cells,) * 3, origin=(low, low, z - side if top else z), element=element)
     options = {} if kind in ("T4", "T10") else {"element": kind}
     return b.add_solid(mesh, material=SOFT, name=name, **options)
 
@@ -64,7 +62,11 @@ def balance(sim, u=None):
     pool = work.pool_force.numpy()[0].astype(float)
     kind = np.concatenate([x.slot_kind for x in model.description.bodies])
     shift = np.concatenate([np.where(x.slot_kind[:, None] == 0, x.origin, 0.0) for x in model.description.bodies])
-    place = np.concatenate([x.reference for x in model.description.bodies]) + shift + (work.u.numpy()[0] if u is None else u)
+    place = (
+        np.concatenate([x.reference for x in model.description.bodies])
+        + shift
+        + (work.u.numpy()[0] if u is None else u)
+    )
     force, moment, size, first = np.zeros(3), np.zeros(3), 0.0, term.offset
     for conn in term.connectivity:
         f = pool[first : first + conn.size].reshape(conn.shape[1], conn.shape[0], 3)
