@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -93,7 +94,7 @@ def arch(mu):
         feet.append(b.add_solid(mesh, material=material, name=name))
         b.clamp(feet[-1].nodes(lambda X: np.ones(len(X), dtype=bool)))
     options = {"mu": mu, "stiffness": 20.0, "restitution": 0.1}
-    for one, other in zip(blocks, blocks[1:]):
+    for one, other in itertools.pairwise(blocks):
         b.add_contact(one.surface("x-"), other.surface("x+"), **options)
     b.add_contact(blocks[0].surface("x+"), feet[0].surface("z+"), **options)
     b.add_contact(blocks[-1].surface("x-"), feet[1].surface("z+"), **options)

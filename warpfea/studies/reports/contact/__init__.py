@@ -78,8 +78,8 @@ def cylinders(device: Any) -> Iterator[dict[str, Any]]:
 
 def stack(device: Any) -> Iterator[dict[str, Any]]:
     """Equal cubes, and a last one of a thousand times the mass, each soft and hard."""
-    for E, top in ((1e7, 1.0), (1e10, 1.0), (2e9, 1e3), (1e10, 1e3)):
-        yield stack_case(E, top, device=device)
+    for modulus, top in ((1e7, 1.0), (1e10, 1.0), (2e9, 1e3), (1e10, 1e3)):
+        yield stack_case(modulus, top, device=device)
 
 
 PARTS: dict[str, Part] = {f.__name__: f for f in (hertz, mindlin, rebound, wall, turntable, balls, cylinders, stack)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time as clock
 from typing import Any
 
@@ -34,7 +35,7 @@ def stack_case(
     b.clamp(bodies[0].nodes("z-"))
     pairs = [
         b.add_contact(upper, lower, mu=0.5, restitution=0.5, stiffness=stiffness)
-        for lower, upper in zip(bodies, bodies[1:])
+        for lower, upper in itertools.pairwise(bodies)
     ]
     sim = wf.Simulation(b.finalize(device=device), dt=dt)
     steps, rest = round(duration / dt), max(round(0.1 * duration / dt), round(0.5 / dt))
