@@ -98,7 +98,7 @@ def test_a_pair_is_in_balance(kind, role, law):
     sim = wf.Simulation(thrown(kind, role, **LAWS[law])[0], dt=DT, solver=TIGHT)
     began, _ = momenta(sim)
     pushed = 0.0
-    for _ in range(30):
+    for _ in range(18):
         before = sim.state.displacement.numpy()[0].copy()
         sim.step()
         force, moment, size = balance(sim, before if law == "explicit" else None)
@@ -116,13 +116,13 @@ def test_a_pair_in_single_precision(law):
     sim = wf.Simulation(thrown("T10", "slave", dtype="float32", **LAWS[law])[0], dt=DT)
     exact = wf.Simulation(thrown("T10", "slave", **LAWS[law])[0], dt=DT)
     began, _ = momenta(sim)
-    for _ in range(30):
+    for _ in range(18):
         before = sim.state.displacement.numpy()[0].copy()
         sim.step()
         force, moment, size = balance(sim, before if law == "explicit" else None)
         assert force <= 1e-6 * size
         assert moment <= 1e-6 * size * 0.16
-    exact.step(30)
+    exact.step(18)
     (ended, scale), (expected, _) = momenta(sim), momenta(exact)
     assert np.abs(ended.sum(axis=0) - began.sum(axis=0)).max() <= 1e-5 * scale
     assert np.abs(ended - expected).max() <= 0.02 * scale

@@ -68,7 +68,7 @@ def stresses(body, state):
 
 
 @pytest.mark.parametrize("element", ["T4", "T10"])
-@pytest.mark.parametrize("cells", [(4, 3), (3, 4), (5, 2)])
+@pytest.mark.parametrize("cells", [(4, 3), (2, 5)])
 def test_pressure_passes_through_flat_meshes(element, cells):
     """Two blocks between smooth walls, of `cells` across: the mean exactly, a layer from the contact each stress."""
     p, side, layers = 1e3, 0.1, 3
@@ -213,7 +213,7 @@ def test_coincident_start(how, speed):
 
 @pytest.mark.parametrize("slave", CELLS)
 @pytest.mark.parametrize("how", TURN)
-@pytest.mark.parametrize("dt", [1e-3, 1e-2])
+@pytest.mark.parametrize("dt", [1e-2, pytest.param(1e-3, marks=pytest.mark.slow)])
 def test_an_impact_beyond_the_law_is_refused(how, slave, dt):
     """100 m/s: the energy of 1 kg is 5 kJ, what the contact can store before its depth is reached is some joules."""
     sim, upper, _, pair = falling(how, speed=100.0, gap=0.013, cells=CELLS[slave], dt=dt)

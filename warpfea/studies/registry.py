@@ -118,11 +118,11 @@ _ENTRIES = (
     Entry(
         name="contact",
         module="reports.contact",
-        summary="contact with obstacles beside Hertz, Mindlin and finer runs, and at rest",
+        summary="contact beside Hertz, Mindlin and finer runs, and at rest",
         about="A rigid sphere pressed into a deep block and moved sideways: contact radius, peak pressure, stiffnesses "
         "and full slip beside the closed forms. An elastic ball thrown at a plane beside a quarter of the step and "
         "half the mesh size. A cube pressed to a wall, and one on a plate that turns: how far they move where "
-        "friction holds them.",
+        "friction holds them. Two elastic balls and cylinders pressed together beside Hertz; a stack of cubes at rest.",
         parts=(
             ("hertz", "contact radius and peak pressure"),
             ("mindlin", "tangential stiffness and full slip"),
@@ -135,7 +135,7 @@ _ENTRIES = (
         ),
         options=("device", "only"),
         example="--out tests/results/contact_hertz_cpu.json",
-        results=("contact_hertz_cpu.json", "contact_rest_cpu.json"),
+        results=("contact_hertz_cpu.json", "contact_rest_cpu.json", "contact_pairs_cpu.json"),
     ),
     Entry(
         name="conservation",

@@ -1,0 +1,40 @@
+"""The committed result of `warpfea study contact` on pairs: balls and cylinders beside Hertz, a stack that rests."""
+
+import json
+import pathlib
+
+import pytest
+
+RESULT = pathlib.Path(__file__).resolve().parent / "results" / "contact_pairs_cpu.json"
+
+
+@pytest.fixture(scope="module")
+def result():
+    content = json.loads(RESULT.read_text())
+    assert content["command"].startswith("warpfea study contact")
+    assert len(content["commit"]) >= 40
+    assert content["machine"]["device"] == "cpu"
+    return content
+
+
+@pytest.mark.parametrize(("part", "numbers"), [("balls", ("a_error", "p0_error", "approach_error")),
+                                               ("cylinders", ("a_error", "p0_error"))])  # fmt: skip
+def test_two_bodies_are_hertz(result, part, numbers):
+    """Meshes that do not match, of two moduli; the approach without what the contact's springs give."""
+    coarse, fine = sorted(result[part], key=lambda row: row["unknowns"])
+    assert fine["cells_per_radius"][0] != fine["cells_per_radius"][1]
+    assert fine["a_over_R"] <= 0.03
+    assert fine["depth_over_a"] >= 25.0
+    for name in numbers:
+        assert abs(fine[name]) < 0.03
+    assert fine["pressure_scatter"] < coarse["pressure_scatter"]
+    assert fine["newton"] <= 30 * fine["load_steps"]
+
+
+def test_stacks_rest(result):
+    assert [(row["E"], row["top"]) for row in result["stack"]] == [(1e7, 1.0), (1e10, 1.0), (2e9, 1e3), (1e10, 1e3)]
+    for row in result["stack"]:
+        assert row["cubes"] == 10
+        assert row["duration"] == 10.0
+        assert row["creep"] < 1e-3
+        assert row["force_error"] < 1e-5
