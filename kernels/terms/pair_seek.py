@@ -355,7 +355,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
         through = bool(False)
-        if best < 0 or off > f64(0.0):
+        if best < 0:
             low = wp.min(x, x0) - vec3d(pad, pad, pad)
             high = wp.max(x, x0) + vec3d(pad, pad, pad)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
