@@ -395,6 +395,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             t.seat[world, point] = THROUGH
 
     return _types.SimpleNamespace(
-        module=module, controls=controls, controls_before=controls_before, check_boxes=check_boxes, adopt_boxes=adopt_boxes, begin_points=begin_points,
-        look_around=look_around, seek=seek, frame=frame, Jet=Jet,
+        module=module, controls=controls, controls_before=controls_before, check_boxes=check_boxes,
+        adopt_boxes=adopt_boxes, begin_points=begin_points, look_around=look_around, seek=seek, frame=frame, down=down,
+        up=up, Jet=Jet,
     )  # fmt: skip
