@@ -177,7 +177,7 @@ def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
         left = sum(c["left_out"] for c in contacts)
         return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_clamped(left)}"]]
     return [
-        [f"contact {c['name']}", f"body {c['body']} on {c['collider']}, law {c['law']}, {c['model']}, "
+        [f"contact {c['name']}", f"body {c['body']} on {c.get('collider') or 'body ' + c['with']}, law {c['law']}, {c['model']}, "
          f"{c['points']} points{_clamped(c['left_out'])}"]
         for c in contacts
     ]  # fmt: skip
