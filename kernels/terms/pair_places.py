@@ -12,7 +12,7 @@ __all__ = ["INNER", "OUTER", "place_functions"]
 TURNS = 16
 """Newton's steps of a place."""
 OUTER = 0.05
-"""By so much of a side a place may lie beyond a facet that another continues: outward vectors of two elements differ."""
+"""Part of a side by which a place may lie beyond a facet: the outward vectors of two elements differ."""
 INNER = 1e-9
 
 

@@ -33,10 +33,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     vec3 = p.vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
-    Contacts, Facets, History = contact_struct(), facet_struct(dtype), history_struct()
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
     Attempt, Clock = attempt_struct(dtype), clock_struct()
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
-    k, f = touch_functions(dtype), place_functions(dtype)
+    k, f = touch_functions(dtype, False), place_functions(dtype)
     along, reach, allowance = k.along, k.reach, k.allowance
     jet, moved, outside, middle, locate, follow, outward = (
         f.jet, f.moved, f.outside, f.middle, f.locate, f.follow, f.outward

@@ -177,10 +177,17 @@ def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
         left = sum(c["left_out"] for c in contacts)
         return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_clamped(left)}"]]
     return [
-        [f"contact {c['name']}", f"body {c['body']} on {c.get('collider') or 'body ' + c['with']}, law {c['law']}, {c['model']}, "
+        [f"contact {c['name']}", f"body {c['body']} on {_other(c)}, law {c['law']}, {c['model']}, "
          f"{c['points']} points{_clamped(c['left_out'])}"]
         for c in contacts
     ]  # fmt: skip
+
+
+def _other(contact: dict[str, Any]) -> str:
+    """The collider or body that the body of a contact touches; of one that is a mesh its triangles."""
+    if "with" in contact:
+        return f"body {contact['with']}"
+    return contact["collider"] + (f" ({contact['triangles']} triangles)" if "triangles" in contact else "")
 
 
 def _clamped(count: int) -> str:

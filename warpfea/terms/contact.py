@@ -15,10 +15,12 @@ from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
+from ..model.triangle_mesh import TriMesh
 from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle_patches
 from .contact_parameters import collider_parameters, contact_parameters
 from .contact_places import Places, at_points
+from .contact_sheets import points_across
 from .contact_tables import ContactTables, block_entries
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, Term, part
 from .time_laws import TimeLaws
@@ -55,7 +57,8 @@ class Contact(Term):
         super().__init__(model)
         self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
-        self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        meshes = self.tables.meshes
+        self.kernels, self.books = contact_kernels(model.dtype, meshes), book_kernels(model.dtype, meshes)
         self.places = Places(self.tables) if self.tables.lumped else None
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
@@ -171,6 +174,8 @@ class Contact(Term):
         gap, _ = self.at_points(state, history, places=False)
         u = state.displacement.numpy()
         touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
+        if self.tables.sheets and new.any():
+            self._refuse_across(points_across(self.tables, s["attempt"], state.displacement, touching, at.launch), new)
         for k, contact in enumerate(self.tables.contacts):
             first, last = self.tables.first[k], self.tables.first[k + 1]
             depth = np.where(new[:, None], -gap[:, first:last], 0.0)
@@ -188,6 +193,17 @@ class Contact(Term):
             depth = np.maximum(depth[deep], 0.0)
             overlap[deep, first:last] = depth.max(axis=1, keepdims=True) if contact.model == "sphere" else depth
         history.overlap.assign(overlap)
+
+    def _refuse_across(self, points: np.ndarray, new: np.ndarray) -> None:
+        """Raise ModelError where a body begins on both sides of a sheet; `points`: as of points_across."""
+        for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
+            k = int(np.searchsorted(self.tables.row_start, row, side="right")) - 1
+            contact, where = self.tables.contacts[k], self._where(k, int(points[world, row]) - 1 - self.tables.first[k])
+            raise ModelError(
+                f"contact {contact.name!r}: body {contact.body.name!r} begins on both sides of collider "
+                f"{contact.collider.name!r}, or on it and behind (world {world}, reference point {where}); move one of "
+                "them: bodies on a sheet of triangles are in front of it"
+            )
 
     def rewind(self, state: State) -> None:
         """Stored overlaps keep their age."""
@@ -381,6 +397,8 @@ class Contact(Term):
             k = t.number[contact.index]
             facts = {"name": contact.name, "body": contact.body.name, "collider": contact.collider.name}
             numbers = {"points": int((t.shares[k] > 0.0).sum()), "left_out": t.left_out[k]}
+            if isinstance(contact.collider.shape, TriMesh):
+                numbers["triangles"] = len(contact.collider.shape.triangles)
             out.append(facts | {"law": contact.law, "model": contact.model} | numbers)
         return out
 

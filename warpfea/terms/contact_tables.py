@@ -22,12 +22,14 @@ from ..model.contact_points import (
     lagrange_basis,
 )
 from ..model.contacts import Collider, Contact
+from ..model.triangle_mesh import TriMesh
+from .collider_meshes import mesh_tables, sizes
 from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["PER_WORLD", "ContactTables", "block_entries", "FacetGroup", "beta_of", "hunt_crossley_damping"]
+__all__ = ["PER_WORLD", "ContactTables", "FacetGroup", "beta_of", "block_entries", "hunt_crossley_damping"]
 
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
 SMOOTHING = (1e-3, 1e-4)
@@ -66,6 +68,15 @@ def hunt_crossley_damping(restitution: float) -> float:
         return 0.0
     # below e of about 0.02 the root is nearer to 1/e than numbers can be
     return float(brentq(excess, low, high, xtol=1e-15)) if excess(high) < 0.0 else high
+
+
+def clamped_slots(model: Model) -> np.ndarray:
+    """(slots,) whether a slot is held in all directions by supports that never move."""
+    held = np.zeros((model.slots, 3))
+    for support in model.description.supports:
+        if support.law is None and support.node_laws is None and support.rotation is None:
+            held[support.body.slot_offset + support.slots] += support.components
+    return np.asarray((held > 0).all(axis=1))
 
 
 @dataclass(eq=False)
@@ -109,7 +120,7 @@ class ContactTables:
         self.contacts: list[Contact] = [found[k][0] for k in order]
         self.host: list[ContactPoints] = [found[k][1] for k in order]
         self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
-        self.clamped = self._clamped()
+        self.clamped = clamped_slots(model)
         self.left_out: list[int] = []
         self.shares = [self._share(c, p) for c, p in zip(self.contacts, self.host)]
         self.groups: list[FacetGroup] = []
@@ -127,17 +138,19 @@ class ContactTables:
         return any(group.data.moving for group in self.groups)
 
     @property
+    def meshes(self) -> bool:
+        """Whether a collider is a mesh of triangles."""
+        return any(isinstance(collider.shape, TriMesh) for collider in self.colliders)
+
+    @property
+    def sheets(self) -> bool:
+        """Whether one of these has no inside."""
+        return any(isinstance(k.shape, TriMesh) and not k.shape.closed for k in self.colliders)
+
+    @property
     def explicit(self) -> bool:
         """Whether a contact has the force of the last state."""
         return any(contact.treatment == "explicit" for contact in self.contacts)
-
-    def _clamped(self) -> np.ndarray:
-        """(slots,) whether a slot is held in all directions by supports that never move."""
-        held = np.zeros((self.model.slots, 3))
-        for support in self.model.description.supports:
-            if support.law is None and support.node_laws is None and support.rotation is None:
-                held[support.body.slot_offset + support.slots] += support.components
-        return np.asarray((held > 0).all(axis=1))
 
     def _share(self, contact: Contact, p: ContactPoints) -> np.ndarray:
         """(F, P) area of each point over that of the region; 0 where it only moves with clamped slots."""
@@ -203,7 +216,7 @@ class ContactTables:
 
     def _contacts(self, laws: TimeLaws) -> Any:
         m, C, K = self.model, self.contacts, self.colliders
-        out = contact_struct()()
+        out = contact_struct(self.meshes)()
 
         def put(name: str, values: Any, dtype: Any) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
@@ -230,14 +243,20 @@ class ContactTables:
             put(name, np.tile(values, (m.worlds, 1)), wp.float64)
         frames = [k.shape.frame() for k in K]
         put("kind", [k.shape.kind for k in K], wp.int32)
-        put("size", [k.shape.sizes for k in K], wp.vec3d)
+        put("size", [sizes(k.shape, self._touching(k)) for k in K], wp.vec3d)
         put("center", [center for center, _ in frames], wp.vec3d)
         put("axes", [axes for _, axes in frames], wp.mat33d)
         put("path", [laws.add(k.law) if k.law is not None else -1 for k in K], wp.int32)
         put("spin", [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K], wp.int32)
         put("anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)
         put("axis", [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K], wp.vec3d)
+        if self.meshes:
+            out.mesh = mesh_tables(m, [k.shape for k in K])
         return out
+
+    def _touching(self, collider: Collider) -> list[np.ndarray]:
+        """Points of the surfaces that may touch a collider, (n, 3), m."""
+        return [p.X.reshape(-1, 3) for c, p in zip(self.contacts, self.host) if c.collider is collider]
 
     def hash(self, h: Any) -> None:
         """Feed what defines the contacts into a hash."""
@@ -245,6 +264,8 @@ class ContactTables:
             center, axes = collider.shape.frame()
             h.update(f"{collider.name} {collider.shape.kind}".encode())
             h.update(np.concatenate([collider.shape.sizes, center, axes.ravel()]).tobytes())
+            if isinstance(collider.shape, TriMesh):
+                h.update(collider.shape.points.tobytes() + collider.shape.triangles.tobytes())
             if collider.rotation is not None:
                 h.update(np.concatenate([collider.rotation.anchor, collider.rotation.axis]).tobytes())
         for contact, p in zip(self.contacts, self.host):

@@ -1,4 +1,4 @@
-"""Contact between bodies: a term whose potential is that of the points of slave surfaces, see kernels/terms/pairs.py."""
+"""Contact between bodies: a term with the potential of points of slave surfaces, see kernels/terms/pairs.py."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from ..kernels.terms.contact import RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..kernels.terms.pair_blocks import pair_block_kernels
+from ..kernels.terms.pair_books import pair_book_kernels
 from ..kernels.terms.pair_data import seat_struct, touching_struct
+from ..kernels.terms.pair_lists import CHUNK, list_kernels
 from ..kernels.terms.pair_seek import seek_kernels
 from ..kernels.terms.pairs import pair_kernels
 from ..model.pairs import bernstein
@@ -56,8 +58,9 @@ class Pairs(Term):
         super().__init__(model)
         self.traits = Traits(walls=True)
         self.tables = PairTables(model)
-        self.shared, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        self.shared, self.books = contact_kernels(model.dtype, False), book_kernels(model.dtype, False)
         self.seek, self.kernels = seek_kernels(model.dtype), pair_kernels(model.dtype)
+        self.lists, self.ending = list_kernels(model.dtype), pair_book_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -113,6 +116,7 @@ class Pairs(Term):
         shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
         shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
         shapes |= dict.fromkeys(("points", "start", "loaded"), (B, F))
+        shapes |= {"chunk": (B, -(-F // CHUNK))}
         shapes |= dict.fromkeys(("weight", "held_weight"), (B, P, t.master_conn.shape[1]))
         out = touching_struct(self.model.dtype)()
         for name, var in touching_struct(self.model.dtype).vars.items():
@@ -138,7 +142,6 @@ class Pairs(Term):
             "active": work.newton.touching,
             "booked": work.array("pairs booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("pairs parts", (B, C, len(RECORD), LANES), wp.float64),
-            "scan": work.array("pairs scan", (B * t.facets,), wp.int32),
             "row_start": m.array("contact", t.row_start, wp.int32),
             "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
@@ -187,7 +190,7 @@ class Pairs(Term):
         new = (active.numpy() != 0) & ~(history.speed.numpy() > 0.0).any(axis=1)
         if not new.any():
             return
-        flags = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
+        flags: wp.array = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
         overlap, born = history.overlap.numpy(), history.born.numpy()
         overlap[new] = 0.0
         born[new] = at.state.time.numpy()[new]
@@ -218,6 +221,11 @@ class Pairs(Term):
                 )
             overlap[deep, first:last] = np.maximum(part_of[deep], 0.0)
         history.overlap.assign(overlap)
+
+    def rewind(self, state: State) -> None:
+        """Stored overlaps keep their age."""
+        if "pairs_born" in state.specs:
+            state.pairs_born.assign(state.pairs_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
     def _where(self, k: int, point: int) -> str:
         """Reference place of a point of a contact."""
@@ -291,12 +299,13 @@ class Pairs(Term):
 
     def _list(self, at: At) -> None:
         """Lists of the points of each master facet."""
-        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.kernels
+        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.lists
         touching, masters = s["touching"], s["masters"]
         at.launch(k.clear_lists, m.worlds * t.facets, [touching])
         at.launch(k.count_points, (m.worlds, t.points), [masters, touching])
-        wp.utils.array_scan(touching.count, s["scan"], inclusive=True)
-        at.launch(k.place_lists, (m.worlds, t.facets), [masters, s["scan"], touching])
+        at.launch(k.sum_chunks, touching.chunk.shape, [masters, touching])
+        at.launch(k.scan_chunks, m.worlds, [touching])
+        at.launch(k.place_lists, (m.worlds, t.facets), [masters, touching])
         at.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
         at.launch(k.sort_lists, (m.worlds, t.facets), [touching])
 
@@ -347,7 +356,7 @@ class Pairs(Term):
         for group in t.groups:
             args = [t.data, s["masters"], group.data, s["history"], s["seats"], s["clock"], accepted]
             args += [s["attempt"], s["touching"], s["booked"]]
-            at.launch(self.kernels.finish, (m.worlds, group.count), args)
+            at.launch(self.ending.finish, (m.worlds, group.count), args)
         args = [t.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         at.launch(self.books.partial_records, (m.worlds, C, len(RECORD), LANES), args)
         args = [s["clock"], accepted, s["parts"], s["attempt"]]
@@ -359,7 +368,7 @@ class Pairs(Term):
         if not s["finished"]:  # without a ledger nothing is booked
             self._finish(at, accepted)
         args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
-        at.launch(self.kernels.close, self.model.worlds, args)
+        at.launch(self.ending.close, self.model.worlds, args)
 
     def report(self, at: At) -> None:
         args = [at.scratch[self.name]["attempt"], self.report_offset, at.work.report]
