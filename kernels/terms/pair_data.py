@@ -93,7 +93,9 @@ def touching_struct(dtype: str):
         weight: wp.array3d(dtype=T)  # [world, point, local] functions of the master's slots
         held_weight: wp.array3d(dtype=T)  # functions that friction acts by, held with its cap
         held_motion: wp.array2d(dtype=wp.vec3d)
-        held_whole: wp.array2d(dtype=wp.vec3d)  # motion and spring when they were taken, and the relative displacement by them
+        held_whole: wp.array2d(
+            dtype=wp.vec3d
+        )  # motion and spring when they were taken, and the relative displacement by them
         held_shift: wp.array2d(dtype=wp.vec3d)
         held_facet: wp.array2d(dtype=wp.int32)
         friction: wp.array2d(dtype=wp.vec3d)  # part of a point's force that acts by them, N

@@ -77,7 +77,9 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         spot = t.spot0[world, point]
         s = jet(mas, t.C0, t.D0, world, f, spot)
         n = wp.normalize(wp.cross(s.a, s.b))
-        v = k.along(facets, v_n, world, q, item) - places.moved(mas, t.V0, t.V0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
+        v = k.along(facets, v_n, world, q, item) - places.moved(
+            mas, t.V0, t.V0, world, f, vec3d(spot[0], spot[1], f64(0.0))
+        )
         v_n_rel = wp.dot(v, n)
         v_t = v - v_n_rel * n
         scale = con.scale[world, c]
@@ -282,7 +284,9 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             for k in range(count):
                 point = t.entry[world, t.start[world, f] + k]
                 rest = at.force[world, point] - t.friction[world, point]
-                total -= t.weight[world, point, i] * vec3(rest) + t.held_weight[world, point, i] * vec3(t.friction[world, point])
+                total -= t.weight[world, point, i] * vec3(rest) + t.held_weight[world, point, i] * vec3(
+                    t.friction[world, point]
+                )
             pool[world, mas.pool + i * mas.count + f] = total
 
     @wp.func

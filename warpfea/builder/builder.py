@@ -400,7 +400,9 @@ class ModelBuilder:
         """
         self._own(surface, "add_contact", Body, SurfaceSet)
         if collider is None:
-            raise NotImplementedError("add_contact: a body with itself is a later part; give a collider or another body")
+            raise NotImplementedError(
+                "add_contact: a body with itself is a later part; give a collider or another body"
+            )
         options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
                        stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
                        smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip

@@ -112,7 +112,9 @@ def make_pair(
     for k in corners:
         if points is not None and (not is_count(points) or points not in PAIR_RULES[k]):
             numbers = ", ".join(map(str, PAIR_RULES[k]))
-            raise ModelError(f"{what}: points = {points!r}: faces of {slave.body.name!r} have rules of {numbers} points")
+            raise ModelError(
+                f"{what}: points = {points!r}: faces of {slave.body.name!r} have rules of {numbers} points"
+            )
     o["points"] = None if points is None else int(points)
     return PairContact(a, b, name, slave, master, index=len(d.pairs), **o)
 

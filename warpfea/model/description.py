@@ -131,7 +131,11 @@ class Description:
         """What there is, in one line; "" of an empty description."""
         loads = len(self.dead_loads) + len(self.pressures) + len(self.moments) + len(self.body_forces)
         counts = {"support": len(self.supports), "load": loads, "joint": len(self.joints)}
-        counts |= {"collider": len(self.colliders), "contact": len(self.contacts) + len(self.pairs), "probe": len(self.probes)}
+        counts |= {
+            "collider": len(self.colliders),
+            "contact": len(self.contacts) + len(self.pairs),
+            "probe": len(self.probes),
+        }
         parts = [repr(body) for body in self.bodies] if len(self.bodies) <= 3 else [f"{len(self.bodies)} bodies"]
         return ", ".join(parts + [f"{n} {what}{'s' * (n > 1)}" for what, n in counts.items() if n])
 
