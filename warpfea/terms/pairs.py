@@ -25,6 +25,7 @@ from .contact import TOUCHING
 from .contact_exact import Exact
 from .contact_parameters import contact_parameters
 from .contact_tables import block_entries
+from .pair_motions import PairMotions
 from .pair_tables import PairTables
 from .term import LOSS, STORED, At, Column, Term, part
 
@@ -374,7 +375,7 @@ class Pairs(Term):
     def keep(self, at: At) -> list[tuple[str, wp.array]]:
         s = at.scratch[self.name]
         t = s["touching"]
-        arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight}
+        arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight, "listed": t.listed}
         return [("stiffness", s["attempt"].stiffness), *arrays.items()]
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
@@ -388,7 +389,7 @@ class Pairs(Term):
     ) -> None:  # fmt: skip
         """The points' stiffness on their own facets and on master facets; not what couples both."""
         m, t = self.model, self.tables
-        stiffness, points, start, entry, weight = kept
+        stiffness, points, start, entry, weight, _ = kept
         *slaves, masters = m.cache["pair blocks"]
         add = contact_block_kernels(m.dtype).add_contact
         for group, (index, begin, source, count) in zip(t.groups, slaves):
@@ -402,6 +403,18 @@ class Pairs(Term):
     def block_modules(self) -> set[wp.Module]:
         dtype = self.model.dtype
         return {contact_block_kernels(dtype).module, pair_block_kernels(dtype).module}
+
+    def couples(self) -> list[tuple[int, int]]:
+        number = self.model.bodies.index
+        return [(number(contact.first.body), number(contact.second.body)) for contact in self.tables.contacts]
+
+    def reserve_motions(self, at: At, motions: Any) -> Iterable[wp.Module]:
+        s = at.scratch[self.name]
+        s["motions"] = PairMotions(at, self.tables, s["masters"], motions)
+        return {s["motions"].kernels.module}
+
+    def couple(self, at: At, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        at.scratch[self.name]["motions"].add(kept, dq_dv, active)
 
     # results
 
