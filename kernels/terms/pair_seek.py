@@ -355,7 +355,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
         through = bool(False)
-        if best < 0 or off > f64(0.0):
+        if best < 0:
             low = wp.min(x, x0) - vec3d(pad, pad, pad)
             high = wp.max(x, x0) + vec3d(pad, pad, pad)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
@@ -395,7 +395,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             t.seat[world, point] = THROUGH
 
     return _types.SimpleNamespace(
-        module=module, controls=controls, controls_before=controls_before,
-        check_boxes=check_boxes, adopt_boxes=adopt_boxes,
-        begin_points=begin_points, look_around=look_around, seek=seek, frame=frame,
+        module=module, controls=controls, controls_before=controls_before, check_boxes=check_boxes,
+        adopt_boxes=adopt_boxes, begin_points=begin_points, look_around=look_around, seek=seek, frame=frame, down=down,
+        up=up,
     )  # fmt: skip

@@ -17,12 +17,12 @@ from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, h
 from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from .contact_exact import Exact
-from .contact_fields import contact_field, nodal_force
+from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle_patches
 from .contact_parameters import collider_parameters, contact_parameters
 from .contact_places import Places, at_points
 from .contact_sheets import refuse_across
 from .contact_tables import ContactTables, block_entries
-from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
+from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, Term, part
 from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
@@ -50,10 +50,7 @@ class Contact(Term):
         Column("collider_work", WORK),
         Column("", NUMERICAL),
     )
-    fields = {
-        "contact_pressure": FieldSpec("contact pressure", "Pa"),
-        "gap": FieldSpec("gap to the nearest obstacle in contact", "m"),
-    }
+    fields = CONTACT_FIELDS
     parts = {"contact": "contact with obstacles: forces, products, history"}
 
     def __init__(self, model: Model) -> None:
@@ -407,14 +404,10 @@ class Contact(Term):
             return None
         return state.contact_place.numpy(), state.contact_turn.numpy(), self.tables.data.grow.numpy()  # type: ignore[attr-defined]
 
-    def sample(self, field: str, body: Any, state: State) -> np.ndarray:
-        """Of a node of a beam the values at the corner of its section with most contact, of a shell at that face."""
-        values = self.samples(field, body, state).reshape(state.worlds, len(body.mesh.points), -1)
-        # least of the gaps; fmin passes over NaN
-        return values.max(axis=2) if field == "contact_pressure" else np.fmin.reduce(values, axis=2)
-
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
-        return contact_field(self.tables, field, body, state.worlds, lambda: self.at_points(state))
+        mine = any(contact.body is body for contact in self.tables.contacts)
+        patches = obstacle_patches(self.tables, body, *self.at_points(state)) if mine else []
+        return contact_field(field, body, state.worlds, patches)
 
     def at_points(self, state: State, history: Any = None, *, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; with `places`

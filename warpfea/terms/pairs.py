@@ -21,11 +21,14 @@ from ..kernels.terms.pair_lists import CHUNK, list_kernels
 from ..kernels.terms.pair_seek import seek_kernels
 from ..kernels.terms.pairs import pair_kernels
 from ..model.pairs import bernstein
+from ..model.state import State
 from .contact import TOUCHING
 from .contact_exact import Exact
+from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
 from .contact_tables import block_entries
 from .pair_motions import PairMotions
+from .pair_survey import survey
 from .pair_tables import PairTables
 from .term import LOSS, STORED, At, Column, Term, part
 
@@ -49,6 +52,7 @@ class Pairs(Term):
 
     name = "pairs"
     columns = (Column("contact_pairs", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
+    fields = CONTACT_FIELDS
     parts = {"pairs": "contact between bodies: search, forces, products, history"}
 
     def __init__(self, model: Model) -> None:
@@ -152,23 +156,24 @@ class Pairs(Term):
             nodes = np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X)
             low.append(nodes.min(axis=1))
             high.append(nodes.max(axis=1))
-        counts = [len(mas.conn) for mas in t.masters]
-        group = np.repeat(np.arange(len(counts)), counts)
-        groups = (np.arange(B)[:, None] * len(counts) + group).ravel()
         touching.lower.assign(np.tile(np.concatenate(low), (B, 1)).astype(np.float32))
         touching.upper.assign(np.tile(np.concatenate(high), (B, 1)).astype(np.float32))
-        array = wp.array(groups, dtype=wp.int32, device=self.model.device)
-        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=array)
+        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=t.box_groups)
 
-    def register(self, at: At) -> None:
+    def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
+        """The structs of history and seats, with arrays from make(name, dtype, shape of a world)."""
         history, seats = history_struct()(), seat_struct()()
         points = (self.tables.points,)
         for name, var in history_struct().vars.items():
             if name not in KEPT:
                 shape = () if name in ("born", "posed") else points
-                setattr(history, name, at.state.register(f"pairs_{name}", var.type.dtype, shape))
+                setattr(history, name, make(f"pairs_{name}", var.type.dtype, shape))
         for name, var in seat_struct().vars.items():
-            setattr(seats, name, at.state.register(f"pairs_{name}", var.type.dtype, points))
+            setattr(seats, name, make(f"pairs_{name}", var.type.dtype, points))
+        return history, seats
+
+    def register(self, at: At) -> None:
+        history, seats = self.history_of(at.state.register)
         at.scratch[self.name] = {"history": history, "seats": seats}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
@@ -450,3 +455,14 @@ class Pairs(Term):
             numbers = {"points": int((t.shares[k] > 0.0).sum()), "facets": len(t.masters[t.of[k]].conn), "left_out": 0}
             out.append(names | {"law": contact.law, "model": contact.model} | numbers)
         return out
+
+    # at a state
+
+    def nodal_force(self, state: State) -> np.ndarray:
+        """Elastic forces of all contacts on slots of both bodies, (worlds, slots, 3), N, at a state."""
+        return survey(self, state).nodal_force()
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        bodies = [side.body for contact in self.tables.contacts for side in (contact.slave, contact.master)]
+        patches = survey(self, state).patches(body) if body in bodies else []
+        return contact_field(field, body, state.worlds, patches)
