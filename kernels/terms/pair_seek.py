@@ -397,5 +397,5 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     return _types.SimpleNamespace(
         module=module, controls=controls, controls_before=controls_before, check_boxes=check_boxes,
         adopt_boxes=adopt_boxes, begin_points=begin_points, look_around=look_around, seek=seek, frame=frame, down=down,
-        up=up, Jet=Jet,
+        up=up,
     )  # fmt: skip

@@ -20,7 +20,7 @@ from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle_patches
 from .contact_parameters import collider_parameters, contact_parameters
 from .contact_places import Places, at_points
-from .contact_sheets import points_across
+from .contact_sheets import refuse_across
 from .contact_tables import ContactTables, block_entries
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, Term, part
 from .time_laws import TimeLaws
@@ -175,7 +175,7 @@ class Contact(Term):
         u = state.displacement.numpy()
         touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
         if self.tables.sheets and new.any():
-            self._refuse_across(points_across(self.tables, s["attempt"], state.displacement, touching, at.launch), new)
+            refuse_across(self, s["attempt"], state.displacement, touching, new, at.launch)
         for k, contact in enumerate(self.tables.contacts):
             first, last = self.tables.first[k], self.tables.first[k + 1]
             depth = np.where(new[:, None], -gap[:, first:last], 0.0)
@@ -184,7 +184,7 @@ class Contact(Term):
                 continue
             if contact.overlap == "refuse":
                 world, point = np.unravel_index(int(depth.argmax()), depth.shape)
-                where = self._where(k, int(point))
+                where = self.where(k, int(point))
                 raise ModelError(
                     f"contact {contact.name!r}: body {contact.body.name!r} begins {depth.max():.3g} m inside collider "
                     f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
@@ -194,23 +194,12 @@ class Contact(Term):
             overlap[deep, first:last] = depth.max(axis=1, keepdims=True) if contact.model == "sphere" else depth
         history.overlap.assign(overlap)
 
-    def _refuse_across(self, points: np.ndarray, new: np.ndarray) -> None:
-        """Raise ModelError where a body begins on both sides of a sheet; `points`: as of points_across."""
-        for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
-            k = int(np.searchsorted(self.tables.row_start, row, side="right")) - 1
-            contact, where = self.tables.contacts[k], self._where(k, int(points[world, row]) - 1 - self.tables.first[k])
-            raise ModelError(
-                f"contact {contact.name!r}: body {contact.body.name!r} begins on both sides of collider "
-                f"{contact.collider.name!r}, or on it and behind (world {world}, reference point {where}); move one of "
-                "them: bodies on a sheet of triangles are in front of it"
-            )
-
     def rewind(self, state: State) -> None:
         """Stored overlaps keep their age."""
         if "contact_born" in state.specs:
             state.contact_born.assign(state.contact_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
-    def _where(self, k: int, point: int) -> str:
+    def where(self, k: int, point: int) -> str:
         """Reference place of a point of a contact."""
         X = self.tables.host[k].X.reshape(-1, 3)[point]
         return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
@@ -371,7 +360,7 @@ class Contact(Term):
             )
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
-            f"{self._where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
+            f"{self.where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
             "smaller dt, a larger stiffness= of the contact, or a thicker shape"
         )
 

@@ -27,6 +27,7 @@ from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
 from .contact_tables import block_entries
+from .pair_motions import PairMotions
 from .pair_survey import survey
 from .pair_tables import PairTables
 from .term import LOSS, STORED, At, Column, Term, part
@@ -50,7 +51,7 @@ class Pairs(Term):
     """
 
     name = "pairs"
-    columns = (Column("contact", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
+    columns = (Column("contact_pairs", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
     fields = CONTACT_FIELDS
     parts = {"pairs": "contact between bodies: search, forces, products, history"}
 
@@ -377,14 +378,14 @@ class Pairs(Term):
     def measure(self, at: At) -> dict[str, np.ndarray]:
         """Energy that the history says is stored, by points."""
         weights = np.concatenate([share.ravel() for share in self.tables.shares])
-        return {"contact": at.scratch[self.name]["history"].stored.numpy() @ weights}
+        return {"contact_pairs": at.scratch[self.name]["history"].stored.numpy() @ weights}
 
     # in a linear solve
 
     def keep(self, at: At) -> list[tuple[str, wp.array]]:
         s = at.scratch[self.name]
         t = s["touching"]
-        arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight}
+        arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight, "listed": t.listed}
         return [("stiffness", s["attempt"].stiffness), *arrays.items()]
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
@@ -398,7 +399,7 @@ class Pairs(Term):
     ) -> None:  # fmt: skip
         """The points' stiffness on their own facets and on master facets; not what couples both."""
         m, t = self.model, self.tables
-        stiffness, points, start, entry, weight = kept
+        stiffness, points, start, entry, weight, _ = kept
         *slaves, masters = m.cache["pair blocks"]
         add = contact_block_kernels(m.dtype).add_contact
         for group, (index, begin, source, count) in zip(t.groups, slaves):
@@ -412,6 +413,18 @@ class Pairs(Term):
     def block_modules(self) -> set[wp.Module]:
         dtype = self.model.dtype
         return {contact_block_kernels(dtype).module, pair_block_kernels(dtype).module}
+
+    def couples(self) -> list[tuple[int, int]]:
+        number = self.model.bodies.index
+        return [(number(contact.first.body), number(contact.second.body)) for contact in self.tables.contacts]
+
+    def reserve_motions(self, at: At, motions: Any) -> Iterable[wp.Module]:
+        s = at.scratch[self.name]
+        s["motions"] = PairMotions(at, self.tables, s["masters"], motions)
+        return {s["motions"].kernels.module}
+
+    def couple(self, at: At, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        at.scratch[self.name]["motions"].add(kept, dq_dv, active)
 
     # results
 

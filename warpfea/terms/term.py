@@ -336,6 +336,17 @@ class Term:
         """Modules that `blocks` launches."""
         return ()
 
+    def couples(self) -> list[tuple[int, int]]:
+        """Numbers of two bodies each that its tangent couples, but `blocks` does not: the rest is for `couple`."""
+        return []
+
+    def reserve_motions(self, at: At, motions: Any) -> Iterable[wp.Module]:
+        """Make what `couple` needs, before launches are recorded; the modules that it launches."""
+        return ()
+
+    def couple(self, at: At, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        """Put what couples bodies into the matrix of the rigid motions of `reserve_motions` (solvers/motions.py)."""
+
     def preconditions(self, at: At) -> bool:
         """Whether `precondition` has something to add."""
         return False
