@@ -16,7 +16,7 @@ from .contact_data import attempt_struct, clock_struct, contact_struct, facet_st
 from .contact_laws import PAPER
 from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
-from .pair_places import OUTER, place_functions
+from .pair_places import OUTER, STAY, place_functions
 
 __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
@@ -354,7 +354,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
         through = bool(False)
-        if best < 0:
+        if best < 0 or off > f64(STAY):
             facing = vec3d()
             if anchored:
                 facing = outward(jet(mas, t.C, t.D, world, t.first[world, point] - 1, t.spot0[world, point]))
