@@ -16,7 +16,7 @@ from .contact_data import attempt_struct, clock_struct, contact_struct, facet_st
 from .contact_laws import PAPER
 from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
-from .pair_places import OUTER, place_functions
+from .pair_places import OUTER, STAY, place_functions
 
 __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
@@ -25,6 +25,8 @@ THROUGH = -2
 MARGIN = 0.25
 """Boxes of the tree are larger than facets by this part of a side: they fit for several steps."""
 ROUNDING = 2.4e-7
+GLANCE = 0.5
+"""A place that the tangent plane in the middle of a facet puts so far beyond its sides is not on it."""
 
 
 @functools.cache
@@ -38,8 +40,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
     k, f = touch_functions(dtype, False), place_functions(dtype)
     along, reach, allowance = k.along, k.reach, k.allowance
-    jet, moved, outside, middle, locate, follow, outward = (
-        f.jet, f.moved, f.outside, f.middle, f.locate, f.follow, f.outward
+    jet, moved, carried, coordinates, outside, middle, locate, follow, outward = (
+        f.jet, f.moved, f.carried, f.coordinates, f.outside, f.middle, f.locate, f.follow, f.outward
     )  # fmt: skip
     Jet = f.Jet
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
@@ -293,7 +295,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         if t.first[world, point] > 0:
             first = t.first[world, point] - 1
             from0 = t.spot0[world, point]
-            motion -= moved(mas, t.C, t.D, world, first, from0) - moved(mas, t.C0, t.D0, world, first, from0)
+            motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, first, from0)
             stretch = t.stretch[world, point]  # of other facets too: it must not vary with the iterate
             change = (now - at.reach[world, point]) - stretch * (spot[2] - from0[2])
             t.depth[world, point] = at.depth[world, point] + change
@@ -303,7 +305,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 if con.law[c] != PAPER:
                     spring = frame(jet(mas, t.C, t.D, world, first, from0)) * spring
         else:
-            motion -= moved(mas, t.C, t.D, world, f, spot) - moved(mas, t.C0, t.D0, world, f, spot)
+            motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, f, spot)
             t.before[world, point] = t.depth[world, point] + wp.dot(n, motion) - (now - at.reach[world, point])
         t.motion[world, point] = motion
         t.whole[world, point] = spring + motion
@@ -334,18 +336,15 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         place = vec3d()
         off = f64(OUTER)
         height = f64(1.0e300)
-        facing = vec3d()
         pad = wp.max(con.offset[c], f64(0.0)) + f64(1.0e-6) * wp.length(x)
         anchored = t.first[world, point] > 0
         if anchored:
             f = t.first[world, point] - 1
             from0 = t.spot0[world, point]
-            motion = shift - at.origin[world, point]
-            motion -= moved(mas, t.C, t.D, world, f, from0) - moved(mas, t.C0, t.D0, world, f, from0)
+            motion = shift - at.origin[world, point] - carried(mas, t.C, t.D, t.C0, t.D0, world, f, from0)
             found = follow(mas, t.C, t.D, world, f, from0, motion)
             if found[3] == f64(0.0):
                 found = locate(mas, t.C, t.D, world, f, x, middle(mas.corners[mas.kind[f]]))
-            facing = outward(jet(mas, t.C, t.D, world, f, from0))
             spot = vec3d(found[0], found[1], found[2])
             o = outside(mas.corners[mas.kind[f]], spot)
             if found[3] != f64(0.0) and o <= off:
@@ -355,7 +354,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
         through = bool(False)
-        if best < 0:
+        if best < 0 or off > f64(STAY):
+            facing = vec3d()
+            if anchored:
+                facing = outward(jet(mas, t.C, t.D, world, t.first[world, point] - 1, t.spot0[world, point]))
             low = wp.min(x, x0) - vec3d(pad, pad, pad)
             high = wp.max(x, x0) + vec3d(pad, pad, pad)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
@@ -365,7 +367,14 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]
-                found = locate(mas, t.C, t.D, world, f, x, middle(corners))
+                center = middle(corners)
+                s = jet(mas, t.C, t.D, world, f, center)
+                first = center + coordinates(s, x - s.x)
+                far = outside(corners, first) > f64(GLANCE)
+                path = x - x0 - carried(mas, t.C, t.D, t.C0, t.D0, world, f, center)
+                if far and wp.length(path) <= f64(0.5) * mas.limit[f]:
+                    continue
+                found = locate(mas, t.C, t.D, world, f, x, center)
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
                 fits = found[3] != f64(0.0) and o <= off
