@@ -21,7 +21,7 @@ from .control import step_struct
 
 __all__ = ["COUNTS", "KEPT", "MAX_LEVEL", "adaptive_kernels", "adaptive_struct"]
 
-KEPT = ("wish", "pace", "last_error", "last_size")
+KEPT = ("wish", "pace", "errors")
 """Columns of what the state holds, [world, column]: the size that the next substep should have at most, s, 0 at the
 start; the mean of sizes, s; error, m, and size, s, of the last substep."""
 COUNTS = ("substeps", "rejected", "least_h", "largest_h")
@@ -40,8 +40,12 @@ START = 0.1
 """Part of the error asked for that a multistep scheme's first step, of order 1, may have."""
 MOST = 65536
 """Substeps between two common instants at most."""
-MEMORY = 16.0
+MEMORY = 256.0
 """Substeps that the pace looks back over."""
+DRIFT = 16.0
+"""Substeps that the mean of local errors looks back over."""
+CAP = 4.0
+"""Times the limit of the mean that one may be."""
 
 
 @functools.cache
@@ -52,6 +56,8 @@ def adaptive_struct():
     class AdaptiveControl:
         flags: wp.array(dtype=wp.int32)  # an estimate is wanted
         error: wp.array(dtype=wp.float64)  # of this attempt, m
+        span: wp.array(dtype=wp.float64)  # s, that the error counts over
+        mean: wp.array(dtype=wp.float64)  # of errors over sizes with this attempt, m/s
         tries: wp.array(dtype=wp.int32)  # refusals in a row that are none of the estimate's
         work: wp.array(dtype=wp.int32)  # PCG iterations of the substeps before
         kept: wp.array2d(dtype=wp.float64)  # KEPT, in the state
@@ -115,6 +121,52 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         good = step.running[world] != 0 and newton.failed[world] == 0 and newton.turned[world] == 0
         ctl.flags[world] = wp.where(good, 1, 0)
         ctl.error[world] = f64(0.0)
+        ctl.mean[world] = f64(0.0)
+
+    @wp.func
+    def mean_with(ctl: Adaptive, world: int, drift: vec3, e: vec3, span: f64) -> vec3:
+        """Running mean of local errors over the size of their steps, m/s."""
+        part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(DRIFT))
+        return drift + T(part) * (T(f64(1.0) / span) * e - drift)
+
+    @wp.func
+    def local(step: Step, world: int, v: vec3, v_n: vec3, v_before: vec3) -> vec3:
+        """Local error, m."""
+        previous = f64(0.0)
+        if wp.static(multistep):
+            if step.a1[world] > f64(0.0):
+                previous = step.previous_h[world]
+        c = estimate(step.h[world], previous)
+        # differences first: the velocities themselves may be large beside them
+        e = T(c[0]) * (v - v_n)
+        if wp.static(multistep):
+            e -= T(c[2]) * (v_n - v_before)
+        return e
+
+    @wp.func
+    def span_of(step: Step, ctl: Adaptive, world: int) -> f64:
+        """s"""
+        return wp.max(step.h[world], f64(SPREAD) * ctl.kept[world, 1])
+
+    @wp.kernel(module=module)
+    def keep_mean(
+        step: Step,
+        ctl: Adaptive,
+        v: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        v_before: wp.array2d(dtype=vec3),
+        drift: wp.array2d(dtype=vec3),
+    ):
+        """After acceptance."""
+        world, slot = wp.tid()
+        if step.accepted[world] == 0:
+            return
+        e = local(step, world, v[world, slot], v_n[world, slot], v_before[world, slot])
+        mean = mean_with(ctl, world, drift[world, slot], e, ctl.span[world])
+        if wp.static(multistep):
+            if step.a1[world] == f64(0.0):
+                mean = vec3()
+        drift[world, slot] = mean
 
     @wp.kernel(module=module)
     def local_error(
@@ -125,6 +177,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         v: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3),
         v_before: wp.array2d(dtype=vec3),
+        drift: wp.array2d(dtype=vec3),
     ):
         """Largest local error of a free place in the substep, m. A maximum does not depend on the order.
 
@@ -133,15 +186,12 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         world, slot = wp.tid()
         if ctl.flags[world] == 0 or arm[slot] == T(0.0):
             return
-        previous = f64(0.0)
-        if wp.static(multistep):
-            if step.a1[world] > f64(0.0):
-                previous = step.previous_h[world]
-        c = estimate(step.h[world], previous)
-        # differences first: the velocities themselves may be large beside them
-        e = T(c[0]) * (v[world, slot] - v_n[world, slot])
-        if wp.static(multistep):
-            e -= T(c[2]) * (v_n[world, slot] - v_before[world, slot])
+        e = local(step, world, v[world, slot], v_n[world, slot], v_before[world, slot])
+        mean = mean_with(ctl, world, drift[world, slot], e, span_of(step, ctl, world))
+        over = f64(arm[slot] * wp.length(wp.cw_mul(free[slot], mean)))
+        if not wp.isfinite(over):
+            over = f64(1.0e300)
+        wp.atomic_max(ctl.mean, world, over)
         size = f64(arm[slot] * wp.length(wp.cw_mul(free[slot], e)))
         if not wp.isfinite(size):
             size = f64(1.0e300)
@@ -179,7 +229,14 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         if wp.static(multistep):
             if n == 2:
                 limit = wp.max(limit, f64(START) * ctl.tolerance)
-        ratio = e / limit
+        first = n < wp.static(order) + 1
+        span = span_of(step, ctl, world)
+        ctl.span[world] = span
+        steady = wp.max(ctl.mean[world], e / (span * f64(CAP)))
+        rate = wp.min(steady, e / span)
+        ratio = rate / unit
+        if first:
+            ratio = e / limit
         if ctl.counts[world, 0] >= f64(MOST):
             ratio = f64(wp.inf)
         if not ratio <= f64(1.0):
@@ -199,18 +256,13 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         ctl.tries[world] = 0
         ctl.work[world] = ctl.work[world] + pcg.total[world]
         pcg.total[world] = 0
-        # where the estimate passes through zero, that of the step before tells how large it will be again
         double = f64(2.0) * h
-        ahead = e * power(f64(2.0), n)
-        if ctl.kept[world, 3] > f64(0.0):
-            ahead = wp.max(ahead, ctl.kept[world, 2] * power(double / ctl.kept[world, 3], n))
-        if ahead <= f64(GROW) * unit * wp.max(double, f64(SPREAD) * pace):
+        longer = wp.max(double, f64(SPREAD) * pace)
+        if steady * (power(f64(2.0), n) * span / longer) <= f64(GROW) * unit:
             ctl.kept[world, 0] = double
         else:
             ctl.kept[world, 0] = h
         ctl.kept[world, 1] = pace + (h - pace) / f64(MEMORY)
-        ctl.kept[world, 2] = e
-        ctl.kept[world, 3] = h
         if ctl.counts[world, 0] == f64(0.0) or h < ctl.counts[world, 2]:
             ctl.counts[world, 2] = h
         ctl.counts[world, 3] = wp.max(ctl.counts[world, 3], h)
@@ -221,6 +273,12 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         """After an attempt: substeps no longer than the wish. The state to go back to is that of the step's start."""
         world = wp.tid()
         step.first_refusal[world] = 0
+        if step.accepted[world] != 0:
+            count = ctl.kept[world, 2] + f64(1.0)
+            if wp.static(multistep):
+                if step.a1[world] == f64(0.0):
+                    count = f64(0.0)
+            ctl.kept[world, 2] = count
         if step.running[world] != 0:
             refine(step, ctl.kept[world, 0], world)
 
@@ -235,6 +293,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         open_step=open_step,
         begin_estimate=begin_estimate,
         local_error=local_error,
+        keep_mean=keep_mean,
         judge=judge,
         settle=settle,
         close_step=close_step,
