@@ -6,9 +6,9 @@ references  what errors are measured from, and the estimate of its own error.
 
 An error is the largest distance of a position from the reference at eight common instants, over the model's size.
 `cost` is the Newton iterations over those of the best fixed step with the same true error, interpolated between the
-runs of `fixed`; beyond them extrapolated with the scheme's order (`extrapolated`). The impacts of `impact` and `contact`
-last a hundredth of the run; `soft_contact` has neither a short impact nor a smooth motion. The committed result is
-tests/results/adaptive_cpu.json.
+runs of `fixed`; beyond them extrapolated with the order of the scheme (`extrapolated`). The impacts of `impact` and
+`contact` last a hundredth of the run; `soft_contact` has neither a short impact nor a smooth motion. The committed
+result is tests/results/adaptive_cpu.json.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["ERRORS", "PARTS", "adaptive", "distance", "fixed", "move", "referenc
 
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-5)
 PIECES = 8
-FINE = 4e-7
+FINE = 2e-7
 """Error that references are asked for; the run with four times it tells how good they are."""
 FINEST = {"backward_euler": 16384, "bdf2": 8192}
 """Most fixed steps."""
