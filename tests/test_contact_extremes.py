@@ -66,6 +66,43 @@ def test_stiff_cube_rests_on_a_rough_floor(E, dt):
     assert sim.contact_record(contact).force[0, -1, 2] == pytest.approx(G, rel=2e-2)
 
 
+def momentum_left(integrator: str, E: float, h: float, speed: float) -> float:
+    """Change of the momentum of a float32 cube, in ten steps from rest under its weight, that the records do not tell,
+    over the impulse of its weight in a step or its momentum at the start; `speed`: along the floor, m/s."""
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(2, 2, 2))
+    body = b.add_solid(mesh, material=wf.SVK(E=E, nu=0.3, density=1000.0), element="T10")
+    contact = b.add_contact(body, b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.3, restitution=0.5)
+    model = b.finalize(device="cpu", dtype="float32")
+    state = wf.solve_static(model, stabilise=True).state
+    v = state.velocity.numpy()
+    v[:, :, 0] = speed
+    state.velocity.assign(v)
+    sim = wf.Simulation(model, state, dt=h, integrator=integrator)
+    worst = 0.0
+    for _ in range(10):
+        before = model.lumped_host @ sim.state.velocity.numpy()[0].astype(float)
+        sim.step()
+        after = model.lumped_host @ sim.state.velocity.numpy()[0].astype(float)
+        impulse = h * (sim.contact_record(contact).force[0, -1] + [0.0, 0.0, -G])
+        worst = max(worst, float(np.abs(after - before - impulse).max()))
+    return worst / max(h * G, speed)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "E", "h", "speed"),
+    [
+        ("backward_euler", 1e4, 1e-5, 0.0),
+        ("energy_momentum", 1e4, 1e-5, 0.0),
+        ("generalized_alpha", 1e4, 1e-5, 0.0),
+        ("backward_euler", 1e4, 1e-3, 1.0),
+    ],
+)
+def test_motion_in_contact_is_not_rounded_with_places(integrator, E, h, speed):
+    """Displacements of 5 mm are rounded to 2e-10 m in float32; over 10 us that changes the damping by some percent."""
+    assert momentum_left(integrator, E, h, speed) < 2e-5
+
+
 @pytest.mark.parametrize("E", [1e5, 1e7, 1e9])
 def test_sliding_block_stops_after_its_way(E):
     """v^2 / (2 mu g); backward Euler takes h v / 2 off."""

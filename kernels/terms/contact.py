@@ -184,7 +184,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def dead_work(
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
-        u: wp.array2d(dtype=vec3),
+        u: wp.array2d(dtype=vec3d),
     ) -> f64:  # fmt: skip
         """Minus the work of an explicit force on the step so far."""
         k = con.collider[c]
@@ -194,7 +194,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def forces(
-        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3),
+        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), fresh: int, at: Attempt,
     ):  # fmt: skip
         """Forces of points, their stiffness and potential.

@@ -25,8 +25,6 @@ FORCES = 7
 @functools.cache
 def book_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in the module of `contact_kernels`."""
-    p = precision(dtype)
-    vec3 = p.vec3
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets = contact_struct(), facet_struct(dtype)
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
@@ -72,7 +70,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def outcome(
         con: Contacts, facets: Facets, his: History, clock: Clock, at: Attempt, world: int, c: int, q: int, item: int,
-        point: int, u: wp.array2d(dtype=vec3),
+        point: int, u: wp.array2d(dtype=vec3d),
     ) -> Outcome:  # fmt: skip
         """What a point leaves.
 
@@ -172,7 +170,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def finish(
-        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3),
+        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         accepted: wp.array(dtype=wp.int32), at: Attempt, booked: wp.array3d(dtype=f64),
     ):  # fmt: skip
         """Books of an accepted substep and the record of it per facet, and the history after it."""
@@ -289,7 +287,7 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def at_points(
-        con: Contacts, facets: Facets, his: History, u: wp.array2d(dtype=vec3), time: wp.array(dtype=f64),
+        con: Contacts, facets: Facets, his: History, u: wp.array2d(dtype=vec3d), time: wp.array(dtype=f64),
         at: Attempt, places: int, gap: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
         """At a state, without rates: gap, m, and the elastic force on the point, N; with `places` the gap of a place

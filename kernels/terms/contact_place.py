@@ -58,7 +58,7 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
         bb: vec3d
 
     @wp.func
-    def jet(con: Contacts, facets: Facets, at: Attempt, world: int, k: int, item: int, u: wp.array2d(dtype=vec3),
+    def jet(con: Contacts, facets: Facets, at: Attempt, world: int, k: int, item: int, u: wp.array2d(dtype=vec3d),
             s: vec2d) -> Jet:  # fmt: skip
         """The place of coordinates s."""
         out = Jet()
@@ -131,7 +131,7 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def deepest_of(con: Contacts, facets: Facets, at: Attempt, world: int, k: int, item: int,
-                   u: wp.array2d(dtype=vec3), start: vec2d) -> vec3d:  # fmt: skip
+                   u: wp.array2d(dtype=vec3d), start: vec2d) -> vec3d:  # fmt: skip
         """Coordinates of the place of a facet that is closest to the collider, and its gap, down from a start."""
         s = start
         here = jet(con, facets, at, world, k, item, u, s)
@@ -165,7 +165,7 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def levels(
-        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3),
+        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), at: Attempt,
     ):  # fmt: skip
         """Depths of the points of lumped contacts."""
@@ -187,7 +187,7 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def seek(
-        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3),
+        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), at: Attempt,
     ):  # fmt: skip
         """The deepest place of each facet, where that may touch and be the deepest of its contact; else a point."""

@@ -2,6 +2,7 @@
 
 import functools
 import types as _types
+from typing import Any
 
 import warp as wp
 
@@ -19,7 +20,7 @@ SLIPS = 16
 @functools.cache
 def touch_functions(dtype: str) -> _types.SimpleNamespace:
     """Device functions in one precision of the displacements; all but these is float64."""
-    T, vec3 = precision(dtype).T, precision(dtype).vec3
+    T = precision(dtype).T
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
     Contacts, Facets = contact_struct(), facet_struct(dtype)
     History, Attempt = history_struct(), attempt_struct(dtype)
@@ -44,7 +45,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         y: vec3d  # place in the collider's frame
 
     @wp.func
-    def along(facets: Facets, field: wp.array2d(dtype=vec3), world: int, point: int, item: int) -> vec3d:
+    def along(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
         """sum_i s_i field_i at a point."""
         out = vec3d()
         for i in range(facets.conn.shape[0]):
@@ -59,7 +60,7 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return facets.shape[point, i, item]
 
     @wp.func
-    def acting(facets: Facets, at: Attempt, field: wp.array2d(dtype=vec3), world: int, point: int, item: int) -> vec3d:
+    def acting(facets: Facets, at: Attempt, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
         """sum_i s_i field_i where a point, or a lumped contact, acts."""
         if facets.moving == 0:
             return along(facets, field, world, point, item)
@@ -175,9 +176,9 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def touch(
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
-        u: wp.array2d(dtype=vec3), time: f64, inv_h: f64, shrink: f64,
+        u: wp.array2d(dtype=vec3d), time: f64, inv_h: f64, shrink: f64,
     ) -> Touch:  # fmt: skip
-        """A point at displacements u."""
+        """A point at displacements u, in float64, see contact_exact.py."""
         out = Touch()
         k = con.collider[c]
         rec = record_of(con, c, point)

@@ -194,8 +194,9 @@ class Opening:
         self._set(w.step.mass_factor, flags, every / dt)
         self._law_values(flags, time)
         m.terms.dead.take_gravity(at.launch, w.law_value, active)
-        for array, values in ((w.u, at.state.displacement), (w.v, at.state.velocity), (w.v_tilde, at.state.velocity)):
-            self._set(array, flags, values.numpy())
+        u, v = at.state.displacement.numpy(), at.state.velocity.numpy()
+        for array, values in ((w.u, u), (w.v, v), (w.v_tilde, v), (w.q_tilde, u - dt * v)):
+            self._set(array, flags, values)
         for term in m.terms:
             term.begin(at, active)
         for term in m.terms:

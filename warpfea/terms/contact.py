@@ -15,6 +15,7 @@ from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
+from .contact_exact import Exact
 from .contact_fields import contact_field, nodal_force
 from .contact_parameters import contact_parameters
 from .contact_places import Places, at_points
@@ -73,6 +74,7 @@ class Contact(Term):
     def build(self, laws: TimeLaws) -> None:
         self.tables.build(laws, self.offset)
         self.connectivity = [group.conn for group in self.tables.groups]
+        self.exact = Exact(self.model, self.connectivity) if self.model.dtype == "float32" else None
         self.rows = self.booked_rows = self.tables.rows
 
     def hash(self, h: Any) -> None:
@@ -131,6 +133,7 @@ class Contact(Term):
             "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
+            "u": self.exact.allocate(work) if self.exact else work.u,
         }
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
@@ -138,7 +141,8 @@ class Contact(Term):
         at.scratch[self.name] = {"history": self.history_of(at.state.register)}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
-        return [self.kernels.module] + ([self.places.kernels.module] if self.places else [])
+        others = (part.kernels.module for part in (self.places, self.exact) if part)
+        return [self.kernels.module, *others]
 
     def start(self, at: At, active: wp.array) -> None:
         """Colliders at the state's time, and what overlaps there.
@@ -229,11 +233,13 @@ class Contact(Term):
     @part("contact")
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
+        if self.exact:
+            self.exact.follow(at, s["u"], active)
         if fresh:
             self._pick(at, active, fresh=1)
         rows = w.rows_of(self)
         for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], s["clock"], w.u, active, fresh]
+            args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
             at.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
             args = [group.data, active, s["attempt"], w.pool_force, rows, s["touching"]]
             at.launch(k.gather_points, (m.worlds, group.count), args)
@@ -245,7 +251,7 @@ class Contact(Term):
         s, w = at.scratch[self.name], at.work
         state = (at.state.displacement, at.state.velocity)
         place = self.places.choose
-        place(at.launch, s, w.step.new_time, w.u, state, active, w.newton.new_walls, fresh=fresh)
+        place(at.launch, s, w.step.new_time, s["u"], state, active, w.newton.new_walls, fresh=fresh)
 
     @part("contact")
     def refresh(self, at: At, flags: wp.array) -> None:
@@ -277,10 +283,10 @@ class Contact(Term):
     @part("contact")
     def _finish(self, at: At, accepted: wp.array) -> None:
         """History, books and records of an accepted substep."""
-        s, m, w, k = at.scratch[self.name], self.model, at.work, self.books
+        s, m, k = at.scratch[self.name], self.model, self.books
         C = len(self.tables.contacts)
         for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], s["clock"], w.u, accepted, s["attempt"]]
+            args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], accepted, s["attempt"]]
             at.launch(k.finish, (m.worlds, group.count), [*args, s["booked"]])
         args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         at.launch(k.partial_records, (m.worlds, C, len(RECORD), LANES), args)

@@ -84,6 +84,10 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
         attempt.shift.zero_()
         attempt.spin.zero_()
     gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
+    u = state.displacement
+    if term.exact:
+        u = zeros(u.shape, wp.vec3d)
+        term.exact.widen(launch, state.displacement, every, u)
     for group in t.groups:
         dim = (B, group.count, group.data.points)
         launch(term.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
@@ -92,10 +96,10 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
         clock.time, clock.still = state.time, 1
         row_start = m.array("contact", t.row_start, wp.int32)
         s = {"history": history, "attempt": attempt, "clock": clock, "row_start": row_start}
-        u, changed = state.displacement, zeros((B,), wp.int32)
-        term.places.choose(launch, s, state.time, u, (u, u), every, changed, fresh=1, settled=1)
+        before, changed = (state.displacement,) * 2, zeros((B,), wp.int32)
+        term.places.choose(launch, s, state.time, u, before, every, changed, fresh=1, settled=1)
     for group in t.groups:
         dim = (B, group.count, group.data.points)
-        args = [t.data, group.data, history, state.displacement, state.time, attempt, int(places), gap, force]
+        args = [t.data, group.data, history, u, state.time, attempt, int(places), gap, force]
         launch(term.books.at_points, dim, args)
     return gap.numpy(), force.numpy()

@@ -1,0 +1,48 @@
+"""What contact of a float32 model reads in float64, see kernels/terms/contact_exact.py."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from ..base.launch import Launcher
+from ..kernels.terms.contact_exact import exact_kernels
+from .term import At
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from .workspace import Workspace
+
+__all__ = ["Exact"]
+
+
+class Exact:
+    """Displacements of the slots of contact in float64.
+
+    Attributes:
+        kernels: device code.
+    """
+
+    def __init__(self, model: Model, connectivity: list[np.ndarray]) -> None:
+        self.kernels = exact_kernels()
+        slots = np.unique(np.concatenate([conn.ravel() for conn in connectivity]))
+        self._slots = model.array("contact", slots, wp.int32)
+
+    def allocate(self, work: Workspace) -> wp.array:
+        """[world, slot] m, of which those of contact are used."""
+        return work.array("contact displacements", work.u.shape, wp.vec3d)
+
+    def follow(self, at: At, out: wp.array, active: wp.array) -> None:
+        """Those of the iterate; in statics, which knows no speeds, as the state has them rounded."""
+        w = at.work
+        if not at.inertia:
+            self.widen(at.launch, w.u, active, out)
+            return
+        args = [self._slots, w.q_tilde, w.v, w.step.dq_dv, active, out]
+        at.launch(self.kernels.follow, (len(out), len(self._slots)), args)
+
+    def widen(self, launch: Launcher, u: wp.array, active: wp.array, out: wp.array) -> None:
+        """The numbers of u."""
+        launch(self.kernels.widen, (len(out), len(self._slots)), [self._slots, u, active, out])
