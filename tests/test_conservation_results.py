@@ -39,6 +39,16 @@ def test_mechanisms_keep_energy(parts):
         assert row["violation"] < 1e-12
 
 
+def test_ten_thousand_revolutions(parts):
+    rows = parts["revolutions"]["rows"]
+    assert [row["family"] for row in rows] == ["T10", "3243 tied"]
+    for row in rows:
+        assert row["turns"] >= 1e4
+        assert row["steps"] > 9e5  # the bound is that of 1e4 steps, for 90 times as many roundings
+        assert max(row["energy"], row["linear"], row["angular"]) < 1e-8
+        assert row["strain"] > 0.2
+
+
 def test_the_table_is_of_the_file(parts):
     text = (HERE / "README.md").read_text().partition("<!-- conservation -->")[2].partition("<!-- /conservation -->")[0]
     assert text.strip() == table(parts)

@@ -616,5 +616,3 @@ def test_contact_between_bodies_is_a_later_part(scene):
     for others in ((), (second,), (second.surface("x-"),), (block,)):
         with pytest.raises(NotImplementedError, match="add_contact: contact between bodies is a later part"):
             b.add_contact(block, *others)
-    with pytest.raises(NotImplementedError, match="TriMesh"):
-        getattr(wf, "TriMesh")  # noqa: B009

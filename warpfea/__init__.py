@@ -62,6 +62,7 @@ from .model.joints import Joint  # noqa: E402
 from .model.model import Model  # noqa: E402
 from .model.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere  # noqa: E402
 from .model.state import State  # noqa: E402
+from .model.triangle_mesh import TriMesh  # noqa: E402
 from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
@@ -113,6 +114,7 @@ __all__ = [
     "State",
     "StepReport",
     "SurfaceSet",
+    "TriMesh",
     "USDWriter",
     "VTUWriter",
     "__version__",
@@ -124,14 +126,7 @@ __all__ = [
 ]
 
 
-_LATER = {
-    "TriMesh": "rigid triangle meshes",
-}
-
-
 def __getattr__(name: str) -> Any:
     if name == "study":  # by name: no scene, which imports this, is to depend on studies
         return importlib.import_module(f"{__name__}.studies.accuracy").study
-    if name in _LATER:
-        raise NotImplementedError(f"warpfea.{name}: {_LATER[name]} are not part of this version")
     raise AttributeError(f"module 'warpfea' has no attribute {name!r}")

@@ -10,10 +10,10 @@ import types as _types
 import warp as wp
 
 from ..common.types import SMALL, kernel_module, precision
+from .contact_colliders import MESHES, collider_functions
 from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import SMOOTH, law_functions
-from .contact_shapes import shape_functions
-from .contact_touch import SLIPS, touch_functions
+from .contact_touch import touch_functions
 
 __all__ = ["MOST_TURN", "RELAX_LANES", "SPEED_FLOOR", "contact_kernels"]
 
@@ -29,21 +29,23 @@ SHRINKS = 0.35
 
 
 @functools.cache
-def contact_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels of contact in one precision of the displacements."""
+def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+    """Kernels of contact in one precision of the displacements; `meshes`: a collider is one."""
     p = precision(dtype)
     T, vec3, sym = p.T, p.vec3, p.sym
     f64, vec3d = wp.float64, wp.vec3d
-    Contacts, Facets = contact_struct(), facet_struct(dtype)
+    Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
-    f = touch_functions(dtype)
+    f = touch_functions(dtype, meshes)
     along, plane, record_of, reach, acts = f.along, f.plane, f.record_of, f.reach, f.acts
     tangent_damping, touch, in_plane, hold = f.tangent_damping, f.touch, f.in_plane, f.hold
     coefficient, shape_of = f.coefficient, f.shape_of
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
-    distance, elastic = shape_functions().distance, law_functions().elastic
-    module = kernel_module(f"contact_{dtype}", max_unroll=SMALL)
+    elastic = law_functions().elastic
+    g = collider_functions(meshes)
+    distance, known_side, beside = g.distance, g.known_side, g.beside
+    module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
     def poses(
@@ -97,10 +99,11 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         turn = his.turn[world, k]
         y = wp.transpose(turn) * (x - his.place[world, k])
         live = his.speed[world, rec] > f64(0.0)
-        side = wp.int32(-1)
-        if live:
-            side = his.mark[world, rec] % SLIPS - 1
-        d = distance(con.kind[k], con.size[k], y, side)
+        if wp.static(meshes):
+            if not live:
+                his.mark[world, rec] = beside(con, k, y, his.mark[world, rec])
+        side = known_side(con, k, live, his.mark[world, rec])
+        d = distance(con, k, y, side)
         at.start[world, point] = y
         begins = reach(con, his, world, c, point, clock.time[world], his.grown[world, k])
         at.origin[world, point] = along(facets, u_n, world, q, item)
@@ -126,7 +129,7 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
         y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
         at.start[world, point] = y
         at.origin[world, point] = along(facets, u, world, q, item)
-        d = distance(con.kind[k], con.size[k], y, -1)
+        d = distance(con, k, y, -1)
         at.reach[world, point] = reach(con, his, world, c, point, time[world], con.grow[world, k])
         at.depth[world, point] = at.reach[world, point] - d[3]
 
@@ -152,8 +155,8 @@ def contact_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         turn = his.turn[world, k]
         y = at.start[world, point]
-        side = his.mark[world, rec] % SLIPS - 1
-        d = distance(con.kind[k], con.size[k], y, side)
+        side = known_side(con, k, True, his.mark[world, rec])
+        d = distance(con, k, y, side)
         n = turn * vec3d(d[0], d[1], d[2])
         x = turn * y + his.place[world, k]
         h = clock.h[world]

@@ -9,9 +9,10 @@ from ..common.entries import add_block_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SMALL, kernel_module, precision
 from .contact import IDLE
+from .contact_colliders import MESHES, collider_functions
 from .contact_data import RECORD, attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import PAPER, SMOOTH, law_functions
-from .contact_touch import SLIPS, touch_functions
+from .contact_touch import touch_functions
 
 __all__ = ["BOOKED", "LANES", "book_kernels", "contact_block_kernels"]
 
@@ -23,17 +24,19 @@ FORCES = 7
 
 
 @functools.cache
-def book_kernels(dtype: str) -> _types.SimpleNamespace:
+def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     """Kernels in the module of `contact_kernels`."""
     f64, vec3d = wp.float64, wp.vec3d
-    Contacts, Facets = contact_struct(), facet_struct(dtype)
+    Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
-    k = touch_functions(dtype)
+    k = touch_functions(dtype, meshes)
     touch, in_plane, hold, pull, acts, Touch = k.touch, k.in_plane, k.hold, k.pull, k.acts, k.Touch
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
     coefficient, lagrange = k.coefficient, k.lagrange
     elastic = law_functions().elastic
-    module = kernel_module(f"contact_{dtype}", max_unroll=SMALL)
+    g = collider_functions(meshes)
+    side_after, released, SLIPS = g.side_after, g.released, g.SLIPS
+    module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SMALL)
 
     @wp.struct
     class Outcome:
@@ -141,24 +144,26 @@ def book_kernels(dtype: str) -> _types.SimpleNamespace:
         rec = record_of(con, c, point)
         if facets.moving != 0:
             his.lead[world, rec] = o.touch.depth
+        kc = con.collider[c]
         if o.touch.depth <= f64(0.0):
+            mark = released(con, kc, his.speed[world, rec] > f64(0.0), his.mark[world, rec])
             his.spring[world, rec] = vec3d()
             his.stored[world, rec] = f64(0.0)
             his.cap[world, rec] = f64(0.0)
             his.speed[world, rec] = f64(0.0)
-            his.mark[world, rec] = 0
+            his.mark[world, rec] = mark
             return
         speed = at.speed[world, point]
         if clock.still == 0:
             speed = wp.max(speed, o.touch.rise / clock.h[world])
         kept = o.kept
         if con.law[c] != PAPER:
-            kept = wp.transpose(at.turn[world, con.collider[c]]) * kept
+            kept = wp.transpose(at.turn[world, kc]) * kept
         his.spring[world, rec] = kept
         his.stored[world, rec] = o.stored
         his.cap[world, rec] = o.cap
         his.speed[world, rec] = speed
-        mark = wp.max(o.touch.side, -1) + 1
+        mark = side_after(con, kc, o.touch.y, o.touch.side) + 1
         if o.slips != 0 and o.cap > f64(0.0):
             mark += SLIPS
         his.mark[world, rec] = mark

@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from ..common.types import precision
+from .contact_mesh import mesh_struct
 
 __all__ = ["RECORD", "attempt_struct", "clock_struct", "contact_struct", "facet_struct", "history_struct"]
 
@@ -14,10 +15,9 @@ RECORD = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "
 
 
 @functools.cache
-def contact_struct():
-    """Contacts [contact] and colliders [collider]."""
+def contact_struct(meshes: bool):
+    """Contacts [contact] and colliders [collider]; `meshes`: with triangles of those that are meshes."""
 
-    @wp.struct
     class Contacts:
         collider: wp.array(dtype=wp.int32)
         law: wp.array(dtype=wp.int32)
@@ -48,7 +48,9 @@ def contact_struct():
         anchor: wp.array(dtype=wp.vec3d)
         axis: wp.array(dtype=wp.vec3d)
 
-    return Contacts
+    if meshes:
+        Contacts.__annotations__["mesh"] = mesh_struct()
+    return wp.struct(Contacts)
 
 
 @functools.cache
@@ -88,7 +90,7 @@ def history_struct():
         grown: wp.array2d(dtype=wp.float64)  # `Contacts.grow` of the last step
         spring: wp.array2d(dtype=wp.vec3d)  # stretch of the friction spring, in the collider's frame (paper: world), m
         speed: wp.array2d(dtype=wp.float64)  # largest approach speed since birth, m/s; 0: not in contact
-        mark: wp.array2d(dtype=wp.int32)  # side of the shape + 1, and 16 where it slips
+        mark: wp.array2d(dtype=wp.int32)  # side + 1, and SLIPS where it slips; see known_side
         overlap: wp.array2d(dtype=wp.float64)  # stored at the start, m
         cap: wp.array2d(dtype=wp.float64)  # mu F_n of the last step, N over the point's share
         stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's share

@@ -11,9 +11,9 @@ import warp as wp
 
 from ..common.types import SMALL, kernel_module, precision
 from .contact import SPEED_FLOOR
+from .contact_colliders import MESHES, collider_functions
 from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
-from .contact_shapes import shape_functions
-from .contact_touch import SLIPS, touch_functions
+from .contact_touch import touch_functions
 
 __all__ = ["place_kernels"]
 
@@ -27,14 +27,14 @@ PROBE = 1e-5
 
 
 @functools.cache
-def place_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels of lumped contacts, in a module of their own."""
+def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+    """Kernels of lumped contacts, in a module of their own; `meshes`: a collider is one."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64, vec2d, vec3d = wp.float64, wp.vec2d, wp.vec3d
-    Contacts, Facets = contact_struct(), facet_struct(dtype)
+    Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
-    f = touch_functions(dtype)
+    f = touch_functions(dtype, meshes)
     along, reach, depth_before, record_of, lagrange, monomial = (
         f.along,
         f.reach,
@@ -43,8 +43,8 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
         f.lagrange,
         f.monomial,
     )
-    distance = shape_functions().distance
-    module = kernel_module(f"contact_place_{dtype}", max_unroll=SMALL)
+    distance, known_side = collider_functions(meshes).distance, collider_functions(meshes).known_side
+    module = kernel_module(f"contact_place_{dtype}{MESHES * meshes}", max_unroll=SMALL)
 
     @wp.struct
     class Jet:
@@ -135,11 +135,11 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
         """Coordinates of the place of a facet that is closest to the collider, and its gap, down from a start."""
         s = start
         here = jet(con, facets, at, world, k, item, u, s)
-        d = distance(con.kind[k], con.size[k], here.y, -1)
+        d = distance(con, k, here.y, -1)
         for _ in range(TURNS):
             n = vec3d(d[0], d[1], d[2])
-            next_a = distance(con.kind[k], con.size[k], here.y + f64(PROBE) * here.a, -1)
-            next_b = distance(con.kind[k], con.size[k], here.y + f64(PROBE) * here.b, -1)
+            next_a = distance(con, k, here.y + f64(PROBE) * here.a, -1)
+            next_b = distance(con, k, here.y + f64(PROBE) * here.b, -1)
             turn_a = (vec3d(next_a[0], next_a[1], next_a[2]) - n) / f64(PROBE)
             turn_b = (vec3d(next_b[0], next_b[1], next_b[2]) - n) / f64(PROBE)
             g = vec2d(wp.dot(n, here.a), wp.dot(n, here.b))
@@ -151,7 +151,7 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
             for _try in range(HALVINGS):
                 if not found and wp.length(step) > f64(1.0e-9):
                     new = jet(con, facets, at, world, k, item, u, s + step)
-                    new_d = distance(con.kind[k], con.size[k], new.y, -1)
+                    new_d = distance(con, k, new.y, -1)
                     if new_d[3] < d[3]:
                         found = True
                         s = s + step
@@ -179,7 +179,7 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
             k = con.collider[c]
             x = facets.X[q, item] + along(facets, u, world, q, item)
             y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
-            d = distance(con.kind[k], con.size[k], y, -1)
+            d = distance(con, k, y, -1)
             depth = reach(con, his, world, c, point, time[world], con.grow[world, k]) - d[3]
             if con.dead[c] != 0:  # its force is that of the last state
                 depth = at.depth[world, point]
@@ -293,10 +293,9 @@ def place_kernels(dtype: str) -> _types.SimpleNamespace:
             grown = con.grow[world, k]
         x = X + origin
         y = wp.transpose(turn) * (x - place)
-        side = wp.int32(-1)
-        if settled == 0 and his.speed[world, rec] > f64(0.0):
-            side = his.mark[world, rec] % SLIPS - 1
-        d = distance(con.kind[k], con.size[k], y, side)
+        live = settled == 0 and his.speed[world, rec] > f64(0.0)
+        side = known_side(con, k, live, his.mark[world, rec])
+        d = distance(con, k, y, side)
         begins = reach(con, his, world, c, point, clock.time[world], grown)
         at.start[world, point] = y
         at.origin[world, point] = origin

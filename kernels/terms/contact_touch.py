@@ -7,25 +7,29 @@ from typing import Any
 import warp as wp
 
 from ..common.types import precision
+from .contact_colliders import collider_functions
 from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
-from .contact_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
+from .contact_mesh import MESH
 
-__all__ = ["SLIPS", "touch_functions"]
-
-SLIPS = 16
-"""Of a point's mark: it slips; below are the sides."""
+__all__ = ["touch_functions"]
 
 
 @functools.cache
-def touch_functions(dtype: str) -> _types.SimpleNamespace:
-    """Device functions in one precision of the displacements; all but these is float64."""
+def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+    """Device functions in one precision of the displacements; all but these is float64. `meshes`: a collider is one."""
     T = precision(dtype).T
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
-    Contacts, Facets = contact_struct(), facet_struct(dtype)
+    Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, Attempt = history_struct(), attempt_struct(dtype)
-    shapes, laws = shape_functions(), law_functions()
-    distance, sweep = shapes.distance, shapes.sweep
+    colliders, laws = collider_functions(meshes), law_functions()
+    distance, sweep, deepening, known_side = (
+        colliders.distance,
+        colliders.sweep,
+        colliders.deepening,
+        colliders.known_side,
+    )
+    SLIPS = colliders.SLIPS
     normal_law, friction, smooth_friction = laws.normal_law, laws.friction, laws.smooth_friction
 
     @wp.struct
@@ -118,31 +122,6 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         return con.offset[c] + grown - allowance(con, his, world, c, point, time)
 
     @wp.func
-    def deepening(con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, depth: f64) -> wp.vec2d:
-        """Change of the depth by a motion, from the motion itself where that is exact, and 1; else 0.
-
-        As a difference of places it would be rounded as those are, by more than a stiff body at rest moves.
-        """
-        kind = con.kind[k]
-        if kind == HALF_SPACE:
-            return wp.vec2d(-local[2], f64(1.0))
-        if kind == SPHERE:
-            return wp.vec2d(
-                -wp.dot(y + start, local) / wp.max(wp.length(y) + wp.length(start), f64(1.0e-300)), f64(1.0)
-            )
-        if kind == BOX and side >= 0:
-            h = con.size[k]
-            axis = side / 2
-            sign = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
-            flat = wp.abs(h[axis] - sign * start[axis] - depth) <= f64(1.0e-12) * h[axis]
-            for j in range(3):
-                if j != axis and wp.abs(start[j]) > h[j]:
-                    flat = False
-            if flat:
-                return wp.vec2d(-sign * local[axis], f64(1.0))
-        return wp.vec2d()
-
-    @wp.func
     def depth_before(con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, point: int) -> f64:
         """Depth as the step began: of a live contact whose place moves, of the deepest place then."""
         if facets.moving != 0:
@@ -186,23 +165,28 @@ def touch_functions(dtype: str) -> _types.SimpleNamespace:
         x = reference(facets, at, world, q, item) + moved
         turn = at.turn[world, k]
         out.y = wp.transpose(turn) * (x - at.place[world, k])
-        side = wp.int32(-1)
         live = his.speed[world, rec] > f64(0.0)
-        if live:
-            side = his.mark[world, rec] % SLIPS - 1
-        out.side = sweep(con.kind[k], con.size[k], at.start[world, point], out.y, side)
-        d = distance(con.kind[k], con.size[k], out.y, out.side)
+        side = known_side(con, k, live, his.mark[world, rec])
+        begins = reach(con, his, world, c, point, time, con.grow[world, k])
+        d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
+        out.side = -1
+        far = bool(False)
+        if wp.static(meshes):  # no nearer than it was, less its way: a mesh need not be searched
+            d[3] = at.reach[world, point] - at.depth[world, point] - wp.length(out.y - at.start[world, point])
+            far = con.kind[k] == MESH and con.law[c] != SMOOTH and not live and d[3] > wp.max(begins, f64(0.0))
+        if not far:
+            out.side = sweep(con, k, at.start[world, point], out.y, side)
+            d = distance(con, k, out.y, out.side)
         out.n = turn * vec3d(d[0], d[1], d[2])
-        shape = con.grow[world, k]
-        out.depth = reach(con, his, world, c, point, time, shape) - d[3]
+        out.depth = begins - d[3]
         motion = moved - at.origin[world, point] - at.shift[world, k]
         if con.spin[k] >= 0:
             motion -= at.spin[world, k] * (his.turn[world, k] * at.start[world, point])
         before = at.depth[world, point]
         change = deepening(con, k, out.side, at.start[world, point], out.y, wp.transpose(turn) * motion,
-                           before - at.reach[world, point])  # fmt: skip
+                           at.reach[world, point] - before, d[3])  # fmt: skip
         if change[1] != f64(0.0):
-            out.depth = before + change[0] + (reach(con, his, world, c, point, time, shape) - at.reach[world, point])
+            out.depth = before + change[0] + (begins - at.reach[world, point])
         rate = rate_of(con, at, world, c, point, inv_h)
         k_n = con.scale[world, c] * con.normal[c]
         led = depth_before(con, facets, his, at, world, c, point)

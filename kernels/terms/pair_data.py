@@ -93,15 +93,14 @@ def touching_struct(dtype: str):
         weight: wp.array3d(dtype=T)  # [world, point, local] functions of the master's slots
         held_weight: wp.array3d(dtype=T)  # functions that friction acts by, held with its cap
         held_motion: wp.array2d(dtype=wp.vec3d)
-        held_whole: wp.array2d(
-            dtype=wp.vec3d
-        )  # motion and spring when they were taken, and the relative displacement by them
-        held_shift: wp.array2d(dtype=wp.vec3d)
+        held_whole: wp.array2d(dtype=wp.vec3d)  # that and the spring, as they were taken
+        held_shift: wp.array2d(dtype=wp.vec3d)  # relative displacement by these functions then
         held_facet: wp.array2d(dtype=wp.int32)
         friction: wp.array2d(dtype=wp.vec3d)  # part of a point's force that acts by them, N
         listed: wp.array2d(dtype=wp.int32)  # [world, point] facet + 1 whose list it is in
         changed: wp.array(dtype=wp.int32)  # a point belongs into another list
         count: wp.array(dtype=wp.int32)  # [world facet] of lists in the making
+        chunk: wp.array2d(dtype=wp.int32)  # [world, chunk of facets] points before it
         points: wp.array2d(dtype=wp.int32)  # [world, facet] points of its list, which begins at `start`
         start: wp.array2d(dtype=wp.int32)
         entry: wp.array2d(dtype=wp.int32)  # [world, point]

@@ -6,6 +6,7 @@ it is inside of a facet now and was outside of it as the step began; no candidat
 
 import functools
 import types as _types
+from typing import Any
 
 import warp as wp
 
@@ -15,7 +16,7 @@ from .contact_data import attempt_struct, clock_struct, contact_struct, facet_st
 from .contact_laws import PAPER
 from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
-from .pair_places import OUTER, place_functions
+from .pair_places import OUTER, STAY, place_functions
 
 __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
@@ -24,6 +25,8 @@ THROUGH = -2
 MARGIN = 0.25
 """Boxes of the tree are larger than facets by this part of a side: they fit for several steps."""
 ROUNDING = 2.4e-7
+GLANCE = 0.5
+"""A place that the tangent plane in the middle of a facet puts so far beyond its sides is not on it."""
 
 
 @functools.cache
@@ -32,26 +35,23 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     vec3 = p.vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
-    Contacts, Facets, History = contact_struct(), facet_struct(dtype), history_struct()
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
     Attempt, Clock = attempt_struct(dtype), clock_struct()
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
-    k, f = touch_functions(dtype), place_functions(dtype)
+    k, f = touch_functions(dtype, False), place_functions(dtype)
     along, reach, allowance = k.along, k.reach, k.allowance
-    jet, moved, outside, middle, locate, follow, outward = (
-        f.jet, f.moved, f.outside, f.middle, f.locate, f.follow, f.outward
+    jet, moved, carried, coordinates, outside, middle, locate, follow, outward = (
+        f.jet, f.moved, f.carried, f.coordinates, f.outside, f.middle, f.locate, f.follow, f.outward
     )  # fmt: skip
     Jet = f.Jet
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
 
-    @wp.kernel(module=module)
-    def controls(
-        mas: Masters, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
+    @wp.func
+    def control(
+        mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
         D: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """Coefficients of a field of the slots on master facets."""
-        world, item, m = wp.tid()
-        if active[world] == 0 or m >= mas.terms[mas.kind[item]]:
-            return
+        """Coefficient m of a field of the slots on a master facet."""
         c = vec3d()
         d = vec3d()
         for i in range(mas.conn.shape[0]):
@@ -60,6 +60,27 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             d += f64(mas.rise[m, i, item]) * value
         C[world, mas.most * item + m] = c
         D[world, mas.most * item + m] = d
+
+    @wp.kernel(module=module)
+    def controls(
+        mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
+        D: wp.array2d(dtype=vec3d),
+    ):  # fmt: skip
+        """Coefficients of displacements on master facets, in float64, see contact_exact.py."""
+        world, item, m = wp.tid()
+        if active[world] != 0 and m < mas.terms[mas.kind[item]]:
+            control(mas, u, world, item, m, C, D)
+
+    @wp.kernel(module=module)
+    def controls_before(
+        mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
+        t: Touching,
+    ):  # fmt: skip
+        """Those of displacements and velocities as an attempt begins."""
+        world, item, m = wp.tid()
+        if active[world] != 0 and m < mas.terms[mas.kind[item]]:
+            control(mas, v_n, world, item, m, t.V0, t.D0)
+            control(mas, u_n, world, item, m, t.C0, t.D0)
 
     @wp.func
     def down(x: vec3d) -> box3:
@@ -188,7 +209,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def look_around(
-        con: Contacts, mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
+        con: Contacts, mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32),
         reaching: f64, t: Touching,
     ):  # fmt: skip
         """Whether a box of a master facet is near a slave facet; where none is, the box in which that holds."""
@@ -274,7 +295,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         if t.first[world, point] > 0:
             first = t.first[world, point] - 1
             from0 = t.spot0[world, point]
-            motion -= moved(mas, t.C, t.D, world, first, from0) - moved(mas, t.C0, t.D0, world, first, from0)
+            motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, first, from0)
             stretch = t.stretch[world, point]  # of other facets too: it must not vary with the iterate
             change = (now - at.reach[world, point]) - stretch * (spot[2] - from0[2])
             t.depth[world, point] = at.depth[world, point] + change
@@ -284,7 +305,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 if con.law[c] != PAPER:
                     spring = frame(jet(mas, t.C, t.D, world, first, from0)) * spring
         else:
-            motion -= moved(mas, t.C, t.D, world, f, spot) - moved(mas, t.C0, t.D0, world, f, spot)
+            motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, f, spot)
             t.before[world, point] = t.depth[world, point] + wp.dot(n, motion) - (now - at.reach[world, point])
         t.motion[world, point] = motion
         t.whole[world, point] = spring + motion
@@ -293,7 +314,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def seek(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        u: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: int,
+        u: wp.array2d(dtype=vec3d), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: int,
         at: Attempt, t: Touching,
     ):  # fmt: skip
         """The seat of each point at an iterate. `settling`: there is no step; what is inside is in contact."""
@@ -315,18 +336,15 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         place = vec3d()
         off = f64(OUTER)
         height = f64(1.0e300)
-        facing = vec3d()
         pad = wp.max(con.offset[c], f64(0.0)) + f64(1.0e-6) * wp.length(x)
         anchored = t.first[world, point] > 0
         if anchored:
             f = t.first[world, point] - 1
             from0 = t.spot0[world, point]
-            motion = shift - at.origin[world, point]
-            motion -= moved(mas, t.C, t.D, world, f, from0) - moved(mas, t.C0, t.D0, world, f, from0)
+            motion = shift - at.origin[world, point] - carried(mas, t.C, t.D, t.C0, t.D0, world, f, from0)
             found = follow(mas, t.C, t.D, world, f, from0, motion)
             if found[3] == f64(0.0):
                 found = locate(mas, t.C, t.D, world, f, x, middle(mas.corners[mas.kind[f]]))
-            facing = outward(jet(mas, t.C, t.D, world, f, from0))
             spot = vec3d(found[0], found[1], found[2])
             o = outside(mas.corners[mas.kind[f]], spot)
             if found[3] != f64(0.0) and o <= off:
@@ -336,7 +354,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
         through = bool(False)
-        if best < 0 or off > f64(0.0):
+        if best < 0 or off > f64(STAY):
+            facing = vec3d()
+            if anchored:
+                facing = outward(jet(mas, t.C, t.D, world, t.first[world, point] - 1, t.spot0[world, point]))
             low = wp.min(x, x0) - vec3d(pad, pad, pad)
             high = wp.max(x, x0) + vec3d(pad, pad, pad)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
@@ -346,7 +367,14 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]
-                found = locate(mas, t.C, t.D, world, f, x, middle(corners))
+                center = middle(corners)
+                s = jet(mas, t.C, t.D, world, f, center)
+                first = center + coordinates(s, x - s.x)
+                far = outside(corners, first) > f64(GLANCE)
+                path = x - x0 - carried(mas, t.C, t.D, t.C0, t.D0, world, f, center)
+                if far and wp.length(path) <= f64(0.5) * mas.limit[f]:
+                    continue
+                found = locate(mas, t.C, t.D, world, f, x, center)
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
                 fits = found[3] != f64(0.0) and o <= off
@@ -376,6 +404,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             t.seat[world, point] = THROUGH
 
     return _types.SimpleNamespace(
-        module=module, controls=controls, check_boxes=check_boxes, adopt_boxes=adopt_boxes, begin_points=begin_points,
-        look_around=look_around, seek=seek, frame=frame, Jet=Jet,
+        module=module, controls=controls, controls_before=controls_before, check_boxes=check_boxes,
+        adopt_boxes=adopt_boxes, begin_points=begin_points, look_around=look_around, seek=seek, frame=frame, down=down,
+        up=up,
     )  # fmt: skip

@@ -13,34 +13,23 @@ import warp as wp
 
 from ..common.types import SMALL, kernel_module, precision
 from .contact import IDLE, LOADED, STIFF
-from .contact_books import BOOKED, SUMS
 from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
-from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
-from .contact_touch import SLIPS, touch_functions
+from .contact_laws import law_functions
+from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
 from .pair_places import place_functions
-from .pair_seek import THROUGH, seek_kernels
+from .pair_seek import THROUGH
 
-__all__ = ["pair_kernels"]
+__all__ = ["pair_functions", "pair_kernels"]
 
 
 @functools.cache
-def pair_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels in one precision of the displacements."""
-    p = precision(dtype)
-    T, vec3, sym = p.T, p.vec3, p.sym
-    f64, vec3d = wp.float64, wp.vec3d
-    Contacts, Facets, History = contact_struct(), facet_struct(dtype), history_struct()
-    Attempt, Clock = attempt_struct(dtype), clock_struct()
-    Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
-    k, places = touch_functions(dtype), place_functions(dtype)
-    Touch, in_plane, hold, pull, plane = k.Touch, k.in_plane, k.hold, k.pull, k.plane
-    friction_potential, friction_force, point_stiffness = k.friction_potential, k.friction_force, k.point_stiffness
-    rate_of, coefficient, tangent_damping = k.rate_of, k.coefficient, k.tangent_damping
-    normal_law, elastic = law_functions().normal_law, law_functions().elastic
-    jet, weigh = places.jet, places.weigh
-    frame = seek_kernels(dtype).frame
-    module = kernel_module(f"pairs_{dtype}", max_unroll=SMALL)
+def pair_functions(dtype: str) -> _types.SimpleNamespace:
+    """The device function touch_of."""
+    f64 = wp.float64
+    Contacts, Attempt, Touching = contact_struct(False), attempt_struct(dtype), touching_struct(dtype)
+    k, normal_law = touch_functions(dtype, False), law_functions().normal_law
+    Touch, in_plane, rate_of = k.Touch, k.in_plane, k.rate_of
 
     @wp.func
     def touch_of(con: Contacts, at: Attempt, t: Touching, world: int, c: int, point: int, inv_h: f64) -> Touch:
@@ -56,6 +45,26 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         out.motion = t.motion[world, point]
         out.whole = t.whole[world, point]
         return in_plane(out, wp.normalize(out.n))
+
+    return _types.SimpleNamespace(touch_of=touch_of)
+
+
+@functools.cache
+def pair_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the displacements."""
+    p = precision(dtype)
+    T, vec3, sym = p.T, p.vec3, p.sym
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
+    Attempt, Clock = attempt_struct(dtype), clock_struct()
+    Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
+    k, places = touch_functions(dtype, False), place_functions(dtype)
+    touch_of = pair_functions(dtype).touch_of
+    in_plane, hold, plane = k.in_plane, k.hold, k.plane
+    friction_potential, friction_force, point_stiffness = k.friction_potential, k.friction_force, k.point_stiffness
+    coefficient, tangent_damping, elastic = k.coefficient, k.tangent_damping, law_functions().elastic
+    jet, weigh = places.jet, places.weigh
+    module = kernel_module(f"pairs_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
     def explicit_forces(
@@ -77,9 +86,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         spot = t.spot0[world, point]
         s = jet(mas, t.C0, t.D0, world, f, spot)
         n = wp.normalize(wp.cross(s.a, s.b))
-        v = k.along(facets, v_n, world, q, item) - places.moved(
-            mas, t.V0, t.V0, world, f, vec3d(spot[0], spot[1], f64(0.0))
-        )
+        foot = vec3d(spot[0], spot[1], f64(0.0))
+        v = k.along(facets, v_n, world, q, item) - places.moved(mas, t.V0, t.V0, world, f, foot)
         v_n_rel = wp.dot(v, n)
         v_t = v - v_n_rel * n
         scale = con.scale[world, c]
@@ -99,8 +107,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def relative(
-        mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int,
-        f: int,
+        mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
+        point: int, f: int,
     ) -> vec3d:  # fmt: skip
         """Displacement of a point relative to the held functions of a facet."""
         out = k.along(facets, u, world, q, item)
@@ -110,7 +118,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def take_functions(
-        mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3), flags: wp.array(dtype=wp.int32), at: Attempt,
+        mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), flags: wp.array(dtype=wp.int32), at: Attempt,
         t: Touching,
     ):  # fmt: skip
         """Friction acts by the functions of the iterate from now on."""
@@ -129,7 +137,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def forces(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
+        u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
     ):  # fmt: skip
         """Forces on points, their stiffness and potential; caps, and the functions that friction acts by, are held."""
         world, item, q = wp.tid()
@@ -215,58 +223,6 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             t.listed[world, point] = wanted
             t.changed[0] = 1
 
-    # lists of the points of each master facet
-
-    @wp.kernel(module=module)
-    def clear_lists(t: Touching):
-        """No points."""
-        i = wp.tid()
-        t.count[i] = 0
-        if i == 0:
-            t.changed[0] = 0
-
-    @wp.kernel(module=module)
-    def count_points(mas: Masters, t: Touching):
-        """How many points a facet has."""
-        world, point = wp.tid()
-        f = t.listed[world, point] - 1
-        if f >= 0:
-            wp.atomic_add(t.count, world * mas.count + f, 1)
-
-    @wp.kernel(module=module)
-    def place_lists(mas: Masters, scan: wp.array(dtype=wp.int32), t: Touching):
-        """Where the lists begin, in each world, from the sums of counts up to each; and no points again."""
-        world, f = wp.tid()
-        i = world * mas.count + f
-        before = wp.int32(0)
-        if world > 0:
-            before = scan[world * mas.count - 1]
-        t.start[world, f] = scan[i] - t.count[i] - before
-        t.points[world, f] = t.count[i]
-        t.count[i] = 0
-
-    @wp.kernel(module=module)
-    def fill_lists(mas: Masters, t: Touching):
-        """Points into their lists, in any order."""
-        world, point = wp.tid()
-        f = t.listed[world, point] - 1
-        if f >= 0:
-            k = wp.atomic_add(t.count, world * mas.count + f, 1)
-            t.entry[world, t.start[world, f] + k] = point
-
-    @wp.kernel(module=module)
-    def sort_lists(t: Touching):
-        """Points of a list in their order: sums are the same every time."""
-        world, f = wp.tid()
-        first = t.start[world, f]
-        for k in range(1, t.points[world, f]):
-            point = t.entry[world, first + k]
-            j = first + k - 1
-            while j >= first and t.entry[world, j] > point:
-                t.entry[world, j + 1] = t.entry[world, j]
-                j -= 1
-            t.entry[world, j + 1] = point
-
     @wp.kernel(module=module)
     def gather_masters(
         mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=vec3)
@@ -283,10 +239,9 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             total = vec3()
             for k in range(count):
                 point = t.entry[world, t.start[world, f] + k]
-                rest = at.force[world, point] - t.friction[world, point]
-                total -= t.weight[world, point, i] * vec3(rest) + t.held_weight[world, point, i] * vec3(
-                    t.friction[world, point]
-                )
+                pulled = t.friction[world, point]
+                total -= t.weight[world, point, i] * vec3(at.force[world, point] - pulled)
+                total -= t.held_weight[world, point, i] * vec3(pulled)
             pool[world, mas.pool + i * mas.count + f] = total
 
     @wp.func
@@ -362,146 +317,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 out += s * s * at.stiffness[world, point]
         pool[world, mas.pool + i * mas.count + f] = out
 
-    # after a step
-
-    @wp.func
-    def add(rows: wp.array3d(dtype=f64), j: int, world: int, row: int, value: f64):
-        """rows[j, world, row] += value."""
-        rows[j, world, row] = rows[j, world, row] + value
-
-    @wp.func
-    def forget(his: History, seats: Seats, world: int, point: int):
-        """A point is in contact no longer."""
-        his.spring[world, point] = vec3d()
-        his.stored[world, point] = f64(0.0)
-        his.cap[world, point] = f64(0.0)
-        his.speed[world, point] = f64(0.0)
-        his.mark[world, point] = 0
-        seats.seat[world, point] = 0
-        seats.spot[world, point] = vec3d()
-
-    @wp.kernel(module=module)
-    def finish(
-        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        accepted: wp.array(dtype=wp.int32), at: Attempt, t: Touching, booked: wp.array3d(dtype=f64),
-    ):  # fmt: skip
-        """Books of an accepted substep and the record of it per facet, and the history after it."""
-        world, item = wp.tid()
-        if accepted[world] == 0:
-            return
-        c = facets.contact[item]
-        law = con.law[c]
-        row = facets.row + item
-        for j in range(BOOKED):
-            booked[j, world, row] = f64(0.0)
-        for j in range(SUMS + 1):
-            at.rows[j, world, row] = f64(0.0)
-        inv_h = f64(0.0)
-        if clock.still == 0:
-            inv_h = f64(1.0) / clock.h[world]
-        for q in range(facets.points):
-            point = facets.point + item * facets.points + q
-            share = facets.share[q, item]
-            live = his.speed[world, point] > f64(0.0)
-            f = t.seat[world, point]
-            if share == f64(0.0) or (f < 0 and not live):
-                continue
-            stored = f64(0.0)
-            kept = vec3d()
-            base = vec3d()
-            if f < 0:  # beyond an edge of the surface
-                at.state[world, point] = IDLE
-                add(booked, 1, world, row, share * his.stored[world, point])
-                forget(his, seats, world, point)
-                continue
-            s = touch_of(con, at, t, world, c, point, inv_h)
-            held = at.held[world, point]
-            held[2] = f64(1.0)
-            s = in_plane(s, at.plane[world, point])
-            normal = s.law[0]
-            pulled = friction_force(con, world, c, s, held, inv_h)
-            w = pull(con, world, c, s, held, inv_h)
-            trial = vec3d(w[0], w[1], w[2])
-            slips = wp.where(wp.length(trial) > held[0], 1, 0)
-            if live:
-                base = plane(s.m, t.whole[world, point] - t.motion[world, point])
-            force = normal * s.n - pulled
-            if con.dead[c] != 0:
-                force = at.dead[world, point]
-                normal = wp.dot(force, s.m)
-                pulled = normal * s.m - force
-                kept = at.dead_spring[world, point]
-                held = vec3d(coefficient(con, his, world, c, point) * normal, con.scale[world, c] * con.tangent[c],
-                             f64(1.0))  # fmt: skip
-                slips = wp.where(wp.length(pulled) >= f64(0.999999) * held[0], 1, 0)
-            elif normal > f64(0.0) and held[1] > f64(0.0):
-                kept = s.q
-                if slips != 0:
-                    kept = vec3d()
-                    if held[0] > f64(0.0):
-                        size = wp.length(trial)
-                        kept = s.q - ((size - held[0]) / (w[3] * size)) * trial
-                        if law == PAPER:
-                            kept = (f64(1.0) / held[1]) * pulled - ((w[3] - held[1]) / held[1]) * s.slip
-            spring = elastic(0, con.scale[world, c] * con.normal[c], s.depth)
-            stored = spring[1] + f64(0.5) * held[1] * wp.dot(kept, kept)
-            slid = s.slip - (kept - base)
-            rubbed = wp.dot(pulled - held[1] * kept, kept - base) + wp.dot(pulled, slid)
-            add(booked, 0, world, row, share * stored)
-            add(booked, 1, world, row, share * (normal - spring[0]) * s.rise)
-            add(booked, 2, world, row, share * rubbed)
-            x = facets.X[q, item] + at.origin[world, point]
-            place = jet(mas, t.C, t.D, world, f, t.spot[world, point])
-            x = place.x
-            moment = wp.cross(x, force)
-            side = mas.sign[c]
-            for j in range(3):
-                add(at.rows, j, world, row, side * share * force[j])
-                add(at.rows, 3 + j, world, row, side * share * moment[j])
-            add(at.rows, 6, world, row, share * normal)
-            if s.depth > f64(0.0):
-                area = facets.area[q, item]
-                add(at.rows, 7, world, row, area * f64(slips) * wp.length(slid))
-                add(at.rows, 8, world, row, area)
-                add(at.rows, 9, world, row, area * f64(1 - slips))
-            at.rows[14, world, row] = wp.max(at.rows[14, world, row], s.depth)
-            if s.depth <= f64(0.0):
-                forget(his, seats, world, point)
-            else:
-                speed = at.speed[world, point]
-                if clock.still == 0:
-                    speed = wp.max(speed, s.rise / clock.h[world])
-                if law != PAPER:
-                    kept = wp.transpose(frame(place)) * kept
-                his.spring[world, point] = kept
-                his.stored[world, point] = stored
-                his.cap[world, point] = held[0]
-                his.speed[world, point] = speed
-                mark = wp.int32(1)
-                if slips != 0 and held[0] > f64(0.0):
-                    mark += SLIPS
-                his.mark[world, point] = mark
-                seats.seat[world, point] = f + 1
-                seats.spot[world, point] = t.spot[world, point]
-        for j in range(4):
-            at.rows[10 + j, world, row] = booked[j, world, row]
-
-    @wp.kernel(module=module)
-    def close(
-        clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
-        accepted: wp.array(dtype=wp.int32), his: History, at: Attempt,
-    ):  # fmt: skip
-        """The energy of contact counts in the bound of the next first iterate."""
-        world = wp.tid()
-        if accepted[world] == 0:
-            return
-        his.posed[world] = clock.new_time[world]
-        at.elapsed[world] = at.elapsed[world] + clock.h[world]
-        potential[world] = potential[world] + term_sums[1, world]
-
     return _types.SimpleNamespace(
-        module=module, explicit_forces=explicit_forces, forces=forces, take_functions=take_functions, clear_lists=clear_lists,
-        count_points=count_points, place_lists=place_lists, fill_lists=fill_lists, sort_lists=sort_lists,
+        module=module, explicit_forces=explicit_forces, forces=forces, take_functions=take_functions,
         gather_masters=gather_masters, product_points=product_points, product_facets=product_facets,
-        product_masters=product_masters, diagonal_masters=diagonal_masters, finish=finish, close=close,
+        product_masters=product_masters, diagonal_masters=diagonal_masters,
     )  # fmt: skip

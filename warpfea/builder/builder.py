@@ -11,11 +11,11 @@ from ..elements.sections import Rectangle
 from ..materials import Material
 from ..model.bodies import Body
 from ..model.contacts import Collider, Contact
-from ..model.pairs import PairContact
 from ..model.description import BodyForce, Description, Rotation
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint
 from ..model.model import Model
+from ..model.pairs import PairContact
 from ..model.shapes import Shape
 from ..terms.evaluation import Evaluation
 from ..terms.term import Term
@@ -354,7 +354,7 @@ class ModelBuilder:
         """Add a rigid obstacle, which bodies feel where `add_contact` says so.
 
         Args:
-            shape: HalfSpace, Sphere, Box, Capsule or Cylinder, where it is at displacement 0.
+            shape: HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh, where it is at displacement 0.
             path: time law of its displacement (3,), m, or a Rotation; None: it is fixed.
             name: unique name; by default the shape's.
 
@@ -400,9 +400,7 @@ class ModelBuilder:
         """
         self._own(surface, "add_contact", Body, SurfaceSet)
         if collider is None:
-            raise NotImplementedError(
-                "add_contact: a body with itself is a later part; give a collider or another body"
-            )
+            raise NotImplementedError("add_contact: a body with itself is a later part; give a collider or a body")
         options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
                        stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
                        smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip

@@ -17,6 +17,7 @@ from ..model.description import Description, Rotation
 from ..model.handles import SurfaceSet
 from ..model.pairs import PAIR_RULES, PairContact, choose_master
 from ..model.shapes import Shape
+from ..model.triangle_mesh import TriMesh
 from .bodies import unused_name
 from .checks import vector
 
@@ -27,13 +28,14 @@ CONTACT_LAWS = ("default", "paper", "smooth")
 TREATMENTS = ("implicit", "explicit")
 CONTACT_MODELS = ("patch", "sphere")
 OVERLAPS = ("refuse", "offset")
+SHAPES = "HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh"
 
 
 def make_collider(d: Description, shape: Any, path: Any, name: str | None) -> Collider:
     """See ModelBuilder.add_collider."""
     if not isinstance(shape, Shape):
-        raise ModelError(f"add_collider: expected a shape (HalfSpace, Sphere, Box, Capsule or Cylinder), got {shape!r}")
-    default = {"HalfSpace": "half_space"}.get(type(shape).__name__, type(shape).__name__.lower())
+        raise ModelError(f"add_collider: expected a shape ({SHAPES}), got {shape!r}")
+    default = {"HalfSpace": "half_space", "TriMesh": "mesh"}.get(type(shape).__name__, type(shape).__name__.lower())
     name = unused_name(name, default, {c.name for c in d.colliders}, "collider")
     out = Collider(shape, name, index=len(d.colliders))
     what = f"collider {name!r}: path"
@@ -86,6 +88,11 @@ def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: 
     default = f"{surface.body.name} on {collider.name}"
     name = unused_name(name, default, {c.name for c in d.contacts} | {c.name for c in d.pairs}, "contact")
     o = _checked(f"contact {name!r}", surface, dict(options))
+    if o["model"] == "sphere" and isinstance(collider.shape, TriMesh) and not collider.shape.closed:
+        raise ModelError(
+            f"contact {name!r}: collider {collider.name!r} is a sheet of triangles, and model = 'sphere' needs an "
+            "obstacle with an inside: take model = 'patch', or a closed mesh"
+        )
     return Contact(surface, collider, name, index=len(d.contacts), **o)
 
 

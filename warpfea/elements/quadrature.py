@@ -17,10 +17,10 @@ __all__ = [
     "conical_triangle",
     "lobatto_square",
     "square_rule",
-    "triangle_16",
     "triangle_3",
     "triangle_6",
     "triangle_7",
+    "triangle_16",
 ]
 
 

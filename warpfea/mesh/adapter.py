@@ -31,7 +31,7 @@ from .cells import FILE_CELLS, cell_dimension
 from .checks import check
 from .mesh import Mesh, transformation
 
-__all__ = ["FORMATS", "from_meshio", "is_meshio", "read"]
+__all__ = ["FORMATS", "from_meshio", "is_meshio", "read", "read_triangles"]
 
 FORMATS = {".msh": "Gmsh 2.2 and 4.1", ".vtu": "VTK", ".inp": "Abaqus"}
 """The mesh files that are read."""
@@ -90,6 +90,35 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
         raise MeshError(f"{label}: can't be read: {error}") from error
     mesh = assemble(raw, file, cell_type)
     return check(mesh.transformed(transform=(matrix, shift)))
+
+
+def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) and triangles (m, 3) of any file that meshio reads; quads are cut in two, all else left out.
+
+    Raises
+    ------
+    MeshError
+        The file is missing or can't be read, or has no triangles.
+    """
+    import meshio
+
+    file = Path(path)
+    if not file.is_file():
+        raise MeshError(f"{file}: no such mesh file")
+    try:
+        with _quiet(str(file)):
+            mesh = meshio.read(file)
+    except OSError as error:
+        raise MeshError(f"{file}: can't be read: {error}") from error
+    halves = {"triangle": ([0, 1, 2],), "quad": ([0, 1, 2], [0, 2, 3])}
+    parts = [block.data[:, half] for block in mesh.cells for half in halves.get(block.type, ())]
+    if not sum(map(len, parts)):
+        found = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells"
+        raise MeshError(f"{file}: has no triangles, but {found}")
+    points = np.asarray(mesh.points, dtype=float)
+    if points.shape[1] == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
+    return points, np.concatenate(parts).astype(np.int64)
 
 
 def is_meshio(mesh: Any) -> bool:

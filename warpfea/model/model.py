@@ -380,9 +380,11 @@ class Model:
         The state of a simulation knows the springs of friction and where colliders are; with another they are where
         their paths are at its time, and there is no friction.
         """
-        if self.terms.contact is None:
-            return np.zeros((self.worlds, self.slots, 3))
-        return self.terms.contact.nodal_force(state)
+        out = np.zeros((self.worlds, self.slots, 3))
+        for term in (self.terms.contact, self.terms.pairs):
+            if term is not None:
+                out += term.nodal_force(state)
+        return out
 
     def set_parameter(self, name: str, values: Any) -> None:
         """Set a parameter in all worlds; simulations take the new values from their next step on.

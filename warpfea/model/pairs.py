@@ -10,7 +10,6 @@ import numpy as np
 from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
-from . import assembly
 from .contact_points import ContactPoints, body_mass_total, effective_modulus, points_by_rules
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet

@@ -23,6 +23,7 @@ __all__ = [
     "HalfSpace",
     "Shape",
     "Sphere",
+    "set_checked",
 ]
 
 ORTHONORMAL = 1e-6
@@ -34,7 +35,7 @@ class Shape:
     """A rigid solid in the place where it is at displacement 0; base of the shapes.
 
     Attributes:
-        kind: HALF_SPACE, SPHERE, BOX, CAPSULE or CYLINDER.
+        kind: HALF_SPACE, SPHERE, BOX, CAPSULE or CYLINDER; MESH of a TriMesh.
     """
 
     kind: ClassVar[int]
@@ -86,7 +87,7 @@ class HalfSpace(Shape):
     kind: ClassVar[int] = HALF_SPACE
 
     def __post_init__(self) -> None:
-        _set(self, normal=_direction(self, "normal"), offset=_number(self, "offset"))
+        set_checked(self, normal=_direction(self, "normal"), offset=_number(self, "offset"))
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
         """A point of the plane, the one closest to the origin, and axes whose third is the normal."""
@@ -128,7 +129,7 @@ class Sphere(Shape):
     kind: ClassVar[int] = SPHERE
 
     def __post_init__(self) -> None:
-        _set(self, center=_vector(self, "center"), radius=_positive(self, "radius"))
+        set_checked(self, center=_vector(self, "center"), radius=_positive(self, "radius"))
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
         """The centre, and the axes of the world."""
@@ -168,10 +169,10 @@ class Box(Shape):
     kind: ClassVar[int] = BOX
 
     def __post_init__(self) -> None:
-        _set(self, center=_vector(self, "center"), size=_vector(self, "size"))
+        set_checked(self, center=_vector(self, "center"), size=_vector(self, "size"))
         if not np.all(self.size > 0.0):
             raise ModelError(f"Box: size = {self.size.tolist()} must be three positive lengths of edges, m")
-        _set(self, axes=_rows(self, "axes"))
+        set_checked(self, axes=_rows(self, "axes"))
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
         """The centre, and the directions of the edges as columns."""
@@ -202,7 +203,7 @@ class _Round(Shape):
     radius: float
 
     def __post_init__(self) -> None:
-        _set(self, start=_vector(self, "start"), end=_vector(self, "end"), radius=_positive(self, "radius"))
+        set_checked(self, start=_vector(self, "start"), end=_vector(self, "end"), radius=_positive(self, "radius"))
         if not np.linalg.norm(self.end - self.start) > 0.0:
             raise ModelError(
                 f"{_name(self)}: end = {self.end.tolist()} is the start; the two ends of the axis must be apart"
@@ -273,7 +274,7 @@ def _name(shape: Shape) -> str:
     return type(shape).__name__
 
 
-def _set(shape: Shape, **values: Any) -> None:
+def set_checked(shape: Shape, **values: Any) -> None:
     """Set checked values of a frozen shape; arrays can't be written to."""
     for name, value in values.items():
         if isinstance(value, np.ndarray):

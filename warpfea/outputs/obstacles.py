@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from warpfea.kernels.terms.contact_mesh import MESH
 from warpfea.model.shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE
-from warpfea.outputs.normals import smooth_corners
+from warpfea.outputs.normals import smooth_corners, vertex_normals
 
 __all__ = ["GREY", "SHEET", "Obstacle", "Obstacles", "names_beside", "near"]
 
@@ -76,7 +77,7 @@ class Obstacles:
             else:
                 points, triangles = shape.mesh(48)
             points, triangles = split_edges((points - center) @ axes, triangles)
-            grown = np.stack([_grown(shape, points, by) for by in grow[:, k]])
+            grown = np.stack([_grown(shape, points, triangles, by) for by in grow[:, k]])
             self.all.append(Obstacle(collider.name, type(shape).__name__, grown, triangles, collider.moves))
 
     def narrow(self, width: float) -> None:
@@ -126,10 +127,12 @@ def split_edges(points: Floats, triangles: npt.NDArray[np.integer[Any]]) -> tupl
     return points[corner], group.reshape(-1, 3).astype(np.int32)
 
 
-def _grown(shape: Any, points: Floats, by: float) -> Floats:
+def _grown(shape: Any, points: Floats, triangles: npt.NDArray[np.int32], by: float) -> Floats:
     """Local points of a shape whose surface lies further out; half-spaces are moved instead."""
     if by == 0.0 or shape.kind == HALF_SPACE:
         return points
+    if shape.kind == MESH:
+        return points + by * vertex_normals(points, triangles)
     first, second, third = shape.sizes
     size = np.full(3, first)
     if shape.kind == BOX:

@@ -12,8 +12,8 @@ from ..kernels.step.control import REPORT
 from ..kernels.terms.constraints import JOINT_COLUMNS
 from ..kernels.terms.contact_data import RECORD
 from ..model.contacts import Contact
-from ..model.pairs import PairContact
 from ..model.joints import Joint
+from ..model.pairs import PairContact
 from .reports import ContactRecord, JointRecord, ProbeRecord
 from .results import Results
 
@@ -123,7 +123,7 @@ class Records(Results):
     def _contact_column(self, contact: Contact | PairContact | str) -> int:
         """First column of a contact in the report of a step."""
         d, terms = self.model.description, self.model.terms
-        contacts = [*d.contacts, *d.pairs]
+        contacts: list[Contact | PairContact] = [*d.contacts, *d.pairs]
         for other in contacts:
             if other is contact or other.name == contact:
                 term: Any = terms.contact if isinstance(other, Contact) else terms.pairs

@@ -15,12 +15,14 @@ from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..model.state import State
+from ..model.triangle_mesh import TriMesh
 from .contact_exact import Exact
-from .contact_fields import contact_field, nodal_force
-from .contact_parameters import contact_parameters
+from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle_patches
+from .contact_parameters import collider_parameters, contact_parameters
 from .contact_places import Places, at_points
+from .contact_sheets import refuse_across
 from .contact_tables import ContactTables, block_entries
-from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, FieldSpec, Term, part
+from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, Term, part
 from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
@@ -48,17 +50,15 @@ class Contact(Term):
         Column("collider_work", WORK),
         Column("", NUMERICAL),
     )
-    fields = {
-        "contact_pressure": FieldSpec("contact pressure", "Pa"),
-        "gap": FieldSpec("gap to the nearest obstacle in contact", "m"),
-    }
+    fields = CONTACT_FIELDS
     parts = {"contact": "contact with obstacles: forces, products, history"}
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.traits = Traits(walls=True)
         self.tables = ContactTables(model)
-        self.kernels, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        meshes = self.tables.meshes
+        self.kernels, self.books = contact_kernels(model.dtype, meshes), book_kernels(model.dtype, meshes)
         self.places = Places(self.tables) if self.tables.lumped else None
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
@@ -133,7 +133,7 @@ class Contact(Term):
             "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
-            "u": self.exact.allocate(work) if self.exact else work.u,
+            "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
@@ -174,6 +174,8 @@ class Contact(Term):
         gap, _ = self.at_points(state, history, places=False)
         u = state.displacement.numpy()
         touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
+        if self.tables.sheets and new.any():
+            refuse_across(self, s["attempt"], state.displacement, touching, new, at.launch)
         for k, contact in enumerate(self.tables.contacts):
             first, last = self.tables.first[k], self.tables.first[k + 1]
             depth = np.where(new[:, None], -gap[:, first:last], 0.0)
@@ -182,7 +184,7 @@ class Contact(Term):
                 continue
             if contact.overlap == "refuse":
                 world, point = np.unravel_index(int(depth.argmax()), depth.shape)
-                where = self._where(k, int(point))
+                where = self.where(k, int(point))
                 raise ModelError(
                     f"contact {contact.name!r}: body {contact.body.name!r} begins {depth.max():.3g} m inside collider "
                     f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
@@ -197,7 +199,7 @@ class Contact(Term):
         if "contact_born" in state.specs:
             state.contact_born.assign(state.contact_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
-    def _where(self, k: int, point: int) -> str:
+    def where(self, k: int, point: int) -> str:
         """Reference place of a point of a contact."""
         X = self.tables.host[k].X.reshape(-1, 3)[point]
         return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
@@ -358,7 +360,7 @@ class Contact(Term):
             )
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
-            f"{self._where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
+            f"{self.where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
             "smaller dt, a larger stiffness= of the contact, or a thicker shape"
         )
 
@@ -374,7 +376,7 @@ class Contact(Term):
         return f"; in touch: contact {', '.join(pairs[:3])}{more}" if pairs else ""
 
     def parameters(self) -> dict[str, Callable[[Any], None]]:
-        return contact_parameters(self.tables)
+        return contact_parameters(self.tables) | collider_parameters(self.tables)
 
     def facts(self) -> list[dict[str, Any]]:
         """Of each contact, in the order they were added, what `Model.info` tells: with the points that count, and those
@@ -384,6 +386,8 @@ class Contact(Term):
             k = t.number[contact.index]
             facts = {"name": contact.name, "body": contact.body.name, "collider": contact.collider.name}
             numbers = {"points": int((t.shares[k] > 0.0).sum()), "left_out": t.left_out[k]}
+            if isinstance(contact.collider.shape, TriMesh):
+                numbers["triangles"] = len(contact.collider.shape.triangles)
             out.append(facts | {"law": contact.law, "model": contact.model} | numbers)
         return out
 
@@ -400,14 +404,10 @@ class Contact(Term):
             return None
         return state.contact_place.numpy(), state.contact_turn.numpy(), self.tables.data.grow.numpy()  # type: ignore[attr-defined]
 
-    def sample(self, field: str, body: Any, state: State) -> np.ndarray:
-        """Of a node of a beam the values at the corner of its section with most contact, of a shell at that face."""
-        values = self.samples(field, body, state).reshape(state.worlds, len(body.mesh.points), -1)
-        # least of the gaps; fmin passes over NaN
-        return values.max(axis=2) if field == "contact_pressure" else np.fmin.reduce(values, axis=2)
-
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
-        return contact_field(self.tables, field, body, state.worlds, lambda: self.at_points(state))
+        mine = any(contact.body is body for contact in self.tables.contacts)
+        patches = obstacle_patches(self.tables, body, *self.at_points(state)) if mine else []
+        return contact_field(field, body, state.worlds, patches)
 
     def at_points(self, state: State, history: Any = None, *, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; with `places`

@@ -30,9 +30,9 @@ class Exact:
         slots = np.unique(np.concatenate([conn.ravel() for conn in connectivity]))
         self._slots = model.array("contact", slots, wp.int32)
 
-    def allocate(self, work: Workspace) -> wp.array:
-        """[world, slot] m, of which those of contact are used."""
-        return work.array("contact displacements", work.u.shape, wp.vec3d)
+    def allocate(self, work: Workspace, term: str) -> wp.array:
+        """[world, slot] m, of which those of contact are used, of a term by its name."""
+        return work.array(f"{term} displacements", work.u.shape, wp.vec3d)
 
     def follow(self, at: At, out: wp.array, active: wp.array) -> None:
         """Those of the iterate; in statics, which knows no speeds, as the state has them rounded."""

@@ -11,13 +11,15 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..model.contacts import Collider, Contact
+from ..model.pairs import PairContact
 from ..model.shapes import HalfSpace
 from .contact_tables import PER_WORLD, beta_of, hunt_crossley_damping
 
 if TYPE_CHECKING:
     from .contact_tables import ContactTables
+    from .pair_tables import PairTables
 
-__all__ = ["contact_parameters"]
+__all__ = ["collider_parameters", "contact_parameters"]
 
 WANTED = {
     "mu": "a friction coefficient, 0 or above",
@@ -28,15 +30,22 @@ WANTED = {
 }
 
 
-def contact_parameters(tables: ContactTables) -> dict[str, Callable[[Any], None]]:
-    """What sets a parameter, by its name."""
+def contact_parameters(tables: ContactTables | PairTables) -> dict[str, Callable[[Any], None]]:
+    """What sets a parameter of a contact with a collider or of two bodies, by its name."""
     out: dict[str, Callable[[Any], None]] = {}
     for contact in tables.contacts:
         out |= {f"{contact.name}.{name}": partial(_set_contact, tables, contact, name) for name in PER_WORLD}
-    return out | {f"{collider.name}.offset": partial(_set_offset, tables, collider) for collider in tables.colliders}
+    return out
 
 
-def _set_contact(tables: ContactTables, contact: Contact, name: str, values: Any) -> None:
+def collider_parameters(tables: ContactTables) -> dict[str, Callable[[Any], None]]:
+    """What sets a parameter of a collider, by its name."""
+    return {f"{collider.name}.offset": partial(_set_offset, tables, collider) for collider in tables.colliders}
+
+
+def _set_contact(
+    tables: ContactTables | PairTables, contact: Contact | PairContact, name: str, values: Any
+) -> None:  # fmt: skip
     """Write a value of a contact in all worlds."""
     what, k, data = f"contact {contact.name!r}", tables.number[contact.index], tables.data
     wanted = _per_world(what, name, values, tables.model.worlds)

@@ -25,7 +25,7 @@ class Places:
 
     def __init__(self, tables: ContactTables) -> None:
         self.tables = tables
-        self.kernels = place_kernels(tables.model.dtype)
+        self.kernels = place_kernels(tables.model.dtype, tables.meshes)
 
     def choose(
         self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],

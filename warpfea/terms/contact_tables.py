@@ -22,12 +22,14 @@ from ..model.contact_points import (
     lagrange_basis,
 )
 from ..model.contacts import Collider, Contact
+from ..model.triangle_mesh import TriMesh
+from .collider_meshes import mesh_tables, sizes
 from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["PER_WORLD", "ContactTables", "block_entries", "FacetGroup", "beta_of", "hunt_crossley_damping"]
+__all__ = ["PER_WORLD", "ContactTables", "FacetGroup", "beta_of", "block_entries", "hunt_crossley_damping"]
 
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
 SMOOTHING = (1e-3, 1e-4)
@@ -127,6 +129,16 @@ class ContactTables:
         return any(group.data.moving for group in self.groups)
 
     @property
+    def meshes(self) -> bool:
+        """Whether a collider is a mesh of triangles."""
+        return any(isinstance(collider.shape, TriMesh) for collider in self.colliders)
+
+    @property
+    def sheets(self) -> bool:
+        """Whether one of these has no inside."""
+        return any(isinstance(k.shape, TriMesh) and not k.shape.closed for k in self.colliders)
+
+    @property
     def explicit(self) -> bool:
         """Whether a contact has the force of the last state."""
         return any(contact.treatment == "explicit" for contact in self.contacts)
@@ -203,7 +215,7 @@ class ContactTables:
 
     def _contacts(self, laws: TimeLaws) -> Any:
         m, C, K = self.model, self.contacts, self.colliders
-        out = contact_struct()()
+        out = contact_struct(self.meshes)()
 
         def put(name: str, values: Any, dtype: Any) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
@@ -230,14 +242,20 @@ class ContactTables:
             put(name, np.tile(values, (m.worlds, 1)), wp.float64)
         frames = [k.shape.frame() for k in K]
         put("kind", [k.shape.kind for k in K], wp.int32)
-        put("size", [k.shape.sizes for k in K], wp.vec3d)
+        put("size", [sizes(k.shape, self._touching(k)) for k in K], wp.vec3d)
         put("center", [center for center, _ in frames], wp.vec3d)
         put("axes", [axes for _, axes in frames], wp.mat33d)
         put("path", [laws.add(k.law) if k.law is not None else -1 for k in K], wp.int32)
         put("spin", [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K], wp.int32)
         put("anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)
         put("axis", [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K], wp.vec3d)
+        if self.meshes:
+            out.mesh = mesh_tables(m, [k.shape for k in K])
         return out
+
+    def _touching(self, collider: Collider) -> list[np.ndarray]:
+        """Points of the surfaces that may touch a collider, (n, 3), m."""
+        return [p.X.reshape(-1, 3) for c, p in zip(self.contacts, self.host) if c.collider is collider]
 
     def hash(self, h: Any) -> None:
         """Feed what defines the contacts into a hash."""
@@ -245,6 +263,8 @@ class ContactTables:
             center, axes = collider.shape.frame()
             h.update(f"{collider.name} {collider.shape.kind}".encode())
             h.update(np.concatenate([collider.shape.sizes, center, axes.ravel()]).tobytes())
+            if isinstance(collider.shape, TriMesh):
+                h.update(collider.shape.points.tobytes() + collider.shape.triangles.tobytes())
             if collider.rotation is not None:
                 h.update(np.concatenate([collider.rotation.anchor, collider.rotation.axis]).tobytes())
         for contact, p in zip(self.contacts, self.host):

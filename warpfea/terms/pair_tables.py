@@ -40,6 +40,7 @@ class PairTables:
         groups: slave facets. surfaces, masters: master surfaces, each once, and their facets.
         host: points of each contact. shares: (F, P) area of each point over that of the region.
         points, rows, facets: points and slave facets in all; master facets.
+        far: how far off a gap is told, m.
         first, row_start: first point and row of each contact.
     """
 
@@ -110,6 +111,7 @@ class PairTables:
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             max(contact.offset, 0.0) for contact in self.contacts
         )
+        self.far = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
         self.size = m.size
 
@@ -135,7 +137,7 @@ class PairTables:
 
     def _contacts(self) -> Any:
         m, C = self.model, self.contacts
-        out = contact_struct()()
+        out = contact_struct(False)()
 
         def put(name: str, values: Any, dtype: Any) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
@@ -165,6 +167,14 @@ class PairTables:
         for name, values in per_world.items():
             put(name, np.tile(values, (m.worlds, 1)), wp.float64)
         return out
+
+    @property
+    def box_groups(self) -> wp.array:
+        """Groups of the boxes of [world, facet]: one of each world and surface."""
+        counts = [len(mas.conn) for mas in self.masters]
+        group = np.repeat(np.arange(len(counts)), counts)
+        groups = (np.arange(self.model.worlds)[:, None] * len(counts) + group).ravel()
+        return wp.array(groups, dtype=wp.int32, device=self.model.device)
 
     def _padded(self, values: list[np.ndarray], axis: int, width: int, mode: str = "constant") -> np.ndarray:
         """Facets of all surfaces, with one axis padded to a width."""

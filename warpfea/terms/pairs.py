@@ -1,8 +1,8 @@
-"""Contact between bodies: a term whose potential is that of the points of slave surfaces, see kernels/terms/pairs.py."""
+"""Contact between bodies: a term with the potential of points of slave surfaces, see kernels/terms/pairs.py."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,13 +15,20 @@ from ..kernels.terms.contact import RELAX_LANES, contact_kernels
 from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
 from ..kernels.terms.pair_blocks import pair_block_kernels
+from ..kernels.terms.pair_books import pair_book_kernels
 from ..kernels.terms.pair_data import seat_struct, touching_struct
+from ..kernels.terms.pair_lists import CHUNK, list_kernels
 from ..kernels.terms.pair_seek import seek_kernels
 from ..kernels.terms.pairs import pair_kernels
 from ..model.pairs import bernstein
+from ..model.state import State
 from .contact import TOUCHING
+from .contact_exact import Exact
+from .contact_fields import CONTACT_FIELDS, contact_field
+from .contact_parameters import contact_parameters
 from .contact_tables import block_entries
 from .pair_motions import PairMotions
+from .pair_survey import survey
 from .pair_tables import PairTables
 from .term import LOSS, STORED, At, Column, Term, part
 
@@ -44,15 +51,17 @@ class Pairs(Term):
     """
 
     name = "pairs"
-    columns = (Column("contact", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
+    columns = (Column("contact_pairs", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
+    fields = CONTACT_FIELDS
     parts = {"pairs": "contact between bodies: search, forces, products, history"}
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.traits = Traits(walls=True)
         self.tables = PairTables(model)
-        self.shared, self.books = contact_kernels(model.dtype), book_kernels(model.dtype)
+        self.shared, self.books = contact_kernels(model.dtype, False), book_kernels(model.dtype, False)
         self.seek, self.kernels = seek_kernels(model.dtype), pair_kernels(model.dtype)
+        self.lists, self.ending = list_kernels(model.dtype), pair_book_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -73,6 +82,7 @@ class Pairs(Term):
     def build(self, laws: TimeLaws) -> None:
         self.tables.build(self.offset)
         self.connectivity = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
+        self.exact = Exact(self.model, self.connectivity) if self.model.dtype == "float32" else None
         self.rows = self.booked_rows = self.tables.rows
 
     def hash(self, h: Any) -> None:
@@ -107,6 +117,7 @@ class Pairs(Term):
         shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
         shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
         shapes |= dict.fromkeys(("points", "start", "loaded"), (B, F))
+        shapes |= {"chunk": (B, -(-F // CHUNK))}
         shapes |= dict.fromkeys(("weight", "held_weight"), (B, P, t.master_conn.shape[1]))
         out = touching_struct(self.model.dtype)()
         for name, var in touching_struct(self.model.dtype).vars.items():
@@ -132,8 +143,8 @@ class Pairs(Term):
             "active": work.newton.touching,
             "booked": work.array("pairs booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("pairs parts", (B, C, len(RECORD), LANES), wp.float64),
-            "scan": work.array("pairs scan", (B * t.facets,), wp.int32),
             "row_start": m.array("contact", t.row_start, wp.int32),
+            "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
@@ -145,27 +156,29 @@ class Pairs(Term):
             nodes = np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X)
             low.append(nodes.min(axis=1))
             high.append(nodes.max(axis=1))
-        counts = [len(mas.conn) for mas in t.masters]
-        group = np.repeat(np.arange(len(counts)), counts)
-        groups = (np.arange(B)[:, None] * len(counts) + group).ravel()
         touching.lower.assign(np.tile(np.concatenate(low), (B, 1)).astype(np.float32))
         touching.upper.assign(np.tile(np.concatenate(high), (B, 1)).astype(np.float32))
-        array = wp.array(groups, dtype=wp.int32, device=self.model.device)
-        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=array)
+        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=t.box_groups)
 
-    def register(self, at: At) -> None:
+    def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
+        """The structs of history and seats, with arrays from make(name, dtype, shape of a world)."""
         history, seats = history_struct()(), seat_struct()()
         points = (self.tables.points,)
         for name, var in history_struct().vars.items():
             if name not in KEPT:
                 shape = () if name in ("born", "posed") else points
-                setattr(history, name, at.state.register(f"pairs_{name}", var.type.dtype, shape))
+                setattr(history, name, make(f"pairs_{name}", var.type.dtype, shape))
         for name, var in seat_struct().vars.items():
-            setattr(seats, name, at.state.register(f"pairs_{name}", var.type.dtype, points))
+            setattr(seats, name, make(f"pairs_{name}", var.type.dtype, points))
+        return history, seats
+
+    def register(self, at: At) -> None:
+        history, seats = self.history_of(at.state.register)
         at.scratch[self.name] = {"history": history, "seats": seats}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
-        return [self.shared.module, self.seek.module, self.kernels.module]
+        exact = [self.exact.kernels.module] if self.exact else []
+        return [self.shared.module, self.seek.module, self.kernels.module, *exact]
 
     def start(self, at: At, active: wp.array) -> None:
         """What overlaps at the state.
@@ -185,11 +198,15 @@ class Pairs(Term):
         history.overlap.assign(overlap)
         history.born.assign(born)
         self._begin(at, flags)
-        self._seek(at, at.state.displacement, flags, settling=1)
+        u = at.state.displacement
+        if self.exact:
+            u = s["u"]
+            self.exact.widen(at.launch, at.state.displacement, flags, u)
+        self._seek(at, u, flags, settling=1)
         seat = s["touching"].seat.numpy()
         depth = np.where((seat >= 0) & new[:, None], s["touching"].depth.numpy(), 0.0)
-        u = at.state.displacement.numpy()
-        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
+        u_n = at.state.displacement.numpy()
+        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u_n.dtype).eps * np.abs(u_n).max(axis=(1, 2))
         for k, contact in enumerate(t.contacts):
             first, last = t.first[k], t.first[k + 1]
             part_of = depth[:, first:last]
@@ -224,8 +241,7 @@ class Pairs(Term):
         touching, masters = s["touching"], s["masters"]
         u, v = at.state.displacement, at.state.velocity
         dim = (m.worlds, t.facets, masters.most)
-        at.launch(self.seek.controls, dim, [masters, v, active, touching.V0, touching.D0])
-        at.launch(self.seek.controls, dim, [masters, u, active, touching.C0, touching.D0])
+        at.launch(self.seek.controls_before, dim, [masters, u, v, active, touching])
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"]]
             dim = (m.worlds, group.count, group.data.points)
@@ -263,9 +279,11 @@ class Pairs(Term):
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
         touching, masters = s["touching"], s["masters"]
-        self._seek(at, w.u, active, settling=0)
+        if self.exact:
+            self.exact.follow(at, s["u"], active)
+        self._seek(at, s["u"], active, settling=0)
         for group in t.groups:
-            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], w.u, active, fresh]
+            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], s["u"], active, fresh]
             dim = (m.worlds, group.count, group.data.points)
             at.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
         wp.capture_if(touching.changed, self._list, at=at)
@@ -277,12 +295,13 @@ class Pairs(Term):
 
     def _list(self, at: At) -> None:
         """Lists of the points of each master facet."""
-        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.kernels
+        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.lists
         touching, masters = s["touching"], s["masters"]
         at.launch(k.clear_lists, m.worlds * t.facets, [touching])
         at.launch(k.count_points, (m.worlds, t.points), [masters, touching])
-        wp.utils.array_scan(touching.count, s["scan"], inclusive=True)
-        at.launch(k.place_lists, (m.worlds, t.facets), [masters, s["scan"], touching])
+        at.launch(k.sum_chunks, touching.chunk.shape, [masters, touching])
+        at.launch(k.scan_chunks, m.worlds, [touching])
+        at.launch(k.place_lists, (m.worlds, t.facets), [masters, touching])
         at.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
         at.launch(k.sort_lists, (m.worlds, t.facets), [touching])
 
@@ -294,7 +313,7 @@ class Pairs(Term):
         at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
         s = at.scratch[self.name]
         for group in self.tables.groups:
-            args = [s["masters"], group.data, at.work.u, flags, attempt, s["touching"]]
+            args = [s["masters"], group.data, s["u"], flags, attempt, s["touching"]]
             at.launch(self.kernels.take_functions, (m.worlds, group.count, group.data.points), args)
 
     @part("pairs")
@@ -329,11 +348,11 @@ class Pairs(Term):
         """History, books and records of an accepted substep."""
         s, m, t = at.scratch[self.name], self.model, self.tables
         C = len(t.contacts)
-        self._seek(at, at.work.u, accepted, settling=0)
+        self._seek(at, s["u"], accepted, settling=0)
         for group in t.groups:
             args = [t.data, s["masters"], group.data, s["history"], s["seats"], s["clock"], accepted]
             args += [s["attempt"], s["touching"], s["booked"]]
-            at.launch(self.kernels.finish, (m.worlds, group.count), args)
+            at.launch(self.ending.finish, (m.worlds, group.count), args)
         args = [t.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         at.launch(self.books.partial_records, (m.worlds, C, len(RECORD), LANES), args)
         args = [s["clock"], accepted, s["parts"], s["attempt"]]
@@ -345,7 +364,7 @@ class Pairs(Term):
         if not s["finished"]:  # without a ledger nothing is booked
             self._finish(at, accepted)
         args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
-        at.launch(self.kernels.close, self.model.worlds, args)
+        at.launch(self.ending.close, self.model.worlds, args)
 
     def report(self, at: At) -> None:
         args = [at.scratch[self.name]["attempt"], self.report_offset, at.work.report]
@@ -354,7 +373,7 @@ class Pairs(Term):
     def measure(self, at: At) -> dict[str, np.ndarray]:
         """Energy that the history says is stored, by points."""
         weights = np.concatenate([share.ravel() for share in self.tables.shares])
-        return {"contact": at.scratch[self.name]["history"].stored.numpy() @ weights}
+        return {"contact_pairs": at.scratch[self.name]["history"].stored.numpy() @ weights}
 
     # in a linear solve
 
@@ -424,6 +443,9 @@ class Pairs(Term):
         more = f" and {len(names) - 3} more" if len(names) > 3 else ""
         return f"; in touch: contact {', '.join(names[:3])}{more}" if names else ""
 
+    def parameters(self) -> dict[str, Callable[[Any], None]]:
+        return contact_parameters(self.tables)
+
     def facts(self) -> list[dict[str, Any]]:
         """Of each contact, in the order they were added, what `Model.info` tells."""
         t, out = self.tables, []
@@ -433,3 +455,14 @@ class Pairs(Term):
             numbers = {"points": int((t.shares[k] > 0.0).sum()), "facets": len(t.masters[t.of[k]].conn), "left_out": 0}
             out.append(names | {"law": contact.law, "model": contact.model} | numbers)
         return out
+
+    # at a state
+
+    def nodal_force(self, state: State) -> np.ndarray:
+        """Elastic forces of all contacts on slots of both bodies, (worlds, slots, 3), N, at a state."""
+        return survey(self, state).nodal_force()
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        bodies = [side.body for contact in self.tables.contacts for side in (contact.slave, contact.master)]
+        patches = survey(self, state).patches(body) if body in bodies else []
+        return contact_field(field, body, state.worlds, patches)

@@ -96,10 +96,18 @@ class Column:
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """A scalar field at nodes that users may ask for: title and units."""
+    """A scalar field at nodes that users may ask for.
+
+    Attributes:
+        title, units: of legends.
+        join: what becomes of the samples of two terms that have this very field; None: it is one term's alone.
+        at_node: what becomes of the samples of a node, where terms override `samples` alone; None: they have `sample`.
+    """
 
     title: str
     units: str
+    join: np.ufunc | None = None
+    at_node: np.ufunc | None = None
 
 
 @dataclass(eq=False)
@@ -363,7 +371,7 @@ class Term:
         return {}
 
     def sample(self, field: str, body: Any, state: State) -> np.ndarray:
-        """(worlds, nodes of the body's mesh) values of one of `fields`."""
+        """(worlds, nodes of the body's mesh) values of one of `fields` without `at_node`."""
         raise NotImplementedError
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray | None:

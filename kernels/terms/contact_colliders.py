@@ -1,0 +1,124 @@
+"""Colliders of all kinds for kernels of contact: distance, sweep, and the side of a point.
+
+A model without triangle meshes takes functions that know none.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from .contact_data import contact_struct
+from .contact_mesh import MESH, mesh_functions
+from .contact_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
+
+__all__ = ["MESHES", "collider_functions"]
+
+MESHES = "_meshes"
+"""In names of modules that know meshes."""
+
+SLIPS = 16
+"""Of a point's mark: it slips; below are the sides."""
+NAMES = ("distance", "sweep", "side_after", "deepening", "beside")
+MESH_SLIPS = 1 << 30
+"""The same where sides are triangles."""
+
+
+@functools.cache
+def collider_functions(meshes: bool) -> _types.SimpleNamespace:
+    """Device functions, see `contact_shapes` and `contact_mesh`, and the number SLIPS."""
+    slips = MESH_SLIPS if meshes else SLIPS
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts = contact_struct(meshes)
+    shapes = shape_functions()
+    of_shape, sweep_shape = shapes.distance, shapes.sweep
+    mesh = mesh_functions(Contacts) if meshes else _types.SimpleNamespace(**dict.fromkeys(NAMES))
+    of_mesh, sweep_mesh, side_on_mesh, along_mesh, beside_mesh = (getattr(mesh, name) for name in NAMES)
+
+    @wp.func
+    def distance(con: Contacts, k: int, y: vec3d, side: int) -> wp.vec4d:
+        """Outward unit normal and signed distance of a place in the frame of collider k."""
+        if wp.static(meshes):
+            if con.kind[k] == MESH:
+                return of_mesh(con, k, y, side)
+        return of_shape(con.kind[k], con.size[k], y, side)
+
+    @wp.func
+    def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
+        """Side through which a motion is inside at its end, -1: any; -2: it went through."""
+        if wp.static(meshes):
+            if con.kind[k] == MESH:
+                return sweep_mesh(con, k, start, end, side)
+        return sweep_shape(con.kind[k], con.size[k], start, end, side)
+
+    @wp.func
+    def known_side(con: Contacts, k: int, live: bool, mark: int) -> int:
+        """The side that a mark tells, -1: none; of a point that touches no sheet -3 in front of it, -4 behind."""
+        if live:
+            return mark % slips - 1
+        if wp.static(meshes):
+            if mark % slips > 0:
+                return -2 - mark % slips
+        return -1
+
+    @wp.func
+    def beside(con: Contacts, k: int, y: vec3d, mark: int) -> int:
+        """The mark of a point that touches nothing: where on a sheet it is, as before if rounding hides that."""
+        if wp.static(meshes):
+            if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
+                return beside_mesh(con, k, y, mark)
+        return 0
+
+    @wp.func
+    def released(con: Contacts, k: int, live: bool, mark: int) -> int:
+        """The mark of a point that touches no more."""
+        if wp.static(meshes):
+            if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
+                if live and mark % slips > 0:
+                    return 1 + (mark % slips - 1) % 2
+                return wp.where(live, 0, mark)
+        return 0
+
+    @wp.func
+    def side_after(con: Contacts, k: int, y: vec3d, side: int) -> int:
+        """The side to keep of a point that is at y and was swept to a side: on a mesh it slides over triangles."""
+        if wp.static(meshes):
+            if con.kind[k] == MESH:
+                return side_on_mesh(con, k, y, side)
+        return wp.max(side, -1)
+
+    @wp.func
+    def deepening(
+        con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
+    ) -> wp.vec2d:  # fmt: skip
+        """Change of the depth by a motion, from the motion itself where that is exact, and 1; else 0. Last the
+        distances of its ends.
+
+        As a difference of places it would be rounded as those are, by more than a stiff body at rest moves.
+        """
+        kind = con.kind[k]
+        if kind == HALF_SPACE:
+            return wp.vec2d(-local[2], f64(1.0))
+        if kind == SPHERE:
+            return wp.vec2d(
+                -wp.dot(y + start, local) / wp.max(wp.length(y) + wp.length(start), f64(1.0e-300)), f64(1.0)
+            )
+        if kind == BOX and side >= 0:
+            h = con.size[k]
+            axis = side / 2
+            sign = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
+            flat = wp.abs(h[axis] - sign * start[axis] + before) <= f64(1.0e-12) * h[axis]
+            for j in range(3):
+                if j != axis and wp.abs(start[j]) > h[j]:
+                    flat = False
+            if flat:
+                return wp.vec2d(-sign * local[axis], f64(1.0))
+        if wp.static(meshes):
+            if kind == MESH:
+                return along_mesh(con, k, side, start, y, local, before, after)
+        return wp.vec2d()
+
+    return _types.SimpleNamespace(
+        distance=distance, sweep=sweep, known_side=known_side, side_after=side_after, beside=beside, released=released,
+        deepening=deepening, SLIPS=slips,
+    )  # fmt: skip

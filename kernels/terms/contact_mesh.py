@@ -1,0 +1,362 @@
+"""Rigid triangle meshes: nearest place, side and crossing, by a tree of boxes built once in the mesh's own frame.
+
+The tree is our own and all of it is float64, unlike `wp.Bvh`: nothing has to be rounded outward, and its stack is each
+thread's own (queries of `wp.Bvh` share one per block on CUDA). It is balanced: box i has the boxes 2 i + 1 and 2 i + 2.
+
+A closed mesh is solid. A sheet, which has an edge with one triangle, is felt from both of its sides. In both what lies
+in front is told by angle-weighted normals (Baerentzen and Aanaes, IEEE TVCG 11, 2005), and a point that has passed the
+surface belongs to the triangle it came through, until it leaves again: `side` is twice the triangle's number, plus 1
+where it came from behind. What counts then are triangles that face like that one and are ahead of the point.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+__all__ = ["FLAT", "MESH", "RIM", "SHARP", "mesh_functions", "mesh_struct"]
+
+MESH = 5
+"""The kind of collider, after those of `contact_shapes`."""
+SHARP, FLAT, RIM = range(3)
+"""A border between triangles of different planes, of one plane, or of an edge that has one triangle."""
+PARTS = 7
+"""Parts of a triangle: face, edges ab, bc, ca, corners a, b, c."""
+STACK = 40
+"""Boxes that wait, at most one per level of a tree and one more; 2^30 triangles need 30."""
+ALIKE = 0.5
+"""Cosine of the angle by which triangles of one side may turn."""
+FINE = 1e-12
+"""Over the mesh's size: what is behind a surface by less is on it."""
+ROUNDED = 1e-6
+"""The same of a point that was on the other side: float32 rounds a step's end so far, or less."""
+SLIVER = 1e-6
+"""Over its thickness: depth of a passage that is none, as over the edge of a blade."""
+
+
+@functools.cache
+def mesh_struct():
+    """Triangles of all meshes, [collider], [box] or [.., triangle]; those of a leaf are next to each other."""
+
+    @wp.struct
+    class Meshes:
+        box: wp.array(dtype=wp.int32)  # [collider] its first box
+        leaf: wp.array(dtype=wp.int32)  # its first leaf
+        inner: wp.array(dtype=wp.int32)  # boxes above the leaves
+        low: wp.array(dtype=wp.vec3d)  # [box] corners of boxes, m
+        high: wp.array(dtype=wp.vec3d)
+        start: wp.array(dtype=wp.int32)  # [leaf] its first triangle; the next entry ends it
+        corner: wp.array2d(dtype=wp.vec3d)  # [corner, triangle], m
+        normal: wp.array2d(dtype=wp.vec3d)  # [part, triangle] of length 1
+        border: wp.array2d(dtype=wp.int32)  # [part, triangle] FLAT, SHARP or RIM
+
+    return Meshes
+
+
+@functools.cache
+def mesh_functions(Contacts) -> _types.SimpleNamespace:
+    """Device functions for contacts of a struct with `mesh`; `size`: its size, thickness, 1 if closed."""
+    f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
+    ints = wp.types.vector(length=STACK, dtype=wp.int32)
+
+    @wp.struct
+    class Nearest:
+        place: vec3d
+        square: f64  # of the distance
+        part: wp.int32
+        triangle: wp.int32  # -1: none
+
+    @wp.struct
+    class Hits:
+        """The first place where a segment passes to the back, and the first to the front; t in [0, 1], or 2."""
+
+        into: f64
+        out: f64
+        into_triangle: wp.int32
+        out_triangle: wp.int32
+
+    @wp.func
+    def closest_on(a: vec3d, b: vec3d, c: vec3d, n: vec3d, y: vec3d) -> vec4d:
+        """The place of a triangle nearest to y, and its part (Ericson, Real-Time Collision Detection, 2005, 5.1.5)."""
+        zero = f64(0.0)
+        ab = b - a
+        ac = c - a
+        d1 = wp.dot(ab, y - a)
+        d2 = wp.dot(ac, y - a)
+        d3 = wp.dot(ab, y - b)
+        d4 = wp.dot(ac, y - b)
+        d5 = wp.dot(ab, y - c)
+        d6 = wp.dot(ac, y - c)
+        if d1 <= zero and d2 <= zero:
+            return vec4d(a[0], a[1], a[2], f64(4.0))
+        if d3 >= zero and d4 <= d3:
+            return vec4d(b[0], b[1], b[2], f64(5.0))
+        if d6 >= zero and d5 <= d6:
+            return vec4d(c[0], c[1], c[2], f64(6.0))
+        part = f64(0.0)
+        place = y - wp.dot(y - a, n) * n
+        if d1 >= zero and d3 <= zero and d1 * d4 - d3 * d2 <= zero:
+            part = f64(1.0)
+            place = a + (d1 / (d1 - d3)) * ab
+        elif d4 >= d3 and d5 >= d6 and d3 * d6 - d5 * d4 <= zero:
+            part = f64(2.0)
+            place = b + ((d4 - d3) / ((d4 - d3) + (d5 - d6))) * (c - b)
+        elif d2 >= zero and d6 <= zero and d5 * d2 - d1 * d6 <= zero:
+            part = f64(3.0)
+            place = a + (d2 / (d2 - d6)) * ac
+        return vec4d(place[0], place[1], place[2], part)
+
+    @wp.func
+    def away(low: vec3d, high: vec3d, y: vec3d) -> f64:
+        """Square of the distance from a box."""
+        out = f64(0.0)
+        for k in range(3):
+            d = wp.max(wp.max(low[k] - y[k], y[k] - high[k]), f64(0.0))
+            out += d * d
+        return out
+
+    @wp.func
+    def sense_of(side: int) -> f64:
+        """1 where a point came from the front, -1 from behind."""
+        return wp.where(side >= 0 and side % 2 == 1, f64(-1.0), f64(1.0))
+
+    @wp.func
+    def counts(con: Contacts, t: int, y: vec3d, side: int) -> bool:
+        """Whether a triangle faces like that of a side and is ahead of a point that has passed the surface."""
+        if side < 0:
+            return True
+        n = con.mesh.normal[0, t]
+        if wp.dot(n, con.mesh.normal[0, side / 2]) <= f64(ALIKE):
+            return False
+        return sense_of(side) * wp.dot(y - con.mesh.corner[0, t], n) <= f64(0.0)
+
+    @wp.func
+    def nearest(con: Contacts, k: int, y: vec3d, side: int) -> Nearest:
+        """The place of a mesh that is nearest to y; with a side, among triangles that count."""
+        best = Nearest()
+        best.square = f64(1.0e300)
+        best.triangle = -1
+        base = con.mesh.box[k]
+        inner = con.mesh.inner[k]
+        waiting = ints()
+        top = wp.int32(1)
+        while top > 0:
+            top -= 1
+            i = waiting[top]
+            if away(con.mesh.low[base + i], con.mesh.high[base + i], y) < best.square:
+                if i < inner:
+                    near = 2 * i + 1
+                    far = near + 1
+                    d_near = away(con.mesh.low[base + near], con.mesh.high[base + near], y)
+                    d_far = away(con.mesh.low[base + far], con.mesh.high[base + far], y)
+                    if d_far < d_near:
+                        near = far
+                        far = 2 * i + 1
+                    waiting[top] = far
+                    waiting[top + 1] = near
+                    top += 2
+                else:
+                    leaf = con.mesh.leaf[k] + i - inner
+                    for t in range(con.mesh.start[leaf], con.mesh.start[leaf + 1]):
+                        if counts(con, t, y, side):
+                            c = closest_on(con.mesh.corner[0, t], con.mesh.corner[1, t], con.mesh.corner[2, t],
+                                           con.mesh.normal[0, t], y)  # fmt: skip
+                            place = vec3d(c[0], c[1], c[2])
+                            square = wp.length_sq(y - place)
+                            if square < best.square:
+                                best.square = square
+                                best.place = place
+                                best.part = wp.int32(c[3])
+                                best.triangle = t
+        return best
+
+    @wp.func
+    def facing(con: Contacts, k: int, s: Nearest, y: vec3d) -> vec4d:
+        """Normal and distance at the nearest place, positive in front of the surface."""
+        n = con.mesh.normal[s.part, s.triangle]
+        if con.mesh.border[s.part, s.triangle] == FLAT:
+            return vec4d(n[0], n[1], n[2], wp.dot(y - con.mesh.corner[0, s.triangle], n))
+        arm = y - s.place
+        size = wp.length(arm)
+        sign = wp.where(wp.dot(arm, n) >= f64(0.0), f64(1.0), f64(-1.0))
+        if size > f64(1.0e-9) * con.size[k][0]:
+            n = (sign / size) * arm
+        return vec4d(n[0], n[1], n[2], sign * size)
+
+    @wp.func
+    def rim(con: Contacts, s: Nearest) -> bool:
+        """Whether the nearest place is on the rim of a sheet."""
+        return con.mesh.border[s.part, s.triangle] == RIM
+
+    @wp.func
+    def distance(con: Contacts, k: int, y: vec3d, side: int) -> vec4d:
+        """Normal towards the side that a point belongs to, and signed distance; without one outside of a sheet."""
+        s = nearest(con, k, y, -1)
+        d = facing(con, k, s, y)
+        if con.size[k][2] == f64(0.0) and (side < 0 or rim(con, s)):
+            return wp.where(d[3] < f64(0.0), -d, d)
+        d = sense_of(side) * d
+        if side >= 0 and d[3] < f64(0.0):
+            ahead = nearest(con, k, y, side)
+            if ahead.triangle >= 0:
+                d = sense_of(side) * facing(con, k, ahead, y)
+                if (d[3] > f64(0.0)) != rim(con, ahead):  # off the rim it is outside
+                    d = -d
+        return d
+
+    @wp.func
+    def side_after(con: Contacts, k: int, y: vec3d, side: int) -> int:
+        """The side of a point where it has come to, -1 outside."""
+        if distance(con, k, y, side)[3] >= f64(0.0):
+            return -1
+        s = nearest(con, k, y, side)
+        if s.triangle < 0:
+            s = nearest(con, k, y, -1)
+        return 2 * s.triangle + wp.max(side, 0) % 2
+
+    @wp.func
+    def beside(con: Contacts, k: int, y: vec3d, mark: int) -> int:
+        """1 in front of a sheet, 2 behind, and as before where it is closer than rounding."""
+        s = nearest(con, k, y, -1)
+        above = wp.dot(y - s.place, con.mesh.normal[s.part, s.triangle])
+        if wp.abs(above) <= f64(ROUNDED) * con.size[k][0]:
+            if mark == 0 and above < -f64(FINE) * con.size[k][0]:
+                return 2
+            return wp.max(mark, 1)
+        return wp.where(above > f64(0.0), 1, 2)
+
+    @wp.func
+    def apart(low: vec3d, high: vec3d, middle: vec3d, half: vec3d) -> bool:
+        """Whether a segment misses a box (separating axes)."""
+        e = f64(0.5) * (high - low)
+        c = middle - f64(0.5) * (high + low)
+        a = vec3d(wp.abs(half[0]), wp.abs(half[1]), wp.abs(half[2]))
+        for k in range(3):
+            if wp.abs(c[k]) > e[k] + a[k]:
+                return True
+        w = wp.cross(half, c)
+        if wp.abs(w[0]) > e[1] * a[2] + e[2] * a[1]:
+            return True
+        if wp.abs(w[1]) > e[0] * a[2] + e[2] * a[0]:
+            return True
+        return wp.abs(w[2]) > e[0] * a[1] + e[1] * a[0]
+
+    @wp.func
+    def within(con: Contacts, t: int, p: vec3d, tol: f64) -> bool:
+        """Whether a place of its plane is in a triangle, or next to it by `tol`."""
+        n = con.mesh.normal[0, t]
+        for k in range(3):
+            a = con.mesh.corner[k, t]
+            edge = con.mesh.corner[(k + 1) % 3, t] - a
+            if wp.dot(wp.cross(n, edge), p - a) < -tol * wp.length(edge):
+                return False
+        return True
+
+    @wp.func
+    def hits(con: Contacts, k: int, a: vec3d, b: vec3d, side: int) -> Hits:
+        """Where the segment from a to b passes the surface, from where it begins by `side`: -3 in front, -4 behind."""
+        out = Hits()
+        out.into = f64(2.0)
+        out.out = f64(2.0)
+        tol = f64(FINE) * con.size[k][0]
+        level = -tol  # from here on up it begins in front
+        if side < -2:
+            level = wp.where(side == -3, -f64(ROUNDED), f64(ROUNDED)) * con.size[k][0]
+        reach = f64(2.0) * f64(ROUNDED) * con.size[k][0]
+        margin = vec3d(reach, reach, reach)
+        base = con.mesh.box[k]
+        inner = con.mesh.inner[k]
+        waiting = ints()
+        top = wp.int32(1)
+        while top > 0:
+            top -= 1
+            i = waiting[top]
+            if not apart(con.mesh.low[base + i] - margin, con.mesh.high[base + i] + margin, f64(0.5) * (a + b),
+                         f64(0.5) * (b - a)):  # fmt: skip
+                if i < inner:
+                    waiting[top] = 2 * i + 1
+                    waiting[top + 1] = 2 * i + 2
+                    top += 2
+                else:
+                    leaf = con.mesh.leaf[k] + i - inner
+                    for t in range(con.mesh.start[leaf], con.mesh.start[leaf + 1]):
+                        n = con.mesh.normal[0, t]
+                        before = wp.dot(a - con.mesh.corner[0, t], n)
+                        after = wp.dot(b - con.mesh.corner[0, t], n)
+                        enters = before >= level and after < f64(0.0) and after < before
+                        leaves = before < level and after >= f64(0.0) and after > before
+                        if enters or leaves:
+                            part = wp.clamp(before / (before - after), f64(0.0), f64(1.0))
+                            if within(con, t, a + part * (b - a), f64(1000.0) * tol):
+                                if enters and part < out.into:
+                                    out.into = part
+                                    out.into_triangle = t
+                                elif leaves and part < out.out:
+                                    out.out = part
+                                    out.out_triangle = t
+        return out
+
+    @wp.func
+    def passes(con: Contacts, k: int, first: int, entry: vec3d, last: int, leave: vec3d, sense: f64) -> bool:
+        """Whether a way in through a triangle and out through another leads through the mesh, not over its edge."""
+        n = con.mesh.normal[0, first]
+        turn = wp.dot(n, con.mesh.normal[0, last])
+        deep = sense * wp.dot(n, entry - leave)
+        thick = con.size[k][1]
+        if turn < f64(-ALIKE):
+            return deep > f64(SLIVER) * thick
+        return turn < f64(ALIKE) and deep > f64(0.5) * thick
+
+    @wp.func
+    def passed(con: Contacts, k: int, side: int, y: vec3d) -> bool:
+        """Whether a point is so far behind a sheet that it is beyond it."""
+        deep = sense_of(side) * wp.dot(con.mesh.normal[0, side / 2], con.mesh.corner[0, side / 2] - y)
+        return con.size[k][2] == f64(0.0) and deep > con.size[k][1]
+
+    @wp.func
+    def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
+        """See `contact_shapes`: the side through which a motion has passed the surface at its end, -1: none or any,
+        -2: it went through."""
+        h = hits(con, k, start, end, side)
+        d = end - start
+        if side >= 0:
+            leave = wp.where(side % 2 == 0, h.out, h.into)
+            last = wp.where(side % 2 == 0, h.out_triangle, h.into_triangle)
+            if leave > f64(1.0):
+                return wp.where(passed(con, k, side, end), -2, side)
+            entry = con.mesh.corner[0, side / 2]
+            if passes(con, k, side / 2, entry, last, start + leave * d, sense_of(side)):
+                return -2
+            return -1
+        if h.into > f64(1.0) and h.out > f64(1.0):
+            return -1
+        behind = wp.where(con.size[k][2] == f64(0.0) and h.out < h.into, 1, 0)
+        first = wp.where(behind == 1, h.out_triangle, h.into_triangle)
+        last = wp.where(behind == 1, h.into_triangle, h.out_triangle)
+        t0 = wp.where(behind == 1, h.out, h.into)
+        t1 = wp.where(behind == 1, h.into, h.out)
+        if t0 > f64(1.0) or t1 < t0:
+            return -1
+        if t1 > f64(1.0):
+            return wp.where(passed(con, k, 2 * first + behind, end), -2, 2 * first + behind)
+        if passes(con, k, first, start + t0 * d, last, start + t1 * d, sense_of(behind)):
+            return -2
+        return -1
+
+    @wp.func
+    def deepening(
+        con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
+    ) -> wp.vec2d:  # fmt: skip
+        """Change of the depth by a motion along one plane, and 1; else 0. Last the distances of its ends."""
+        if side < 0:
+            return wp.vec2d()
+        n = sense_of(side) * con.mesh.normal[0, side / 2]
+        a = con.mesh.corner[0, side / 2]
+        tol = f64(FINE) * con.size[k][0]
+        if wp.abs(wp.dot(start - a, n) - before) <= tol and wp.abs(wp.dot(y - a, n) - after) <= tol:
+            return wp.vec2d(-wp.dot(n, local), f64(1.0))
+        return wp.vec2d()
+
+    return _types.SimpleNamespace(
+        distance=distance, sweep=sweep, side_after=side_after, deepening=deepening, beside=beside
+    )

@@ -1,0 +1,43 @@
+"""Whether bodies begin across a sheet of triangles, of which no side can be told then."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import SMALL, kernel_module, precision
+from .contact_colliders import MESHES, collider_functions
+from .contact_data import attempt_struct, contact_struct, facet_struct
+from .contact_touch import touch_functions
+
+__all__ = ["sheet_kernels"]
+
+
+@functools.cache
+def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
+    """A kernel in a module of its own, which runs as a simulation begins."""
+    vec3, vec3d = precision(dtype).vec3, wp.vec3d
+    Contacts, Facets, Attempt = contact_struct(True), facet_struct(dtype), attempt_struct(dtype)
+    along = touch_functions(dtype, True).along
+    distance, sweep = collider_functions(True).distance, collider_functions(True).sweep
+    module = kernel_module(f"contact_sheets_{dtype}{MESHES}", max_unroll=SMALL)
+
+    @wp.kernel(module=module)
+    def across(
+        con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), tolerance: wp.array(dtype=wp.float64), at: Attempt,
+        found: wp.array2d(dtype=wp.int32),
+    ):  # fmt: skip
+        """Of each facet a point that is behind a sheet as seen from the point before it, + 1; found: [world, row]."""
+        world, item = wp.tid()
+        k = con.collider[facets.contact[item]]
+        before = vec3d()
+        for q in range(facets.points):
+            x = facets.X[q, item] + along(facets, u, world, q, item)
+            y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
+            if q > 0:
+                side = sweep(con, k, before, y, -1)
+                if side == -2 or (side >= 0 and distance(con, k, y, side)[3] < -tolerance[world]):
+                    found[world, facets.row + item] = facets.point + item * facets.points + q + 1
+            before = y
+
+    return _types.SimpleNamespace(module=module, across=across)

@@ -1,0 +1,270 @@
+"""Rigid triangle meshes as obstacles: what they must be, and the tables that contact searches."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..base.checks import is_number
+from ..base.errors import MeshError, ModelError
+from ..kernels.terms.contact_mesh import FLAT, MESH, RIM, SHARP
+from ..mesh.adapter import read_triangles
+from .shapes import Shape, set_checked
+
+__all__ = ["TriMesh", "TriangleTables"]
+
+NEEDLE = 1e-10
+"""Least height of a triangle over its longest edge."""
+PLANE = 1e-12
+"""Sine of the angle up to which triangles count as coplanar."""
+FOLD = 1e-6
+"""Least length of the sum of the normals at an edge."""
+LEAF = 4
+"""Most triangles of a leaf."""
+
+
+@dataclass(frozen=True)
+class TriangleTables:
+    """What the device reads of a mesh, in its own frame; see kernels/terms/contact_mesh.py.
+
+    Attributes:
+        low, high: (boxes, 3) m, of a balanced tree.
+        start: (leaves + 1,) first triangle of each leaf, and their number.
+        corner: (3, triangles, 3) m, in the order of the leaves.
+        normal: (7, triangles, 3) of face, edges ab, bc, ca and corners a, b, c.
+        border: (7, triangles) FLAT, SHARP or RIM.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    start: np.ndarray
+    corner: np.ndarray
+    normal: np.ndarray
+    border: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class TriMesh(Shape):
+    """The solid within a closed mesh of triangles, or a sheet of triangles that has no thickness.
+
+    A mesh in which each edge has two triangles is closed, and solid behind its triangles. Any other is a sheet: bodies
+    touch it from both sides, and one that begins on it is in front. Points at exactly one place are one point.
+
+    Args:
+        points: (n, 3), m over `scale`, or a file that meshio reads, such as .stl, .obj, .ply, .vtk or .msh.
+        triangles: (m, 3) point numbers, seen from the front counter-clockwise; None with a file.
+        scale: m per unit of the points.
+
+    Raises:
+        ModelError: a file that can't be read, no triangles, a triangle without an area, a point number out of range or
+            a value that is not finite; an edge of more than two triangles, or run through twice in one direction, or
+            where the surface folds back on itself; a closed mesh that is inside out.
+    """
+
+    points: Any
+    triangles: Any = None
+    scale: float = 1.0
+    kind: ClassVar[int] = MESH
+
+    def __post_init__(self) -> None:
+        if not is_number(self.scale) or not self.scale > 0.0:
+            raise ModelError(f"TriMesh: scale = {self.scale!r} must be a positive finite number")
+        points, triangles = self.points, self.triangles
+        if isinstance(points, (str, os.PathLike)):
+            if triangles is not None:
+                raise ModelError(f"TriMesh: triangles = must be left out where a file is given ({points})")
+            try:
+                points, triangles = read_triangles(points)
+            except MeshError as error:
+                raise ModelError(f"TriMesh: {error}") from None
+        points = float(self.scale) * _points(points)
+        triangles = _triangles(triangles, points)
+        set_checked(self, points=points, triangles=triangles, scale=float(self.scale))
+        self._neighbours  # noqa: B018  (checks edges)
+        if self.closed and not self.volume > 0.0:
+            raise ModelError(
+                f"TriMesh: the mesh is closed and inside out, its volume is {self.volume:.3g} m^3: turn the triangles "
+                "round, [:, ::-1]"
+            )
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """The middle of its box, and the axes of the world."""
+        used = self.points[self.triangles.ravel()]
+        return 0.5 * (used.min(axis=0) + used.max(axis=0)), np.eye(3)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """(3,) diagonal of its box, thickness 2 V/A (of a sheet the diagonal), m, and 1 if it is closed."""
+        used = self.points[self.triangles.ravel()]
+        size = float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
+        area = 0.5 * float(np.linalg.norm(self._cross, axis=1).sum())
+        return np.array([size, 2.0 * self.volume / area if self.closed else size, float(self.closed)])
+
+    @property
+    def radius_of_curvature(self) -> float:
+        return np.inf
+
+    def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
+        """Points and triangles as they are."""
+        return self.points, self.triangles
+
+    @property
+    def closed(self) -> bool:
+        """Whether each edge has two triangles."""
+        return bool((self._neighbours >= 0).all())
+
+    @property
+    def volume(self) -> float:
+        """m^3, of a closed mesh."""
+        a, b, c = np.moveaxis(self._corners, 1, 0)
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+    @cached_property
+    def _corners(self) -> np.ndarray:
+        """(m, 3, 3) corners of the triangles about the centre, m."""
+        return self.points[self.triangles] - self.frame()[0]
+
+    @property
+    def _cross(self) -> np.ndarray:
+        """(m, 3) normals as long as twice the area, m^2."""
+        p = self._corners
+        return np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+
+    @cached_property
+    def _welded(self) -> np.ndarray:
+        """(m, 3) triangles by numbers of places."""
+        _, number = np.unique(self.points, axis=0, return_inverse=True)
+        return number.reshape(-1)[self.triangles]
+
+    @cached_property
+    def _neighbours(self) -> np.ndarray:
+        """(m, 3) the triangle beyond each edge ab, bc, ca, or -1. ModelError names an edge that is wrong."""
+        t = self._welded
+        start, end = t.ravel(), np.roll(t, -1, axis=1).ravel()
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        order = np.lexsort((high, low))
+        low, high = low[order], high[order]
+        same = (low[1:] == low[:-1]) & (high[1:] == high[:-1])
+        for k in np.flatnonzero(same[1:] & same[:-1])[:1]:
+            found = ", ".join(str(int(e) // 3) for e in order[k : k + 3])
+            raise ModelError(f"TriMesh: {self._edge(order[k])} has more than two triangles ({found}, ...)")
+        one, other = order[:-1][same], order[1:][same]
+        for k in np.flatnonzero(start[one] == start[other])[:1]:
+            raise ModelError(
+                f"TriMesh: {self._edge(one[k])} is run through in one direction by triangles {one[k] // 3} and "
+                f"{other[k] // 3}; turn one of them round"
+            )
+        normal = self._cross / np.linalg.norm(self._cross, axis=1, keepdims=True)
+        folded = np.linalg.norm(normal[one // 3] + normal[other // 3], axis=1) < FOLD
+        for k in np.flatnonzero(folded)[:1]:
+            raise ModelError(f"TriMesh: at {self._edge(one[k])} triangles {one[k] // 3} and {other[k] // 3} lie on "
+                             "each other: the surface folds back on itself")  # fmt: skip
+        out = np.full(t.size, -1)
+        out[one], out[other] = other // 3, one // 3
+        return out.reshape(-1, 3)
+
+    def _edge(self, number: int) -> str:
+        """What an edge (3 x triangle + edge) is called: the points at its ends."""
+        triangle, k = divmod(int(number), 3)
+        a, b = self.triangles[triangle, [k, (k + 1) % 3]]
+        return f"the edge between points {a} and {b}"
+
+    @cached_property
+    def tables(self) -> TriangleTables:
+        """What contact searches."""
+        normal, border = self._parts()
+        order, start, low, high = tree(self._corners)
+        corner = np.moveaxis(self._corners[order], 1, 0)
+        return TriangleTables(low, high, start, corner, normal[:, order], border[:, order])
+
+    def _parts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit normals (7, m, 3), of edges and corners by the angles of their faces, and kinds of border (7, m)."""
+        face = self._cross / np.linalg.norm(self._cross, axis=1, keepdims=True)
+        beyond, t, p = self._neighbours, self._welded, self._corners
+        normal, border = np.repeat(face[None], 7, axis=0), np.full((7, len(face)), FLAT)
+        places = int(t.max()) + 1
+        first = np.zeros((places, 3))
+        first[t.ravel()] = np.repeat(face, 3, axis=0)
+        total, bent, rim = np.zeros((places, 3)), np.zeros(places, dtype=bool), np.zeros(places, dtype=bool)
+        for k in range(3):
+            out, back = p[:, (k + 1) % 3] - p[:, k], p[:, (k + 2) % 3] - p[:, k]
+            angle = np.arctan2(np.linalg.norm(np.cross(out, back), axis=1), np.einsum("ij,ij->i", out, back))
+            np.add.at(total, t[:, k], angle[:, None] * face)
+            bent[t[np.linalg.norm(face - first[t[:, k]], axis=1) > PLANE, k]] = True
+            alone = beyond[:, k] < 0
+            rim[t[alone][:, [k, (k + 1) % 3]].ravel()] = True
+            other = np.where(alone[:, None], face, face[beyond[:, k]])
+            sharp = np.linalg.norm(face - other, axis=1) > PLANE
+            mean = 0.5 * (face + other)
+            normal[1 + k] = np.where(sharp[:, None], mean / np.linalg.norm(mean, axis=1, keepdims=True), face)
+            border[1 + k] = np.where(alone, RIM, np.where(sharp, SHARP, FLAT))
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        mean = np.where(length > 1e-9, total / np.maximum(length, 1e-300), first)
+        for k in range(3):
+            at = t[:, k]
+            normal[4 + k] = np.where(bent[at][:, None], mean[at], face)
+            border[4 + k] = np.where(rim[at], RIM, np.where(bent[at], SHARP, FLAT))
+        return normal, border
+
+
+def tree(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A balanced tree of boxes: order of the triangles, start of leaves, low and high corners of boxes.
+
+    Each box is halved by the number of its triangles across the longest axis of their middles.
+
+    Args:
+        corners: (m, 3, 3) m.
+    """
+    count = len(corners)
+    levels = max(0, int(np.ceil(np.log2(count / LEAF))))
+    middle, order = corners.mean(axis=1), np.arange(count)
+    for level in range(levels):
+        start = np.arange((1 << level) + 1) * count >> level
+        part = np.repeat(np.arange(1 << level), np.diff(start))
+        spread = np.maximum.reduceat(middle[order], start[:-1]) - np.minimum.reduceat(middle[order], start[:-1])
+        axis = spread.argmax(axis=1)[part]
+        order = order[np.lexsort((order, middle[order, axis], part))]
+    start = np.arange((1 << levels) + 1) * count >> levels
+    lows = [np.minimum.reduceat(corners[order].min(axis=1), start[:-1])]
+    highs = [np.maximum.reduceat(corners[order].max(axis=1), start[:-1])]
+    for _ in range(levels):
+        lows.insert(0, np.minimum(lows[0][::2], lows[0][1::2]))
+        highs.insert(0, np.maximum(highs[0][::2], highs[0][1::2]))
+    return order, start, np.concatenate(lows), np.concatenate(highs)
+
+
+def _points(values: Any) -> np.ndarray:
+    """(n, 3) finite numbers."""
+    try:
+        out = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ModelError(f"TriMesh: points = {values!r} must be (n, 3) numbers, m, or a file") from None
+    if out.ndim != 2 or out.shape[1] != 3:
+        raise ModelError(f"TriMesh: points have shape {out.shape}, expected (n, 3), m")
+    for k in np.flatnonzero(~np.isfinite(out).all(axis=1))[:1]:
+        raise ModelError(f"TriMesh: point {k} = {out[k].tolist()} is not finite")
+    return out
+
+
+def _triangles(values: Any, points: np.ndarray) -> np.ndarray:
+    """(m, 3) numbers of points, of triangles that have an area."""
+    count = len(points)
+    out = np.array([] if values is None else values)
+    if not out.size:
+        raise ModelError("TriMesh: there are no triangles; give (m, 3) point numbers")
+    if out.ndim != 2 or out.shape[1] != 3 or not np.issubdtype(out.dtype, np.integer):
+        raise ModelError(
+            f"TriMesh: triangles have shape {out.shape} and type {out.dtype}, expected (m, 3) whole numbers"
+        )
+    for k in np.flatnonzero(((out < 0) | (out >= count)).any(axis=1))[:1]:
+        raise ModelError(f"TriMesh: triangle {k} = {out[k].tolist()} has a point number out of range, 0 .. {count - 1}")
+    edges = points[np.roll(out, -1, axis=1)] - points[out]
+    longest = np.einsum("tki,tki->tk", edges, edges).max(axis=1)
+    flat = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) <= NEEDLE * longest
+    for k in np.flatnonzero(flat)[:1]:
+        raise ModelError(f"TriMesh: triangle {k} = {out[k].tolist()} has no area ({int(flat.sum())} such)")
+    return out.astype(np.int64)

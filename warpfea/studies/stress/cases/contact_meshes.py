@@ -1,0 +1,103 @@
+"""Contact with rigid triangle meshes: thin sheets at speed, vertices and edges on vertices and edges, exact touch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+import warpfea as wf
+
+from ..case import Answer, Setting, case
+from .contact import FAST, GROUP, NAMED, SIDE, SINGLE, corner_down, edge_down, exact, middle, scene, watch
+
+SQUARE = np.array([(0, 1, 2), (0, 2, 3)])
+
+
+def sheet(cells: int = 4, half: float = 0.3, height: float = 0.0) -> wf.TriMesh:
+    """A square about the cube's middle, of cells x cells squares."""
+    g = np.linspace(-half, half, cells + 1) + SIDE / 2
+    points = np.array([(x, y, height) for y in g for x in g])
+    first = np.arange(cells * (cells + 1)).reshape(cells, cells + 1)[:, :-1].reshape(-1, 1, 1)
+    corners = np.array([0, 1, cells + 2, cells + 1])
+    return wf.TriMesh(points, (first + corners[SQUARE]).reshape(-1, 3))
+
+
+def pyramid(height: float = 0.2, half: float = 0.2) -> wf.TriMesh:
+    """A solid whose tip, of four triangles, is at the origin."""
+    base = [(-half, -half, -height), (half, -half, -height), (half, half, -height), (-half, half, -height)]
+    sides = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
+    return wf.TriMesh(np.array([*base, (0, 0, 0)]), np.array([*SQUARE[:, ::-1].tolist(), *sides]))
+
+
+def roof(height: float = 0.1, half: float = 0.2, long: float = 0.4) -> wf.TriMesh:
+    """A solid with a ridge along y at x = z = 0, cut into four."""
+    points, triangles = [], []
+    for y in np.linspace(-long, long, 5):
+        points += [(-half, y, -height), (half, y, -height), (0, y, 0)]
+    for k in range(0, 12, 3):
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            triangles += [(k + a, k + a + 3, k + b + 3), (k + a, k + b + 3, k + b)]
+    return wf.TriMesh(np.array(points), np.array([*triangles, (0, 1, 2), (12, 14, 13)]))
+
+
+@case(
+    "contact-sheet", GROUP, values=tuple((way, E) for way in ("front", "behind") for E in (1e6, 1e8)), quick="none",
+    refusal=NAMED,
+)  # fmt: skip
+def impact(setting: Setting, value: tuple[str, float]) -> Answer:
+    """A cube at 100 m/s onto a sheet without thickness, ten of its sides a step: it does not get behind."""
+    way, E = value
+    shape = sheet()
+    if way == "behind":
+        shape = wf.TriMesh(shape.points, shape.triangles[:, ::-1])
+    s = scene(shape, E=E, gravity=(0, 0, 0), place=(0, 0, 0.3), mu=0.3, restitution=0.5)
+    s.builder.set_initial(s.body, velocity=(0, 0, -FAST))
+    sim = wf.Simulation(s.model(setting), dt=1e-2)
+    seen = watch(sim, s, 5, mu=0.3)
+    return seen.answer(setting, max(seen.through, 0.0), 0.0, "the centre stays before the obstacle")
+
+
+FEATURES: dict[str, tuple[Callable[[], wf.TriMesh], Callable[[], np.ndarray]]] = {
+    "vertex on vertex": (pyramid, corner_down),
+    "vertex on edge": (roof, corner_down),
+    "edge on edge": (roof, edge_down),
+    "edge on vertex": (pyramid, edge_down),
+    "vertex on border": (lambda: sheet(2), corner_down),
+}
+
+
+@case("contact-mesh", GROUP, values=tuple(FEATURES), quick="float64", refusal=SINGLE)
+def features(setting: Setting, which: str) -> Answer:
+    """A turned cube falls at 1 m/s with its vertex or edge on one of a mesh, 40 steps: it stays before the mesh, the
+    change of its momentum is the impulse, and no energy comes from nowhere."""
+    shape, turn = FEATURES[which]
+    s = scene(shape(), E=1e6, turn=turn(), place=(0, 0, 5e-4), mu=0.3, restitution=0.5, stiffness=10.0)
+    s.builder.set_initial(s.body, velocity=(0, 0, -1.0))
+    sim = wf.Simulation(s.model(setting), dt=1e-3)
+    seen = watch(sim, s, 40, mu=0.3)
+    sunk = float(sim.contact_record(s.pads[0]).penetration[0].max()) / SIDE
+    limits = {"through": (seen.through, 0.0), "sunk": (sunk, 0.3)}
+    return seen.answer(setting, None, exact(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)
+
+
+@case("contact-mesh-touch", GROUP, values=("sheet", "borders", "same faces", "tip"), quick="both")
+def exact_touch(setting: Setting, which: str) -> Answer:
+    """A cube begins in exact touch with a mesh, under its weight, 50 steps: on a sheet, with its edges on borders of
+    triangles, face on face with a mesh of its own size, or with a tip on the middle of its face."""
+    cube = wf.Box(center=(SIDE / 2, SIDE / 2, -SIDE / 2), size=(SIDE, SIDE, SIDE))
+    shapes = {
+        "sheet": sheet(3),
+        "borders": sheet(6),
+        "same faces": wf.TriMesh(*cube.mesh()),
+        "tip": wf.TriMesh(pyramid().points + (SIDE / 2, SIDE / 2, 0), pyramid().triangles),
+    }
+    s = scene(shapes[which], mu=0.5, restitution=0.5, stiffness=100.0 if which == "tip" else 1.0)
+    sim = wf.Simulation(s.model(setting), dt=1e-3)
+    seen = watch(sim, s, 50, mu=0.5)
+    sunk = float(sim.contact_record(s.pads[0]).penetration[0].max()) / SIDE
+    shifted = float(np.abs(middle(sim, s)[:2] / SIDE - 0.5).max())
+    limits = {"sunk": (sunk, 0.05)}
+    if which != "tip":  # which slides off, as four slopes of 45 degrees and mu = 0.5 let it
+        limits["shifted"] = (shifted, exact(setting, 1e-3, 1e-2))
+    return seen.answer(setting, None, exact(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)

@@ -1,0 +1,51 @@
+"""Triangles of colliders on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.terms.contact_mesh import mesh_struct
+from ..model.shapes import Shape
+from ..model.triangle_mesh import TriMesh
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["mesh_tables", "sizes"]
+
+
+def mesh_tables(model: Model, shapes: Sequence[Shape]) -> Any:
+    """The device struct of all meshes among the shapes of colliders; a mesh used twice is there once."""
+    found = dict.fromkeys(shape for shape in shapes if isinstance(shape, TriMesh))
+    out, parts = mesh_struct()(), [shape.tables for shape in found]
+    boxes, leaves, triangles = (np.cumsum([0, *counts]) for counts in zip(
+        *((len(p.low), len(p.start), len(p.corner[0])) for p in parts)))  # fmt: skip
+    place = {shape: k for k, shape in enumerate(found)}
+    index = [place.get(shape, -1) for shape in shapes]  # type: ignore[call-overload]
+
+    def put(name: str, values: Any, dtype: Any) -> None:
+        setattr(out, name, model.array("contact", np.ascontiguousarray(values), dtype))
+
+    put("box", [boxes[k] if k >= 0 else 0 for k in index], wp.int32)
+    put("leaf", [leaves[k] if k >= 0 else 0 for k in index], wp.int32)
+    put("inner", [len(parts[k].start) - 2 if k >= 0 else 0 for k in index], wp.int32)
+    put("low", np.concatenate([p.low for p in parts]), wp.vec3d)
+    put("high", np.concatenate([p.high for p in parts]), wp.vec3d)
+    put("start", np.concatenate([p.start + n for p, n in zip(parts, triangles)]), wp.int32)
+    put("corner", np.concatenate([p.corner for p in parts], axis=1), wp.vec3d)
+    put("normal", np.concatenate([p.normal for p in parts], axis=1), wp.vec3d)
+    put("border", np.concatenate([p.border for p in parts], axis=1), wp.int32)
+    return out
+
+
+def sizes(shape: Shape, surfaces: Sequence[np.ndarray]) -> np.ndarray:
+    """`Shape.sizes`; the thickness of a sheet is how deep bodies may come: the second largest edge of the smallest box
+    around a surface that touches it, m. `surfaces`: their points, (n, 3)."""
+    out = shape.sizes
+    if isinstance(shape, TriMesh) and not shape.closed:
+        out[1] = min((np.sort(np.ptp(X, axis=0))[1] for X in surfaces), default=out[0])
+    return out
