@@ -76,8 +76,8 @@ def free_groups(model: Any) -> tuple[Any, int]:
 def check_static_supports(model: Any) -> None:
     """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
     state = model.state()
-    d = model.description
-    held_by = "hold what rests on contact with solve_static(stabilise=True), " if d.contacts or d.pairs else ""
+    touches = model.description.all_contacts
+    held_by = "hold what rests on contact with solve_static(stabilise=True), " if touches else ""
     for label in range(model.component_count):
         slots = np.flatnonzero(model.component == label)
         parts, part = np.unique(model.part[slots], return_inverse=True)
