@@ -26,7 +26,8 @@ def pair_motion_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def cross_parts(
-        bodies: Bodies, mas: Masters, facets: Facets, contact: wp.array(dtype=wp.int32), first: wp.array(dtype=wp.int32),
+        bodies: Bodies, mas: Masters, facets: Facets, contact: wp.array(dtype=wp.int32),
+        first: wp.array(dtype=wp.int32),
         stiffness: wp.array2d(dtype=sym), weight: wp.array3d(dtype=T), listed: wp.array2d(dtype=wp.int32),
         active: wp.array(dtype=wp.int32), lanes: int, parts: wp.array4d(dtype=mat33d),
     ):  # fmt: skip
@@ -79,7 +80,8 @@ def pair_motion_kernels(dtype: str) -> _types.SimpleNamespace:
         parts: wp.array4d(dtype=mat33d), dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=T),
     ):  # fmt: skip
-        """matrix -= (dq/dv) the sums of each pair of bodies; `source`: a contact, and 1 where its slave is the second."""
+        """matrix -= (dq/dv) the sums of each pair of bodies; `source`: a contact, and whether its slave is the
+        second."""
         world, index, block = wp.tid()
         if active[world] == 0:
             return
