@@ -155,16 +155,16 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def anchor(
         mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock, at: Attempt, t: Touching,
-        v_n: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int, f: int, guess: vec3d,
+        v_n: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int, f: int, start: vec3d,
     ):  # fmt: skip
         """Measure the motion of a point from a facet: its place on it as the attempt began, depth and speed then."""
-        found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], guess)
+        found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], start)
         spot = vec3d(found[0], found[1], found[2])
         live = his.speed[world, point] > f64(0.0)
         if found[3] == f64(0.0):
             if not live:
                 return
-            spot = guess
+            spot = start
         s = jet(mas, t.C0, t.D0, world, f, spot)
         n = outward(s)
         t.first[world, point] = f + 1
