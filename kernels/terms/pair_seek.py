@@ -382,7 +382,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     s = jet(mas, t.C, t.D, world, f, spot)
                     n = outward(s)
                     gap = spot[2] * wp.dot(n, s.c)
-                    fits = -gap <= mas.limit[f]
+                    fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
                     if anchored:
                         fits = fits and wp.dot(n, facing) > f64(0.0)
                     elif settling == 0:
