@@ -10,7 +10,7 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=1e-2, t_end=0.6, tol=1e-6, fps=50.0, speed=0.5, picture=0.6)
+@scene(dt=1e-2, t_end=0.6, tol=1e-6, fps=50.0, speed=0.5, picture=0.59)
 def arch(
     *,
     blocks: int = 9,

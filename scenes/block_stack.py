@@ -10,7 +10,7 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=4e-3, t_end=0.4, tol=1e-6, fps=60.0, speed=0.25, picture=0.4)
+@scene(dt=4e-3, t_end=0.4, tol=1e-6, fps=60.0, speed=0.25, picture=0.39)
 def block_stack(
     *,
     blocks: int = 4,

@@ -6,16 +6,16 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=4e-3, t_end=0.6, tol=1e-6, fps=60.0, speed=0.25, picture=0.3)
+@scene(dt=4e-3, t_end=0.44, tol=1e-6, fps=100.0, speed=0.25, picture=0.3)
 def finger_beam_shell(
     *,
-    travel: float = 0.12,
-    duration: float = 0.4,
+    travel: float = 0.08,
+    duration: float = 0.5,
     mu: float = 0.3,
     stiffness: float = 10.0,
     finger_E: float = 2e5,
     beam_E: float = 1e7,
-    shell_E: float = 1e7,
+    shell_E: float = 1e8,
     density: float = 1000.0,
 ) -> wf.ModelBuilder:
     """A finger of soft T10 hangs from a carriage, pushes a beam over a shell, bends, and drops it over the edge.
@@ -42,10 +42,11 @@ def finger_beam_shell(
         normal=(0, 0, 1), material=wf.SVK(E=beam_E, nu=0.3, density=density), name="beam",
     )  # fmt: skip
     mesh = wf.mesh.box((0.015, 0.03, 0.06), cells=(1, 2, 3), origin=(-0.01, -0.015, 0.004))
-    finger = b.add_solid(
-        mesh, material=wf.NeoHookean.from_E_nu(E=finger_E, nu=0.4, density=density), name="finger"
+    finger = b.add_solid(mesh, material=wf.NeoHookean.from_E_nu(E=finger_E, nu=0.4, density=density), name="finger")
+    b.drive(
+        finger.nodes("z+"),
+        displacement=([0.0, 0.1, duration, 2.0], [(0, 0, 0), (0, 0, 0), (travel, 0, 0), (travel, 0, 0)]),
     )
-    b.drive(finger.nodes("z+"), displacement=([0.0, 0.1, duration, 2.0], [(0, 0, 0), (0, 0, 0), (travel, 0, 0), (travel, 0, 0)]))
     options = {"mu": mu, "restitution": 0.3, "stiffness": stiffness}
     b.add_contact(beam, shell.surface("top"), name="table", **options)
     b.add_contact(finger.surface("x+"), beam, name="push", **options)

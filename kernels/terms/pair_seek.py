@@ -339,7 +339,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         place = vec3d()
         off = f64(OUTER)
         height = f64(1.0e300)
-        pad = wp.max(con.offset[c], f64(0.0)) + f64(1.0e-6) * wp.length(x)
+        pad = wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)
         anchored = t.first[world, point] > 0
         if anchored:
@@ -367,7 +367,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
             query = wp.bvh_query_aabb(mas.tree, down(low), up(high), root)
             index = wp.int32(0)
-            left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch
+            left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch - wp.min(con.offset[c], f64(0.0))
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]

@@ -121,7 +121,7 @@ class PairTables:
         self.pool = pool + entries
         self.data = self._contacts()
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
-            max(contact.offset, 0.0) for contact in self.contacts
+            abs(contact.offset) for contact in self.contacts
         )
         self.far = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
