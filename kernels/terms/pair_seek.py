@@ -357,11 +357,14 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 off = o
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
-            through = at.depth[world, point] - wp.dot(motion, facing) > f64(LOST) * mas.limit[f]
         if best < 0 or off > f64(STAY):
             facing = vec3d()
             if anchored:
-                facing = outward(jet(mas, t.C, t.D, world, t.first[world, point] - 1, t.spot0[world, point]))
+                f = t.first[world, point] - 1
+                from0 = t.spot0[world, point]
+                facing = outward(jet(mas, t.C, t.D, world, f, from0))
+                motion = shift - at.origin[world, point] - carried(mas, t.C, t.D, t.C0, t.D0, world, f, from0)
+                through = at.depth[world, point] - wp.dot(motion, facing) > f64(LOST) * mas.limit[f]
             low = wp.min(x, x0) - vec3d(pad, pad, pad)
             high = wp.max(x, x0) + vec3d(pad, pad, pad)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
