@@ -16,7 +16,7 @@ OUTER = 0.05
 INNER = 1e-9
 QUADRATIC = 1e-8
 """A step so small is the last: what it leaves is its square."""
-STAY = 0.01
+STAY = 0.05
 """By so much of a side a point may pass the border of the facet that it was on as the attempt began: one that lies on a
 border does not change facets from iterate to iterate."""
 

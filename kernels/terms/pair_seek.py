@@ -22,6 +22,8 @@ __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
 THROUGH = -2
 """Seat of a point that has left through another side."""
+LOST = 0.25
+"""A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
 MARGIN = 0.25
 """Boxes of the tree are larger than facets by this part of a side: they fit for several steps."""
 ROUNDING = 2.4e-7
@@ -249,17 +251,18 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def crosses(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d) -> bool:
-        """Whether a point that moved by more than a body is thick went in through a facet on its way."""
+        """Whether a point went in through a facet on its way, and deep."""
         kind = mas.kind[f]
         m = middle(mas.corners[kind])
         old = jet(mas, t.C0, t.D0, world, f, m)
         new = jet(mas, t.C, t.D, world, f, m)
         way = x - x0 - (new.x - old.x)
-        if wp.length(way) <= mas.limit[f]:
+        deep = f64(LOST) * mas.limit[f]
+        if wp.length(way) <= deep:
             return False
         g0 = wp.dot(x0 - old.x, outward(old))
         g1 = wp.dot(x - new.x, outward(new))
-        if g0 <= f64(0.0) or g1 >= -mas.limit[f]:
+        if g0 <= f64(0.0) or g1 >= -deep:
             return False
         y = x - (g1 / (g1 - g0)) * way
         there = locate(mas, t.C, t.D, world, f, y, m)
@@ -336,7 +339,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         place = vec3d()
         off = f64(OUTER)
         height = f64(1.0e300)
-        pad = wp.max(con.offset[c], f64(0.0)) + f64(1.0e-6) * wp.length(x)
+        pad = wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
+        through = bool(False)
         anchored = t.first[world, point] > 0
         if anchored:
             f = t.first[world, point] - 1
@@ -353,17 +357,20 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 off = o
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
-        through = bool(False)
         if best < 0 or off > f64(STAY):
             facing = vec3d()
             if anchored:
-                facing = outward(jet(mas, t.C, t.D, world, t.first[world, point] - 1, t.spot0[world, point]))
+                f = t.first[world, point] - 1
+                from0 = t.spot0[world, point]
+                facing = outward(jet(mas, t.C, t.D, world, f, from0))
+                motion = shift - at.origin[world, point] - carried(mas, t.C, t.D, t.C0, t.D0, world, f, from0)
+                through = at.depth[world, point] - wp.dot(motion, facing) > f64(LOST) * mas.limit[f]
             low = wp.min(x, x0) - vec3d(pad, pad, pad)
             high = wp.max(x, x0) + vec3d(pad, pad, pad)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
             query = wp.bvh_query_aabb(mas.tree, down(low), up(high), root)
             index = wp.int32(0)
-            left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch
+            left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch - wp.min(con.offset[c], f64(0.0))
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]
@@ -382,7 +389,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     s = jet(mas, t.C, t.D, world, f, spot)
                     n = outward(s)
                     gap = spot[2] * wp.dot(n, s.c)
-                    fits = -gap <= mas.limit[f]
+                    fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
                     if anchored:
                         fits = fits and wp.dot(n, facing) > f64(0.0)
                     elif settling == 0:

@@ -20,10 +20,10 @@ __all__ = ["survey_kernels"]
 def survey_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in one precision of the model."""
     f64, vec3d = wp.float64, wp.vec3d
-    Contacts, Facets, History = contact_struct(), facet_struct(dtype), history_struct()
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
     Attempt = attempt_struct(dtype)
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
-    k, places, seek = touch_functions(dtype), place_functions(dtype), seek_kernels(dtype)
+    k, places, seek = touch_functions(dtype, False), place_functions(dtype), seek_kernels(dtype)
     Touch, along, reach, hold, in_plane = k.Touch, k.along, k.reach, k.hold, k.in_plane
     friction_force, normal_law = k.friction_force, law_functions().normal_law
     jet, locate, outside, outward, weigh = places.jet, places.locate, places.outside, places.outward, places.weigh

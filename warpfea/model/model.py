@@ -162,7 +162,7 @@ class Model:
             self.free_host[rows] *= 1.0 - support.components
             if support.law is None and support.node_laws is None:
                 self.clamped_host[rows] |= support.components.astype(bool)
-        if not self.free_host.any() and not self.description.contacts and not self.description.pairs:
+        if not self.free_host.any() and not self.description.all_contacts:
             raise ModelError("every component of every node is prescribed: nothing is left to solve for")
 
     def _assemble_mass(self) -> None:

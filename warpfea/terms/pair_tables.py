@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.errors import ModelError
 from ..kernels.terms.contact_data import contact_struct, facet_struct
 from ..kernels.terms.pair_data import master_struct
 from ..model.contact_points import ContactPoints
@@ -21,7 +22,7 @@ from ..model.pairs import (
     pair_numbers,
     pair_points,
 )
-from .contact_tables import CONSTANT, LAWS, SMOOTHING, FacetGroup, beta_of, hunt_crossley_damping
+from .contact_tables import CONSTANT, LAWS, SMOOTHING, FacetGroup, beta_of, clamped_slots, hunt_crossley_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -63,11 +64,22 @@ class PairTables:
                 self.surfaces.append(contact.master)
             self.of.append(same[0] if same else len(self.surfaces) - 1)
         self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
+        self._check_clamped()
         self.regions = [self._region(contact) for contact in self.contacts]
         self.shares = [p.area / region for p, region in zip(self.host, self.regions)]
         self.facets = sum(len(m.conn) for m in self.masters)
         self.points = self.rows = 0
         self.groups: list[FacetGroup] = []
+
+    def _check_clamped(self) -> None:
+        """ModelError for a contact of which nothing can move."""
+        clamped = clamped_slots(self.model)
+        for contact, slots in zip(self.contacts, self.slots):
+            if clamped[slots].all():
+                raise ModelError(
+                    f"contact {contact.name!r}: all of the surfaces of bodies {contact.first.body.name!r} and "
+                    f"{contact.second.body.name!r} is clamped; leave the contact out, or free one of them"
+                )
 
     @property
     def explicit(self) -> bool:
@@ -109,7 +121,7 @@ class PairTables:
         self.pool = pool + entries
         self.data = self._contacts()
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
-            max(contact.offset, 0.0) for contact in self.contacts
+            abs(contact.offset) for contact in self.contacts
         )
         self.far = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()

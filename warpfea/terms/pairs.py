@@ -191,7 +191,7 @@ class Pairs(Term):
         new = (active.numpy() != 0) & ~(history.speed.numpy() > 0.0).any(axis=1)
         if not new.any():
             return
-        flags = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
+        flags: wp.array = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
         overlap, born = history.overlap.numpy(), history.born.numpy()
         overlap[new] = 0.0
         born[new] = at.state.time.numpy()[new]
@@ -222,6 +222,11 @@ class Pairs(Term):
                 )
             overlap[deep, first:last] = np.maximum(part_of[deep], 0.0)
         history.overlap.assign(overlap)
+
+    def rewind(self, state: State) -> None:
+        """Stored overlaps keep their age."""
+        if "pairs_born" in state.specs:
+            state.pairs_born.assign(state.pairs_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
     def _where(self, k: int, point: int) -> str:
         """Reference place of a point of a contact."""
