@@ -328,11 +328,10 @@ class Pairs(Term):
         for group in t.groups:
             dim = (m.worlds, group.count, group.data.points)
             at.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
-        for group in t.groups:
-            dim = (m.worlds, group.count, group.conn.shape[1])
-            at.launch(k.product_facets, dim, [group.data, active, attempt, touching, w.pool_product])
-        dim = (m.worlds, t.facets, t.master_conn.shape[1])
-        at.launch(k.product_masters, dim, [masters, active, attempt, touching, w.pool_product])
+        for group in t.groups:  # the last one takes the master facets along
+            masters_too = t.master_conn.size if group is t.groups[-1] else 0
+            args = [masters, group.data, active, attempt, touching, w.pool_product]
+            at.launch(k.product_sides, (m.worlds, group.conn.size + masters_too), args)
 
     @part("pairs")
     def diagonal(self, at: At, active: wp.array) -> None:
