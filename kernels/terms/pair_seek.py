@@ -23,7 +23,7 @@ __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 THROUGH = -2
 """Seat of a point that has left through another side."""
 TURNED = 0.1
-"""Least cosine of the normals of two facets that a point in contact passes between: around an edge of a box it doesn't."""
+"""Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
 LOST = 0.25
 """A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
 MARGIN = 0.25
