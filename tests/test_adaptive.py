@@ -99,6 +99,58 @@ def test_bdf2_estimate_is_the_error_of_its_formula():
 
 
 @pytest.mark.parametrize("integrator", SCHEMES)
+def test_means_are_those_of_the_rates(integrator):
+    """Every interval is one substep: rates and their running means, from the velocities in numpy."""
+    h, count = 1e-4, 30
+    sim = auto(bar(), 1e-1, integrator=integrator, interval=h, horizon=1e-2)
+    v = [sim.state.velocity.numpy()[0].copy()]
+    mean, seen, pace = np.zeros_like(v[0]), 0, None
+    for _ in range(count):
+        sim.step()
+        v.append(sim.state.velocity.numpy()[0].copy())
+        assert sim.totals["substeps"][0] == len(v) - 1
+        order = 1 if integrator == "backward_euler" else 2
+        pace = 0.125 * 1e-2 * 0.1 ** (1.0 / order) if pace is None else pace
+        span = max(h, 0.125 * pace)
+        pace += (h - pace) / 256.0
+        if integrator == "backward_euler":
+            rate = 0.5 * h * (v[-1] - v[-2]) / span
+        elif len(v) == 2:
+            continue  # of order 1
+        else:
+            rate = 2.0 / 9.0 * h * (v[-1] - 2.0 * v[-2] + v[-3]) / span
+        seen = min(seen + 1, 16)
+        mean = mean + (rate - mean) / seen
+    assert span == h
+    found = sim.state.adaptive_means.numpy()[0]
+    np.testing.assert_allclose(found, mean, atol=1e-9 * np.abs(mean).max())
+    assert sim.state.adaptive.numpy()[0, 2] == 16.0
+
+
+def test_a_vibration_smaller_than_the_error_is_not_resolved():
+    """A box in slow rotation with an axial vibration of a tenth of the error asked for, 64 periods of it."""
+    error, end, spin, pace = 1e-3, 0.4, 2.0, np.pi * np.sqrt(1e8 / 1000.0)
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    law = wf.SVK(E=1e8, nu=0.3, density=1000.0)
+    body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=law)
+
+    def velocity(X):
+        x, z = X[:, 0] - 0.5, X[:, 2] - 0.1
+        return np.column_stack([-0.1 * error * pace * np.cos(np.pi * X[:, 0]) - spin * z, 0.0 * x, spin * x])
+
+    b.set_initial(body, velocity=velocity)
+    model = b.finalize(device="cpu")
+    sim = auto(model, error, integrator="bdf2", interval=end / 4, horizon=end)
+    start = sim.positions(body)[0]
+    sim.run(end)
+    c, s = np.cos(spin * end), np.sin(spin * end)
+    x, y, z = (start - [0.5, 0.1, 0.1]).T
+    turned = np.column_stack([c * x - s * z, y, s * x + c * z]) + [0.5, 0.1, 0.1]
+    assert np.linalg.norm(sim.positions(body)[0] - turned, axis=1).max() <= 2.0 * error * model.size
+    assert sim.totals["substeps"][0] < 3 * pace * end / (2.0 * np.pi)  # 7 in each period where every rate is held
+
+
+@pytest.mark.parametrize("integrator", SCHEMES)
 def test_steps_are_halved_kept_or_doubled(integrator):
     """Sizes are the interval over powers of two, and so are their ratios."""
     sim = auto(bar(), 1e-3, integrator=integrator, interval=0.05, horizon=0.1)
@@ -373,9 +425,10 @@ def test_the_command_line_adapts_steps(tmp_path, capsys):
 
 SMOOTH = ("stiff", "dead_points", "free_flight")
 STRUCK = ("impact", "contact")
+SCENES = (*SMOOTH, *STRUCK, "soft_contact")
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-5)
-NOT_RUN = {("impact", "backward_euler", 1e-4), ("impact", "backward_euler", 1e-5)}
-"""They would take 3e5 and 3e6 steps."""
+NOT_RUN = {("impact", "backward_euler", 1e-4), ("impact", "backward_euler", 1e-5), ("contact", "backward_euler", 1e-5)}
+"""They would take 3e5, 3e6 and 1e5 steps."""
 
 
 def study(scene, integrator):
@@ -383,7 +436,7 @@ def study(scene, integrator):
     return [row for row in content["adaptive"] if (row["scene"], row["integrator"]) == (scene, integrator)]
 
 
-@pytest.mark.parametrize("scene", SMOOTH + STRUCK)
+@pytest.mark.parametrize("scene", SCENES)
 def test_references_are_ten_times_finer_than_what_they_judge(scene):
     """A run for a quarter of the error has at most a third of the difference left."""
     content = json.loads(RESULT.read_text())
@@ -392,7 +445,7 @@ def test_references_are_ten_times_finer_than_what_they_judge(scene):
 
 
 @pytest.mark.parametrize("integrator", SCHEMES)
-@pytest.mark.parametrize("scene", SMOOTH + STRUCK)
+@pytest.mark.parametrize("scene", SCENES)
 def test_true_errors_keep_to_those_asked(scene, integrator):
     rows = study(scene, integrator)
     assert len(rows) >= 2
@@ -401,7 +454,7 @@ def test_true_errors_keep_to_those_asked(scene, integrator):
 
 
 @pytest.mark.parametrize("integrator", SCHEMES)
-@pytest.mark.parametrize("scene", SMOOTH + STRUCK)
+@pytest.mark.parametrize("scene", SCENES)
 def test_true_errors_fall_as_those_asked(scene, integrator):
     rows = study(scene, integrator)
     slope = np.polyfit(np.log([row["asked"] for row in rows]), np.log([row["true"] for row in rows]), 1)[0]
@@ -409,14 +462,14 @@ def test_true_errors_fall_as_those_asked(scene, integrator):
 
 
 COSTLY = {
-    ("dead_points", "bdf2"): ({1e-5}, "2.43: its cause was not found"),
     ("impact", "backward_euler"): (
         {1e-2, 1e-3},
-        "1.30, 0.92: the blow takes most of its steps with fixed ones, too",
+        "1.06, 0.75: the flight after the blow alone takes 0.70 and 0.40, with the steps that the best fixed one has",
     ),
-    ("impact", "bdf2"): ({1e-5}, "0.73"),
-    ("contact", "backward_euler"): (set(ERRORS), "1.35 to 2.42: the ball is in soft contact for much of its run"),
-    ("contact", "bdf2"): (set(ERRORS), "1.16 to 1.34: as above"),
+    ("contact", "bdf2"): (
+        {1e-2},
+        "1.92: 16 and 32 fixed steps, longer than the contact, are at 1.4e-2 and 6.7e-3 by chance, 64 at 2.6e-2",
+    ),
 }
 """What misses the iterations asked for: at which errors, and by how much."""
 

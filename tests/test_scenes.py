@@ -15,13 +15,18 @@ from warpfea.builder.scene import Scene, find, load_file, names
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 BUILTIN = [
+    "arch",
+    "ball_on_plate",
     "beam_over_cylinders",
     "belt",
+    "block_stack",
     "bouncing_ball",
     "cantilever",
     "chain",
     "double_pendulum",
+    "finger_beam_shell",
     "four_bar",
+    "gears",
     "gripper",
     "hook",
     "hung_plate",
@@ -216,7 +221,7 @@ def test_the_registry_lists_without_importing():
 
 def test_names_and_find():
     assert names() == BUILTIN
-    with pytest.raises(wf.ModelError, match="no scene 'crane'; there are beam_over_cylinders, belt, bouncing_ball"):
+    with pytest.raises(wf.ModelError, match="no scene 'crane'; there are arch, ball_on_plate, beam_over_cylinders"):
         find("crane")
 
 
@@ -226,9 +231,8 @@ def test_every_scene_is_described_and_builds(name):
     assert scene.description.endswith(".")
     assert all(p.doc and not p.required for p in scene.parameters.values())
     builder = scene()
-    assert (
-        builder.description.supports or builder.description.joints or builder.description.contacts or name == "spin"
-    )  # floats
+    d = builder.description
+    assert d.supports or d.joints or d.contacts or name == "spin"  # floats
     assert builder.description.probes
     assert scene.picture is None or scene.picture < scene.t_end
 

@@ -1,11 +1,13 @@
 """Step sizes from an estimate of the local error: what a substep has left in the positions, and what follows from it.
 
-A substep of h is accepted where its error e in position, over the model's size, is at most
+The error e of a substep of h, a vector at each place, counts as the rate r = e / max(h, SPREAD pace), with `pace` a
+running mean of the accepted sizes, and enters the running mean m of the rates at its place. It is accepted where
 
-    SHARE error max(h, SPREAD pace) / horizon,
+    |m| <= limit and |r| <= CAP limit, or |r| <= limit,    limit = SHARE error size / horizon,
 
-with `pace` a running mean of the accepted sizes: local errors then add up over the horizon to a share of what was
-asked. Where a velocity jumps, e is of order h however short the substep is: the pace lets it pass.
+at all places: local errors then add up over the horizon to a share of what was asked. Errors of vibrations change their
+sign and add up to nothing: with their means alone held, a vibration smaller than the error asked for is not resolved.
+Where a velocity jumps, e is of order h however short the substep is: the pace lets it pass.
 """
 
 import functools
@@ -21,9 +23,9 @@ from .control import step_struct
 
 __all__ = ["COUNTS", "KEPT", "MAX_LEVEL", "adaptive_kernels", "adaptive_struct"]
 
-KEPT = ("wish", "pace", "last_error", "last_size")
+KEPT = ("wish", "pace", "seen")
 """Columns of what the state holds, [world, column]: the size that the next substep should have at most, s, 0 at the
-start; the mean of sizes, s; error, m, and size, s, of the last substep."""
+start; the mean of sizes, s; the substeps that the mean of rates has seen, at most AVERAGE."""
 COUNTS = ("substeps", "rejected", "least_h", "largest_h")
 """Columns of what a step reports: accepted substeps, those refused for their error, least and largest size, s."""
 MAX_LEVEL = 26
@@ -40,8 +42,12 @@ START = 0.1
 """Part of the error asked for that a multistep scheme's first step, of order 1, may have."""
 MOST = 65536
 """Substeps between two common instants at most."""
-MEMORY = 16.0
+MEMORY = 256.0
 """Substeps that the pace looks back over."""
+AVERAGE = 16.0
+"""Substeps that the mean of rates looks back over."""
+CAP = 4.0
+"""A rate may be this many times what their mean may be."""
 
 
 @functools.cache
@@ -51,7 +57,9 @@ def adaptive_struct():
     @wp.struct
     class AdaptiveControl:
         flags: wp.array(dtype=wp.int32)  # an estimate is wanted
-        error: wp.array(dtype=wp.float64)  # of this attempt, m
+        span: wp.array(dtype=wp.float64)  # s, that the error of this attempt counts over
+        rate: wp.array(dtype=wp.float64)  # largest rate of this attempt, m/s
+        mean: wp.array(dtype=wp.float64)  # largest mean of rates with it, m/s
         tries: wp.array(dtype=wp.int32)  # refusals in a row that are none of the estimate's
         work: wp.array(dtype=wp.int32)  # PCG iterations of the substeps before
         kept: wp.array2d(dtype=wp.float64)  # KEPT, in the state
@@ -114,7 +122,37 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         world = wp.tid()
         good = step.running[world] != 0 and newton.failed[world] == 0 and newton.turned[world] == 0
         ctl.flags[world] = wp.where(good, 1, 0)
-        ctl.error[world] = f64(0.0)
+        ctl.span[world] = wp.max(step.h[world], f64(SPREAD) * ctl.kept[world, 1])
+        ctl.rate[world] = f64(0.0)
+        ctl.mean[world] = f64(0.0)
+
+    @wp.func
+    def rate_of(step: Step, ctl: Adaptive, world: int, v: vec3, v_n: vec3, v_before: vec3) -> vec3:
+        """Local error of a place over the time that it counts over, m/s."""
+        previous = f64(0.0)
+        if wp.static(multistep):
+            if step.a1[world] > f64(0.0):
+                previous = step.previous_h[world]
+        c = estimate(step.h[world], previous)
+        # differences first: the velocities themselves may be large beside them
+        e = T(c[0]) * (v - v_n)
+        if wp.static(multistep):
+            e -= T(c[2]) * (v_n - v_before)
+        return T(f64(1.0) / ctl.span[world]) * e
+
+    @wp.func
+    def mean_of(ctl: Adaptive, world: int, mean: vec3, rate: vec3) -> vec3:
+        """The running mean with one more rate, m/s."""
+        part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(AVERAGE))
+        return mean + T(part) * (rate - mean)
+
+    @wp.func
+    def size_of(x: vec3) -> f64:
+        """Length; what is no number is large."""
+        size = f64(wp.length(x))
+        if not wp.isfinite(size):
+            size = f64(1.0e300)
+        return size
 
     @wp.kernel(module=module)
     def local_error(
@@ -125,27 +163,46 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         v: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3),
         v_before: wp.array2d(dtype=vec3),
+        means: wp.array2d(dtype=vec3),
     ):
-        """Largest local error of a free place in the substep, m. A maximum does not depend on the order.
+        """Largest rate and mean of rates of a free place. A maximum does not depend on the order.
 
         `arm`: what an unknown moves by 1, m: 1 of positions, half the section of gradients across it, else 0.
         """
         world, slot = wp.tid()
         if ctl.flags[world] == 0 or arm[slot] == T(0.0):
             return
-        previous = f64(0.0)
+        reach = arm[slot] * free[slot]
+        rate = rate_of(step, ctl, world, v[world, slot], v_n[world, slot], v_before[world, slot])
+        wp.atomic_max(ctl.rate, world, size_of(wp.cw_mul(reach, rate)))
+        wp.atomic_max(ctl.mean, world, size_of(wp.cw_mul(reach, mean_of(ctl, world, means[world, slot], rate))))
+
+    @wp.func
+    def starts(step: Step, world: int) -> int:
+        """Whether the substep is a multistep scheme's first, of order 1."""
         if wp.static(multistep):
-            if step.a1[world] > f64(0.0):
-                previous = step.previous_h[world]
-        c = estimate(step.h[world], previous)
-        # differences first: the velocities themselves may be large beside them
-        e = T(c[0]) * (v[world, slot] - v_n[world, slot])
-        if wp.static(multistep):
-            e -= T(c[2]) * (v_n[world, slot] - v_before[world, slot])
-        size = f64(arm[slot] * wp.length(wp.cw_mul(free[slot], e)))
-        if not wp.isfinite(size):
-            size = f64(1.0e300)
-        wp.atomic_max(ctl.error, world, size)
+            if step.a1[world] == f64(0.0):
+                return 1
+        return 0
+
+    @wp.kernel(module=module)
+    def keep_mean(
+        step: Step,
+        ctl: Adaptive,
+        v: wp.array2d(dtype=vec3),
+        v_n: wp.array2d(dtype=vec3),
+        v_before: wp.array2d(dtype=vec3),
+        means: wp.array2d(dtype=vec3),
+    ):
+        """Take the rate of an accepted substep into the mean, which begins after one of order 1."""
+        world, slot = wp.tid()
+        if step.accepted[world] == 0:
+            return
+        mean = vec3()
+        if starts(step, world) == 0:
+            rate = rate_of(step, ctl, world, v[world, slot], v_n[world, slot], v_before[world, slot])
+            mean = mean_of(ctl, world, means[world, slot], rate)
+        means[world, slot] = mean
 
     @wp.func
     def power(x: f64, n: int) -> f64:
@@ -168,18 +225,16 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
             if ctl.tries[world] > ctl.max_tries:
                 step.level[world] = MAX_LEVEL  # it is the last
             return
-        n = wp.static(order) + 1
-        if wp.static(multistep):
-            if step.a1[world] == f64(0.0):
-                n = 2
         pace = ctl.kept[world, 1]
-        unit = f64(SHARE) * ctl.tolerance / ctl.horizon[0]
-        e = ctl.error[world]
-        limit = unit * wp.max(h, f64(SPREAD) * pace)
-        if wp.static(multistep):
-            if n == 2:
-                limit = wp.max(limit, f64(START) * ctl.tolerance)
-        ratio = e / limit
+        span = ctl.span[world]
+        limit = f64(SHARE) * ctl.tolerance / ctl.horizon[0]
+        rate = ctl.rate[world]
+        steady = wp.max(ctl.mean[world], rate / f64(CAP))
+        ratio = wp.min(rate, steady) / limit
+        n = wp.static(order) + 1
+        if starts(step, world) != 0:
+            n = 2
+            ratio = rate / wp.max(limit, f64(START) * ctl.tolerance / span)
         if ctl.counts[world, 0] >= f64(MOST):
             ratio = f64(wp.inf)
         if not ratio <= f64(1.0):
@@ -199,18 +254,13 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         ctl.tries[world] = 0
         ctl.work[world] = ctl.work[world] + pcg.total[world]
         pcg.total[world] = 0
-        # where the estimate passes through zero, that of the step before tells how large it will be again
         double = f64(2.0) * h
-        ahead = e * power(f64(2.0), n)
-        if ctl.kept[world, 3] > f64(0.0):
-            ahead = wp.max(ahead, ctl.kept[world, 2] * power(double / ctl.kept[world, 3], n))
-        if ahead <= f64(GROW) * unit * wp.max(double, f64(SPREAD) * pace):
+        longer = wp.max(double, f64(SPREAD) * pace)
+        if steady * (power(f64(2.0), n) * span / longer) <= f64(GROW) * limit:
             ctl.kept[world, 0] = double
         else:
             ctl.kept[world, 0] = h
         ctl.kept[world, 1] = pace + (h - pace) / f64(MEMORY)
-        ctl.kept[world, 2] = e
-        ctl.kept[world, 3] = h
         if ctl.counts[world, 0] == f64(0.0) or h < ctl.counts[world, 2]:
             ctl.counts[world, 2] = h
         ctl.counts[world, 3] = wp.max(ctl.counts[world, 3], h)
@@ -218,9 +268,15 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def settle(step: Step, ctl: Adaptive):
-        """After an attempt: substeps no longer than the wish. The state to go back to is that of the step's start."""
+        """After an attempt: what is kept, and substeps no longer than the wish.
+
+        The state to go back to is that of the step's start.
+        """
         world = wp.tid()
         step.first_refusal[world] = 0
+        if step.accepted[world] != 0:
+            seen = wp.min(ctl.kept[world, 2] + f64(1.0), f64(AVERAGE))
+            ctl.kept[world, 2] = wp.where(starts(step, world) != 0, f64(0.0), seen)
         if step.running[world] != 0:
             refine(step, ctl.kept[world, 0], world)
 
@@ -235,6 +291,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         open_step=open_step,
         begin_estimate=begin_estimate,
         local_error=local_error,
+        keep_mean=keep_mean,
         judge=judge,
         settle=settle,
         close_step=close_step,

@@ -14,7 +14,9 @@ TURNS = 16
 OUTER = 0.05
 """Part of a side by which a place may lie beyond a facet: the outward vectors of two elements differ."""
 INNER = 1e-9
-STAY = 0.01
+QUADRATIC = 1e-8
+"""A step so small is the last: what it leaves is its square."""
+STAY = 0.05
 """By so much of a side a point may pass the border of the facet that it was on as the attempt began: one that lies on a
 border does not change facets from iterate to iterate."""
 
@@ -85,6 +87,20 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         return out
 
     @wp.func
+    def carried(
+        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), C0: wp.array2d(dtype=vec3d),
+        D0: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d,
+    ) -> vec3d:  # fmt: skip
+        """Displacement of a place by C and D less that by C0 and D0."""
+        out = vec3d()
+        kind = mas.kind[f]
+        for m in range(mas.terms[kind]):
+            p = power(spot[0], mas.power[kind, m][0]) * power(spot[1], mas.power[kind, m][1])
+            i = mas.most * f + m
+            out += p * ((C[world, i] - C0[world, i]) + spot[2] * (D[world, i] - D0[world, i]))
+        return out
+
+    @wp.func
     def way(
         mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, old: vec3d, new: vec3d
     ) -> vec3d:  # fmt: skip
@@ -144,7 +160,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
             if outside(mas.corners[mas.kind[f]], spot) > f64(1.0):
                 return wp.vec4d(spot[0], spot[1], spot[2], f64(0.0))
             size = wp.max(size, wp.abs(d[2]) / mas.size[f])
-            if size < f64(1.0e-15) or (size < f64(1.0e-11) and size >= f64(0.5) * last):
+            if size < f64(QUADRATIC):
                 return wp.vec4d(spot[0], spot[1], spot[2], f64(1.0))
             last = size
         return wp.vec4d(spot[0], spot[1], spot[2], wp.where(last < f64(1.0e-9), f64(1.0), f64(0.0)))
@@ -169,7 +185,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
                 return wp.vec4d(spot[0], spot[1], spot[2], f64(0.0))
             change = wp.length(spot - first)
             size = wp.max(size, wp.abs(d[2]) / mas.size[f])
-            if size <= f64(1.0e-15) * change or (size < f64(1.0e-11) and size >= f64(0.5) * last):
+            if size <= f64(QUADRATIC) * change or size < f64(1.0e-15):
                 return wp.vec4d(spot[0], spot[1], spot[2], f64(1.0))
             last = size
         return wp.vec4d(spot[0], spot[1], spot[2], wp.where(last < f64(1.0e-9), f64(1.0), f64(0.0)))
@@ -190,6 +206,6 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         return out
 
     return _types.SimpleNamespace(
-        Jet=Jet, power=power, jet=jet, moved=moved, way=way, coordinates=coordinates, outside=outside, middle=middle,
-        locate=locate, follow=follow, outward=outward, weigh=weigh,
+        Jet=Jet, power=power, jet=jet, moved=moved, carried=carried, way=way, coordinates=coordinates,
+        outside=outside, middle=middle, locate=locate, follow=follow, outward=outward, weigh=weigh,
     )  # fmt: skip

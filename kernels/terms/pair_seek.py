@@ -23,12 +23,14 @@ __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 THROUGH = -2
 """Seat of a point that has left through another side."""
 TURNED = 0.1
-"""Least cosine of the normals of two facets that a point in contact passes between: not around an edge of a box."""
+"""Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
 LOST = 0.25
 """A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
 MARGIN = 0.25
 """Boxes of the tree are larger than facets by this part of a side: they fit for several steps."""
 ROUNDING = 2.4e-7
+GLANCE = 0.5
+"""A place that the tangent plane in the middle of a facet puts so far beyond its sides is not on it."""
 
 
 @functools.cache
@@ -42,8 +44,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
     k, f = touch_functions(dtype, False), place_functions(dtype)
     along, reach, allowance = k.along, k.reach, k.allowance
-    jet, moved, outside, middle, locate, follow, outward = (
-        f.jet, f.moved, f.outside, f.middle, f.locate, f.follow, f.outward
+    jet, moved, carried, coordinates, outside, middle, locate, follow, outward = (
+        f.jet, f.moved, f.carried, f.coordinates, f.outside, f.middle, f.locate, f.follow, f.outward
     )  # fmt: skip
     Jet = f.Jet
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
@@ -157,16 +159,16 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def anchor(
         mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock, at: Attempt, t: Touching,
-        v_n: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int, f: int, guess: vec3d,
+        v_n: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int, f: int, start: vec3d,
     ):  # fmt: skip
         """Measure the motion of a point from a facet: its place on it as the attempt began, depth and speed then."""
-        found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], guess)
+        found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], start)
         spot = vec3d(found[0], found[1], found[2])
         live = his.speed[world, point] > f64(0.0)
         if found[3] == f64(0.0):
             if not live:
                 return
-            spot = guess
+            spot = start
         s = jet(mas, t.C0, t.D0, world, f, spot)
         n = outward(s)
         t.first[world, point] = f + 1
@@ -298,7 +300,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         if t.first[world, point] > 0:
             first = t.first[world, point] - 1
             from0 = t.spot0[world, point]
-            motion -= moved(mas, t.C, t.D, world, first, from0) - moved(mas, t.C0, t.D0, world, first, from0)
+            motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, first, from0)
             stretch = t.stretch[world, point]  # of other facets too: it must not vary with the iterate
             change = (now - at.reach[world, point]) - stretch * (spot[2] - from0[2])
             t.depth[world, point] = at.depth[world, point] + change
@@ -308,7 +310,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 if con.law[c] != PAPER:
                     spring = frame(jet(mas, t.C, t.D, world, first, from0)) * spring
         else:
-            motion -= moved(mas, t.C, t.D, world, f, spot) - moved(mas, t.C0, t.D0, world, f, spot)
+            motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, f, spot)
             t.before[world, point] = t.depth[world, point] + wp.dot(n, motion) - (now - at.reach[world, point])
         t.motion[world, point] = motion
         t.whole[world, point] = spring + motion
@@ -339,19 +341,16 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         place = vec3d()
         off = f64(OUTER)
         height = f64(1.0e300)
-        facing = vec3d()
-        pad = wp.max(con.offset[c], f64(0.0)) + f64(1.0e-6) * wp.length(x)
+        pad = wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)
         anchored = t.first[world, point] > 0
         if anchored:
             f = t.first[world, point] - 1
             from0 = t.spot0[world, point]
-            motion = shift - at.origin[world, point]
-            motion -= moved(mas, t.C, t.D, world, f, from0) - moved(mas, t.C0, t.D0, world, f, from0)
+            motion = shift - at.origin[world, point] - carried(mas, t.C, t.D, t.C0, t.D0, world, f, from0)
             found = follow(mas, t.C, t.D, world, f, from0, motion)
             if found[3] == f64(0.0):
                 found = locate(mas, t.C, t.D, world, f, x, middle(mas.corners[mas.kind[f]]))
-            facing = outward(jet(mas, t.C, t.D, world, f, from0))
             spot = vec3d(found[0], found[1], found[2])
             o = outside(mas.corners[mas.kind[f]], spot)
             if found[3] != f64(0.0) and o <= off:
@@ -360,18 +359,31 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 off = o
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
-            through = at.depth[world, point] - wp.dot(motion, facing) > f64(LOST) * mas.limit[f]
         if best < 0 or off > f64(STAY):
+            facing = vec3d()
+            if anchored:
+                f = t.first[world, point] - 1
+                from0 = t.spot0[world, point]
+                facing = outward(jet(mas, t.C, t.D, world, f, from0))
+                motion = shift - at.origin[world, point] - carried(mas, t.C, t.D, t.C0, t.D0, world, f, from0)
+                through = at.depth[world, point] - wp.dot(motion, facing) > f64(LOST) * mas.limit[f]
             low = wp.min(x, x0) - vec3d(pad, pad, pad)
             high = wp.max(x, x0) + vec3d(pad, pad, pad)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
             query = wp.bvh_query_aabb(mas.tree, down(low), up(high), root)
             index = wp.int32(0)
-            left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch
+            left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch - wp.min(con.offset[c], f64(0.0))
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]
-                found = locate(mas, t.C, t.D, world, f, x, middle(corners))
+                center = middle(corners)
+                s = jet(mas, t.C, t.D, world, f, center)
+                first = center + coordinates(s, x - s.x)
+                far = outside(corners, first) > f64(GLANCE)
+                path = x - x0 - carried(mas, t.C, t.D, t.C0, t.D0, world, f, center)
+                if far and wp.length(path) <= f64(0.5) * mas.limit[f]:
+                    continue
+                found = locate(mas, t.C, t.D, world, f, x, center)
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
                 fits = found[3] != f64(0.0) and o <= off
@@ -379,7 +391,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     s = jet(mas, t.C, t.D, world, f, spot)
                     n = outward(s)
                     gap = spot[2] * wp.dot(n, s.c)
-                    fits = -gap <= mas.limit[f]
+                    fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
                     if anchored:
                         fits = fits and wp.dot(n, facing) > f64(TURNED)
                     elif settling == 0:
@@ -401,7 +413,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             t.seat[world, point] = THROUGH
 
     return _types.SimpleNamespace(
-        module=module, controls=controls, controls_before=controls_before,
-        check_boxes=check_boxes, adopt_boxes=adopt_boxes,
-        begin_points=begin_points, look_around=look_around, seek=seek, frame=frame,
+        module=module, controls=controls, controls_before=controls_before, check_boxes=check_boxes,
+        adopt_boxes=adopt_boxes, begin_points=begin_points, look_around=look_around, seek=seek, frame=frame, down=down,
+        up=up,
     )  # fmt: skip

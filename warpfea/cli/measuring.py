@@ -78,7 +78,8 @@ def add_bench(commands: Any) -> None:
         "  warpfea bench --growth --out growth.json\n  warpfea bench --product --out product.json\n"
         "  warpfea bench --cpu --out cpu.json\n  warpfea bench --contact --out contact.json\n"
         "  warpfea bench --scenes --device cpu --before old.json --out scenes.json\n"
-        "  warpfea bench --price --rows 'pendulum,hook' --out price.json",
+        "  warpfea bench --price --rows 'pendulum,hook' --out price.json\n"
+        "  warpfea bench --pairs --rows 'pile-4-*' --out pairs.json",
     )
     kind = to.add_mutually_exclusive_group()
     kind.add_argument("--peer", action="store_true", help="120 steps to 5e-4 N on the peer's sizes, beside its times")
@@ -88,6 +89,7 @@ def add_bench(commands: Any) -> None:
     kind.add_argument("--scenes", action="store_true", help="launches, modules, bytes and iterations of every scene")
     kind.add_argument("--contact", action="store_true", help="a step with contact beside one without")
     kind.add_argument("--price", action="store_true", help="every scene beside itself with all that it leaves out")
+    kind.add_argument("--pairs", action="store_true", help="contact between bodies: piles, solves, search, worlds")
     to.add_argument(
         "--problem",
         action="append",
@@ -117,7 +119,7 @@ def add_bench(commands: Any) -> None:
         metavar="N",
         help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
     )
-    group = to.add_argument_group("with --peer, --cpu, --scenes or --price")
+    group = to.add_argument_group("with --peer, --cpu, --scenes, --price or --pairs")
     group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
     group.add_argument(
         "--before", metavar="FILE", help="--scenes: an earlier file to stand beside (the `before` in it, if it has one)"

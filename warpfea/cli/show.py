@@ -171,13 +171,18 @@ def _joint_rows(joints: list[dict[str, Any]]) -> list[list[str]]:
     return [["joints", ", ".join(f"{len(n)} {kind} ({sum(n)} equations)" for kind, n in counts.items())]]
 
 
+def _bodies(c: dict[str, Any]) -> str:
+    """What touches what."""
+    return f"body {c['body']} on {c['collider'] if 'collider' in c else 'body ' + c['with']}"
+
+
 def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
     """A row for each contact; of many a count."""
     if len(contacts) > MANY:
         left = sum(c["left_out"] for c in contacts)
         return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_clamped(left)}"]]
     return [
-        [f"contact {c['name']}", f"body {c['body']} on {c['collider']}{_triangles(c)}, law {c['law']}, {c['model']}, "
+        [f"contact {c['name']}", f"{_bodies(c)}{_triangles(c)}, law {c['law']}, {c['model']}, "
          f"{c['points']} points{_clamped(c['left_out'])}"]
         for c in contacts
     ]  # fmt: skip

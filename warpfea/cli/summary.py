@@ -232,7 +232,7 @@ def _joints(sim: Simulation) -> list[list[str]]:
 def _contacts(sim: Simulation) -> dict[str, Any]:
     """Of each contact that has been recorded the largest and the last values."""
     out = {}
-    for contact in sim.model.description.contacts:
+    for contact in sim.model.description.all_contacts:
         record = sim.contact_record(contact)
         if record.time.size:
             largest = {name: np.nanmax(getattr(record, name)[0]) for name in ("normal_force", "penetration")}

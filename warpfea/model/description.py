@@ -127,13 +127,18 @@ class Description:
     pairs: list[PairContact] = field(default_factory=list)
     gravity: TimeLaw | None = None
 
+    @property
+    def all_contacts(self) -> list[Contact | PairContact]:
+        """Contacts with colliders, then between bodies."""
+        return [*self.contacts, *self.pairs]
+
     def summary(self) -> str:
         """What there is, in one line; "" of an empty description."""
         loads = len(self.dead_loads) + len(self.pressures) + len(self.moments) + len(self.body_forces)
         counts = {"support": len(self.supports), "load": loads, "joint": len(self.joints)}
         counts |= {
             "collider": len(self.colliders),
-            "contact": len(self.contacts) + len(self.pairs),
+            "contact": len(self.all_contacts),
             "probe": len(self.probes),
         }
         parts = [repr(body) for body in self.bodies] if len(self.bodies) <= 3 else [f"{len(self.bodies)} bodies"]

@@ -162,7 +162,7 @@ class Model:
             self.free_host[rows] *= 1.0 - support.components
             if support.law is None and support.node_laws is None:
                 self.clamped_host[rows] |= support.components.astype(bool)
-        if not self.free_host.any() and not self.description.contacts and not self.description.pairs:
+        if not self.free_host.any() and not self.description.all_contacts:
             raise ModelError("every component of every node is prescribed: nothing is left to solve for")
 
     def _assemble_mass(self) -> None:
@@ -380,9 +380,11 @@ class Model:
         The state of a simulation knows the springs of friction and where colliders are; with another they are where
         their paths are at its time, and there is no friction.
         """
-        if self.terms.contact is None:
-            return np.zeros((self.worlds, self.slots, 3))
-        return self.terms.contact.nodal_force(state)
+        out = np.zeros((self.worlds, self.slots, 3))
+        for term in (self.terms.contact, self.terms.pairs):
+            if term is not None:
+                out += term.nodal_force(state)
+        return out
 
     def set_parameter(self, name: str, values: Any) -> None:
         """Set a parameter in all worlds; simulations take the new values from their next step on.

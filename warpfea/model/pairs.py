@@ -238,8 +238,8 @@ def thickness(surface: SurfaceSet) -> np.ndarray:
             wp.array(skin.triangles.ravel(), dtype=wp.int32),
         )
         out = wp.zeros(len(places), dtype=float)
-        x = wp.array((places - center) / size, dtype=wp.vec3)
-        n = wp.array(normal[:, 0], dtype=wp.vec3)
+        x: wp.array = wp.array((places - center) / size, dtype=wp.vec3)
+        n: wp.array = wp.array(normal[:, 0], dtype=wp.vec3)
         wp.launch(thickness_kernel(), len(places), [mesh.id, x, n, out], device="cpu")
         return np.asarray(out.numpy(), dtype=float) * size
 

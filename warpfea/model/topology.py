@@ -76,7 +76,8 @@ def free_groups(model: Any) -> tuple[Any, int]:
 def check_static_supports(model: Any) -> None:
     """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
     state = model.state()
-    held_by = "hold what rests on contact with solve_static(stabilise=True), " if model.description.contacts else ""
+    touches = model.description.all_contacts
+    held_by = "hold what rests on contact with solve_static(stabilise=True), " if touches else ""
     for label in range(model.component_count):
         slots = np.flatnonzero(model.component == label)
         parts, part = np.unique(model.part[slots], return_inverse=True)
@@ -97,10 +98,15 @@ def check_static_supports(model: Any) -> None:
                     f"term {term.name!r}: restraints gave {rows.shape}; expected (rows, {3 * model.slots}), CSR"
                 )
             held = np.hstack([held, (rows[:, columns] @ modes.T).T / model.size])
-        values = np.linalg.svd(held, compute_uv=False) if held.size else np.zeros(0)
-        free = len(modes) - int(np.sum(values > 1e-9))
+        turned, values, _ = (
+            np.linalg.svd(held, full_matrices=True) if held.size else (np.eye(len(modes)), np.zeros(0), 0)
+        )
+        rank = int(np.sum(values > 1e-9))
+        free = len(modes) - rank
         if free:
-            body = next(b for b in model.bodies if b.slot_offset <= slots[0] < b.slot_offset + b.slot_count)
+            moves = (turned[:, rank:] ** 2).reshape(len(parts), -1).sum(axis=1)  # of each part in these motions
+            first = slots[part == int(np.argmax(moves > 1e-6))][0]
+            body = next(b for b in model.bodies if b.slot_offset <= first < b.slot_offset + b.slot_count)
             raise ModelError(
                 f"body {body.name!r} is not supported: supports, joints and terms leave {free} rigid "
                 f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "

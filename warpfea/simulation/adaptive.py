@@ -115,6 +115,7 @@ class Adaptive:
         shapes = {"counts": (model.worlds, len(COUNTS)), "horizon": (1,), "first": (1,)}
         self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("kept",), **shapes)
         self.control.kept = at.state.register("adaptive", wp.float64, (len(KEPT),))
+        self.means = at.state.register("adaptive_means", model.types.vec3, (model.slots,))
         self.control.tolerance = asked.error * float(model.size)
         self.control.max_tries = max_tries
 
@@ -144,13 +145,15 @@ class Adaptive:
         """Before the kernel `end_attempt`: estimate the error of what has converged, and refuse what is too far off."""
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
-        args = [w.step, ctl, self.arm, m.topology.free, w.v, self.velocity, self.v_before]
+        args = [w.step, ctl, self.arm, m.topology.free, w.v, self.velocity, self.v_before, self.means]
         launch(k.local_error, self.dim, args)
         launch(k.judge, m.worlds, [w.step, w.newton, w.pcg, ctl])
 
     def settle(self) -> None:
-        """After the kernel `end_attempt`: the size of the next substep."""
-        self.launch(self.kernels.settle, self.model.worlds, [self.work.step, self.control])
+        """After the kernel `end_attempt` and before the commit: means of rates, the size of the next substep."""
+        w, launch = self.work, self.launch
+        launch(self.kernels.keep_mean, self.dim, [w.step, self.control, w.v, self.velocity, self.v_before, self.means])
+        launch(self.kernels.settle, self.model.worlds, [w.step, self.control])
 
     def close(self) -> None:
         """Before the report."""

@@ -122,8 +122,7 @@ class Records(Results):
 
     def _contact_column(self, contact: Contact | PairContact | str) -> int:
         """First column of a contact in the report of a step."""
-        d, terms = self.model.description, self.model.terms
-        contacts = [*d.contacts, *d.pairs]
+        contacts, terms = self.model.description.all_contacts, self.model.terms
         for other in contacts:
             if other is contact or other.name == contact:
                 term: Any = terms.contact if isinstance(other, Contact) else terms.pairs

@@ -153,7 +153,7 @@ def begin_static(
     check_model(model)
     if model.terms.dead.pulls:
         require_density(model.bodies, "gravity")
-    for contact in model.description.contacts:
+    for contact in model.description.all_contacts:
         if contact.treatment == "explicit":
             raise ModelError(
                 f"contact {contact.name!r}: treatment = 'explicit' takes the force of the last state, which is no "

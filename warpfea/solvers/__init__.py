@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..terms.term import At
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
+
+if TYPE_CHECKING:
+    from ..model.model import Model
 
 __all__ = ["SOLVERS", "Jacobi", "NewtonPCG", "get", "make_loop"]
 
@@ -36,7 +39,26 @@ def get(solver: Any) -> NewtonPCG | Jacobi:
 
 
 def make_loop(at: At, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
-    """The loop that the options describe."""
+    """The loop that the options describe.
+
+    Raises:
+        ModelError: a solver that can't hold what couples bodies.
+    """
+    if isinstance(options, Jacobi) or options.linear == "direct":
+        refuse_couplings(at.model, "Jacobi" if isinstance(options, Jacobi) else "NewtonPCG(linear='direct')")
     if isinstance(options, Jacobi):
         return JacobiLoop(at, options, **more)
     return NewtonLoop(at, options, **more)
+
+
+def refuse_couplings(model: Model, name: str) -> None:
+    """ModelError where a term couples bodies that share no element, which a matrix with a fixed pattern can't hold."""
+    found = [(term.name, couples) for term in model.terms if (couples := term.couples())]
+    if found:
+        kind, couples = found[0]
+        a, b = (repr(model.bodies[k].name) for k in couples[0])
+        more = f" and {len(couples) - 1} more" if len(couples) > 1 else ""
+        raise ModelError(
+            f"{name} does not hold {kind!r}, which couple bodies {a} and {b}{more} with a pattern that changes: take "
+            "wf.NewtonPCG()"
+        )

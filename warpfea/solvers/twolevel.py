@@ -32,13 +32,15 @@ import warp as wp
 from ..base.launch import labelled
 from ..kernels.common.types import precision
 from ..kernels.solvers.blocks import block_kernels
-from ..kernels.solvers.levels import LANES, TILE, TILE_SLOTS, level_kernels, level_struct
+from ..kernels.solvers.levels import TILE, TILE_SLOTS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
 from ..terms.term import Kept
 from .band import BandFactor, find_band
+from .dense import DenseInverse, gauss_jordan
 from .levels import GROUP_SLOTS, Level, make_levels
+from .motions import Motions, motion_bodies
 from .reuse import Reuse
 
 if TYPE_CHECKING:
@@ -62,7 +64,9 @@ REBUILD_COST = 40.0
 class LevelArrays:
     """Matrices and vectors of one level, [world, ...]."""
 
-    def __init__(self, model: Model, work: Workspace, level: Level, depth: int, storage: str) -> None:
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, level: Level, depth: int, storage: str
+    ) -> None:  # fmt: skip
         B, n, T = model.worlds, level.slots, model.types.T
         S = precision(storage).T
         other = storage != model.dtype
@@ -70,26 +74,14 @@ class LevelArrays:
         self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
         if level.band is not None:
             return
-        if level.dense:
-            N = TILE * -(-n // TILE_SLOTS)
-            self.size = N
-            self.matrix = work.array(f"{name} inverse", (B, N, N), T)
-            self.stored = work.array(f"{name} stored", (B, N, N), S) if other else self.matrix
-            self.root = work.array(f"{name} root", (B, N if other else 1), T)
-            self.rows = work.array(f"{name} rows", (1, B, N if other else 1), wp.float64)
-            self.trace = work.array(f"{name} trace", (1, B), wp.float64)
-            self.left = work.array(f"{name} panels", (B, TILE, N), T)
-            self.top = work.array(f"{name} panels 2", (B, TILE, N), T)
-            self.scale = work.array(f"{name} diagonal", (B, N), T)
-            self.pivot = work.array(f"{name} pivot", (B, 1, TILE, TILE), T)
-        else:
+        self.dense = DenseInverse(model, work, launch, name, 3 * n, storage) if level.dense else None
+        if not level.dense:
             shape = (B, level.tiles, TILE, TILE)
             self.matrix = work.array(f"{name} inverse", shape, T)
             self.stored = work.array(f"{name} stored", shape, S) if other else self.matrix
             self.root = work.array(f"{name} root", shape[:3] if other else (1, 1, 1), T)
-        tiles = 1 if level.dense else level.tiles
-        self.diagonal = work.array(f"{name} pivots", (B, tiles, TILE), T)
-        self.column = work.array(f"{name} column", (B, tiles, TILE), T)
+            self.diagonal = work.array(f"{name} pivots", (B, level.tiles, TILE), T)
+            self.column = work.array(f"{name} column", (B, level.tiles, TILE), T)
         self.vectors: dict[str, wp.array] = {}
         if depth:
             names = ("r", "x") if level.dense else ("r", "x", "z", "d")
@@ -119,7 +111,7 @@ class TwoLevel:
         self.jacobi = pcg_kernels(model.dtype, model.terms.traits.gated).block_jacobi
         self.dim = (model.worlds, model.slots)
         self.levels = self._levels(kind)
-        self.arrays = [LevelArrays(model, work, level, k, self.storage) for k, level in enumerate(self.levels)]
+        self.arrays = [LevelArrays(model, work, launch, level, k, self.storage) for k, level in enumerate(self.levels)]
         self.at, self.terms = residual.at, model.terms
         for term in self.terms:
             term.reserve(self.at, self.assembled, projected=True)
@@ -135,7 +127,7 @@ class TwoLevel:
             residual.on_matrix = self._factor
             self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if dense else 0), model.types.T)
         self.value = self.assembled.values("preconditioner matrix")
-        self.lanes = LANES if model.device.is_cuda else 1
+        self.motions, self.coupling = self._motions()
         self.by_row = 0 if model.device.is_cuda else 1
         self.corrected = not self.levels[0].whole and any(term.preconditions(self.at) for term in self.terms)
         self.kept: dict[str, Kept] = {}
@@ -145,6 +137,13 @@ class TwoLevel:
         self.reuse = Reuse(model, work, launch, name, self.rebuild_cost)
         most = max([level.slots for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
+
+    def _motions(self) -> tuple[Motions | None, set[wp.Module]]:
+        """The rigid motions of bodies that terms couple, and modules of the terms that they need."""
+        if not motion_bodies(self.model):
+            return None, set()
+        out = Motions(self.model, self.work, self.launch, self.residual, self.assembled.pattern)
+        return out, out.modules().union(*(term.reserve_motions(self.at, out) for term in self.terms))
 
     def _levels(self, kind: str) -> list[Level]:
         """The levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
@@ -184,7 +183,7 @@ class TwoLevel:
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
         k = self.kernels
-        out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules()
+        out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules() | self.coupling
         return out | {self.band.kernels.module if self.band else self.making.module}
 
     # the seam
@@ -237,6 +236,8 @@ class TwoLevel:
             coarse, correct = z, 0
         else:
             coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
+        if self.motions:
+            self.motions.apply(r, z, active)
         args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
         launch(k.add_coarse, dim, args)
@@ -252,15 +253,16 @@ class TwoLevel:
     def _apply_dense(self, depth: int, r: wp.array, x: wp.array, active: wp.array) -> None:
         n, B = self.levels[depth].slots, self.model.worlds
         flat_r, flat_x = (_flat(a, self.model.types.T, (B, 3 * n)) for a in (r, x))
-        lanes = self.launch.lanes(3 * n)
-        arrays = self.arrays[depth]
-        dim = (B, self.launch.padded(3 * n * lanes))
+        dense = self.arrays[depth].dense
+        assert dense is not None
         if self.follows:  # z = L^-T (L^-1 r)
+            lanes = self.launch.lanes(3 * n)
+            dim = (B, self.launch.padded(3 * n * lanes))
             for upper, given, out in ((0, flat_r, self.half), (1, self.half, flat_x)):
-                args = [arrays.stored, arrays.root, upper, lanes, given, active, out]
+                args = [dense.stored, dense.root, upper, lanes, given, active, out]
                 self.launch(self.kernels.apply_triangle, dim, args)
             return
-        self.launch(self.kernels.apply_dense, dim, [arrays.stored, arrays.root, lanes, flat_r, active, flat_x])
+        dense.apply(flat_r, flat_x, active)
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = T r on a level; returns the coarse correction C P^T r, which is still to be interpolated by P."""
@@ -328,6 +330,8 @@ class TwoLevel:
             self._carry()
             self._add(penalties=True)
         self.reuse.made()
+        if self.motions:
+            self._couple(self.motions, flags)
         if self.follows:
             return
         if self.band:
@@ -335,8 +339,9 @@ class TwoLevel:
             return
         for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
             value = arrays.value if depth else self.value
-            if level.dense:
-                self._invert_dense(level, arrays, value, flags)
+            if arrays.dense is not None:
+                self._fill_dense(level, arrays.dense, value, flags)
+                arrays.dense.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
                 return
             self._invert_tiles(level, arrays, value, flags, keep=depth == 0)
             if depth + 1 == len(self.levels):
@@ -345,6 +350,15 @@ class TwoLevel:
             free = self.all_free if depth else m.topology.free
             args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
             launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+
+    def _couple(self, motions: Motions, flags: wp.array) -> None:
+        """The matrix of the bodies' rigid motions, and its inverse."""
+        motions.begin(self.reuse.place, self.value, flags)
+        for term in self.terms:
+            kept = self.kept[term.name].place if term.name in self.kept else []
+            if term.couples():
+                term.couple(self.at, kept, self.reuse.control.dq_dv, flags)
+        motions.end(flags)
 
     def _add(self, *, penalties: bool) -> None:
         """Add the terms' blocks to the matrix: those that D is taken from, or the penalties, which follow from D."""
@@ -359,47 +373,25 @@ class TwoLevel:
         if self.band:
             self.band.make(value, flags)
             return
-        level, arrays = self.levels[0], self.arrays[0]
+        dense = self.arrays[0].dense
+        assert dense is not None
         lanes = FACTOR_LANES if self.model.device.is_cuda else 1
-        self._fill_dense(level, arrays, value, flags)
-        args = [lanes, arrays.scale, flags, arrays.left, arrays.top, arrays.matrix]
+        self._fill_dense(self.levels[0], dense, value, flags)
+        args = [lanes, dense.scale, flags, dense.left, dense.top, dense.matrix]
         self.launch(self.making.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array, *, keep: bool) -> None:
         B, k = self.model.worlds, self.making
         args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
         self.launch(k.fill_tiles, (B, level.tiles, TILE_SLOTS), args)
-        self._gauss_jordan(level.tiles, arrays.matrix, arrays, flags, keep=keep)
+        gauss_jordan(self.launch, k, level.tiles, arrays, arrays.matrix, flags, keep=keep)
         if arrays.stored is not arrays.matrix:
             args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]
             self.launch(k.store_tiles, (B, level.tiles, TILE), args)
 
-    def _gauss_jordan(self, tiles: int, matrix: wp.array, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
-        args = [self.lanes, tiles, int(keep), flags, arrays.diagonal, arrays.column, matrix]
-        self.launch(self.making.invert_tiles, self.model.worlds * tiles * self.lanes, args, block_dim=LANES)
-
-    def _fill_dense(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array) -> None:
-        args = [level.pattern.data, value, level.slots, flags, arrays.scale, arrays.matrix]
-        self.launch(self.making.fill_dense, (self.model.worlds, arrays.size // 3), args)
-
-    def _invert_dense(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array) -> None:
-        """Dense inverse by block Gauss-Jordan, with blocks of the size of a tile."""
-        B, N, k, launch = self.model.worlds, arrays.size, self.making, self.launch
-        keep = level is self.levels[0]
-        self._fill_dense(level, arrays, value, flags)
-        for first in range(0, N, TILE):
-            args = [arrays.matrix, arrays.scale, first, flags, arrays.diagonal, arrays.pivot]
-            launch(k.take_pivot, (B, TILE, TILE), args)
-            self._gauss_jordan(1, arrays.pivot, arrays, flags, keep=keep)
-            args = [arrays.matrix, arrays.pivot, first, flags, arrays.left, arrays.top]
-            launch(k.take_panels, (B, TILE, N), args)
-            args = [arrays.pivot, arrays.left, arrays.top, first, flags, arrays.matrix]
-            launch(k.eliminate, (B, N // 4, N), args)
-        if arrays.stored is not arrays.matrix:
-            launch(k.dense_traces, (B, N), [arrays.scale, arrays.matrix, flags, arrays.rows])
-            self.residual.reduce(arrays.rows, 1, flags, arrays.trace)
-            args = [arrays.scale, arrays.trace, arrays.matrix, flags, arrays.root, arrays.stored]
-            launch(k.store_dense, (B, N, N), args)
+    def _fill_dense(self, level: Level, dense: DenseInverse, value: Any, flags: wp.array) -> None:
+        args = [level.pattern.data, value, level.slots, flags, dense.scale, dense.matrix]
+        self.launch(self.making.fill_dense, (self.model.worlds, dense.size // 3), args)
 
 
 def _flat(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:

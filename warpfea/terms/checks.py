@@ -45,13 +45,17 @@ def check_made(term: Any, make: Any, model: Model) -> None:
 
 
 def check_names(terms: Sequence[Term], taken: Sequence[str], what: str, names: Any) -> None:
-    """ModelError where two terms give the same name, or one that is taken; `names` is a function of a term."""
+    """ModelError where two terms give the same name, or one that is taken; `names` is a function of a term.
+
+    Two may share a field whose specification says how they are joined.
+    """
     owner: dict[str, Term] = {}
     for term in terms:
         for name in names(term):
             if name in taken:
                 raise ModelError(f"term {term.name!r}: {what} {name!r} is taken; give it a name of its own")
-            if name in owner:
+            shared = name in owner and names(owner[name])[name]
+            if name in owner and not (names(term)[name] is shared and getattr(shared, "join", None)):
                 raise ModelError(f"terms {owner[name].name!r} and {term.name!r} both have {what} {name!r}")
             owner[name] = term
 

@@ -1,9 +1,9 @@
-"""Contact as fields at the nodes of a body: pressure and gap."""
+"""Contact as fields at the nodes of a body: pressure and gap, of contact with obstacles and between bodies."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,35 +11,68 @@ from scipy.spatial import cKDTree
 from ..kernels.terms.contact_laws import SMOOTH
 from ..model.discretisation import Discretisation, element_functions
 from .contact_tables import LAWS, ContactTables
+from .term import FieldSpec
 
-__all__ = ["contact_field", "nodal_force"]
+if TYPE_CHECKING:
+    from .pair_tables import PairTables
+
+__all__ = ["CONTACT_FIELDS", "Patch", "contact_field", "nearest_samples", "nodal_force", "obstacle_patches"]
+
+CONTACT_FIELDS = {
+    "contact_pressure": FieldSpec("contact pressure", "Pa", np.add, np.maximum),
+    "gap": FieldSpec("gap to the nearest obstacle or body in contact", "m", np.fmin, np.fmin),
+}
+"""Of both terms of contact: what they press adds up, and the smallest of their gaps counts."""
 
 
-def contact_field(
-    t: ContactTables, name: str, body: Any, worlds: int, at_points: Callable[[], tuple[np.ndarray, np.ndarray]]
-) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Points of a contact on a body, each (worlds, points).
+
+    Attributes:
+        nearest: sample of the body that a point counts at, -1: none.
+        area: that it stands for, m^2. normal: elastic normal force, N. gap: m, 1e30 where it is not known.
+    """
+
+    nearest: np.ndarray
+    area: np.ndarray
+    normal: np.ndarray
+    gap: np.ndarray
+
+
+def contact_field(name: str, body: Any, worlds: int, patches: list[Patch]) -> np.ndarray:
     """(worlds, nodes x samples) "contact_pressure" or "gap" at the samples of each node of a body.
 
     Every contact point counts at the sample closest to it in the reference. Pressure is the elastic normal force of a
     sample's points over the area that they stand for; of several contacts it adds up. Gap is the smallest of the
-    points, NaN where a sample has none. `at_points` gives gaps and forces of all points.
+    points, NaN where a sample has none.
     """
-    mine = [k for k, contact in enumerate(t.contacts) if contact.body is body]
     nodes = len(body.mesh.points) * body.family.node_samples.shape[1]
     pressure, least = np.zeros((worlds, nodes)), np.full((worlds, nodes), np.inf)
-    if mine:
-        gap, force = at_points()
-    for k in mine:
-        points = slice(t.first[k], t.first[k + 1])
-        nearest = _nearest(t, k)
-        area = np.bincount(nearest, weights=t.host[k].area.ravel(), minlength=nodes)
-        normal = _normal_force(t, k, gap[:, points], force[:, points])
+    for patch in patches:
         for world in range(worlds):
-            total = np.bincount(nearest, weights=normal[world], minlength=nodes)
+            known = patch.nearest[world] >= 0
+            at = patch.nearest[world, known]
+            area, total = (
+                np.bincount(at, weights=x[world, known], minlength=nodes) for x in (patch.area, patch.normal)
+            )
             pressure[world] += np.divide(total, area, out=np.zeros(nodes), where=area > 0.0)
-            np.minimum.at(least[world], nearest, gap[world, points])
+            np.minimum.at(least[world], at, patch.gap[world, known])
     # points that do not count have a gap of 1e30
     return pressure if name == "contact_pressure" else np.where(least < 1e29, least, np.nan)
+
+
+def obstacle_patches(t: ContactTables, body: Any, gap: np.ndarray, force: np.ndarray) -> list[Patch]:
+    """Points of a body's contacts with obstacles, from gaps and forces of all points."""
+    out = []
+    for k, contact in enumerate(t.contacts):
+        if contact.body is body:
+            points = slice(t.first[k], t.first[k + 1])
+            normal = _normal_force(t, k, gap[:, points], force[:, points])
+            nearest, area = nearest_samples(t, k, body), t.host[k].area.ravel()
+            shape = normal.shape
+            out.append(Patch(np.broadcast_to(nearest, shape), np.broadcast_to(area, shape), normal, gap[:, points]))
+    return out
 
 
 def _normal_force(t: ContactTables, k: int, gap: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -57,20 +90,42 @@ def _normal_force(t: ContactTables, k: int, gap: np.ndarray, force: np.ndarray) 
     return share * stiffness * np.maximum(depth, 0.0)
 
 
-def _nearest(t: ContactTables, k: int) -> np.ndarray:
-    """(points,) the sample that each point of a contact counts at."""
-    key = f"contact {k} samples"
+def nearest_samples(
+    t: ContactTables | PairTables, k: int, body: Discretisation, X: np.ndarray | None = None
+) -> np.ndarray:  # fmt: skip
+    """(points,) the sample of a body that points at reference places X (points, 3) count at.
+
+    By default those of contact k, of the nodes that its facets have.
+    """
+    key = f"{type(t).__name__} {k} samples {body.name}"
     if key not in t.model.cache:
-        p, body = t.host[k], t.contacts[k].body
-        used = np.zeros(body.slot_count, dtype=bool)
-        used[p.conn[np.any(np.abs(p.shape) > 1e-12, axis=1)]] = True
         count = body.family.node_samples.shape[1]
         nodes = np.asarray(body.mesh.used_nodes)
+        if X is None:
+            p = t.host[k]
+            used = np.zeros(body.slot_count, dtype=bool)
+            used[p.conn[np.any(np.abs(p.shape) > 1e-12, axis=1)]] = True
+        else:
+            used = _on_surface(body)
         nodes = nodes[used[body.node_slot[nodes]]]
         samples = (nodes[:, None] * count + np.arange(count)).ravel()
         tree = cKDTree(_sample_places(body)[samples])
-        t.model.cache[key] = samples[tree.query(p.X.reshape(-1, 3))[1]]
-    return t.model.cache[key]
+        fixed = None if X is not None else samples[tree.query(t.host[k].X.reshape(-1, 3))[1]]
+        t.model.cache[key] = (samples, tree, fixed)
+    samples, tree, fixed = t.model.cache[key]
+    return fixed if X is None else samples[tree.query(X)[1]]
+
+
+def _on_surface(body: Discretisation) -> np.ndarray:
+    """(slots,) whether a slot belongs to an outer face."""
+    out = np.zeros(body.slot_count, dtype=bool)
+    for face in np.unique(body.boundary[:, 1]):
+        xi, _ = body.family.face_points(int(face), np.array([(0.25, 0.25), (0.5, 0.25), (0.25, 0.5)]))
+        rows = body.boundary[body.boundary[:, 1] == face, 0]
+        shape, _ = element_functions(body, rows, xi)
+        used = np.any(np.abs(np.broadcast_to(shape, (len(rows), *shape.shape[1:]))) > 1e-12, axis=1)
+        out[body.connectivity[rows][used]] = True
+    return out
 
 
 def _sample_places(body: Discretisation) -> np.ndarray:
@@ -84,12 +139,13 @@ def _sample_places(body: Discretisation) -> np.ndarray:
     return out
 
 
-def nodal_force(tables: ContactTables, force: np.ndarray) -> np.ndarray:
+def nodal_force(tables: ContactTables | PairTables, force: np.ndarray) -> np.ndarray:
     """Forces on slots (worlds, slots, 3), N, of forces on points (worlds, points, 3)."""
     out = np.zeros((len(force), tables.model.slots, 3))
-    for k, (contact, p) in enumerate(zip(tables.contacts, tables.host)):
+    bodies = [contact.body for contact in tables.contacts]
+    for k, (body, p) in enumerate(zip(bodies, tables.host)):
         at_point = force[:, tables.first[k] : tables.first[k + 1]].reshape(-1, *p.area.shape, 3)
         at_slot = np.einsum("bfpk,fpl->bflk", at_point, p.shape)
         for world in range(len(force)):
-            np.add.at(out[world], p.conn + contact.body.slot_offset, at_slot[world])
+            np.add.at(out[world], p.conn + body.slot_offset, at_slot[world])
     return out

@@ -7,23 +7,42 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..base.errors import ModelError
 from ..base.launch import Launcher
 from ..kernels.terms.contact_sheets import sheet_kernels
 from ..model.triangle_mesh import TriMesh
+from .contact_starts import reference_place
 from .contact_tables import ContactTables
 
-__all__ = ["points_across"]
+__all__ = ["refuse_across"]
 
 
-def points_across(
-    tables: ContactTables, attempt: Any, displacement: wp.array, tolerance: np.ndarray, launch: Launcher
-) -> np.ndarray:  # fmt: skip
-    """(worlds, facets) a point of each facet, + 1, that is behind a sheet while others are in front, or 0.
+def refuse_across(
+    term: Any, attempt: Any, displacement: wp.array, tolerance: np.ndarray, new: np.ndarray, launch: Launcher
+) -> None:  # fmt: skip
+    """Raise ModelError where a body begins on both sides of a sheet.
 
     Args:
+        term: of contact.
         attempt: where colliders are.
-        tolerance: (worlds,) m.
+        tolerance, new: (worlds,) m, and in which worlds to look.
     """
+    t = term.tables
+    points = _points_across(t, attempt, displacement, tolerance, launch)
+    for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
+        k = int(np.searchsorted(t.row_start, row, side="right")) - 1
+        contact, where = t.contacts[k], reference_place(t, k, int(points[world, row]) - 1 - int(t.first[k]))
+        raise ModelError(
+            f"contact {contact.name!r}: body {contact.body.name!r} begins on both sides of collider "
+            f"{contact.collider.name!r}, or on it and behind (world {world}, reference point {where}); move one of "
+            "them: bodies on a sheet of triangles are in front of it"
+        )
+
+
+def _points_across(
+    tables: ContactTables, attempt: Any, displacement: wp.array, tolerance: np.ndarray, launch: Launcher
+) -> np.ndarray:  # fmt: skip
+    """(worlds, facets) a point of each facet, + 1, that is behind a sheet while others are in front, or 0."""
     m = tables.model
     found = wp.zeros((m.worlds, tables.rows), dtype=wp.int32, device=m.device)
     limit: Any = wp.array(tolerance, dtype=wp.float64, device=m.device)

@@ -70,6 +70,15 @@ def hunt_crossley_damping(restitution: float) -> float:
     return float(brentq(excess, low, high, xtol=1e-15)) if excess(high) < 0.0 else high
 
 
+def clamped_slots(model: Model) -> np.ndarray:
+    """(slots,) whether a slot is held in all directions by supports that never move."""
+    held = np.zeros((model.slots, 3))
+    for support in model.description.supports:
+        if support.law is None and support.node_laws is None and support.rotation is None:
+            held[support.body.slot_offset + support.slots] += support.components
+    return np.asarray((held > 0).all(axis=1))
+
+
 @dataclass(eq=False)
 class FacetGroup:
     """Facets with as many slots and points each, those of a contact next to each other.
@@ -111,7 +120,7 @@ class ContactTables:
         self.contacts: list[Contact] = [found[k][0] for k in order]
         self.host: list[ContactPoints] = [found[k][1] for k in order]
         self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
-        self.clamped = self._clamped()
+        self.clamped = clamped_slots(model)
         self.left_out: list[int] = []
         self.shares = [self._share(c, p) for c, p in zip(self.contacts, self.host)]
         self.groups: list[FacetGroup] = []
@@ -142,14 +151,6 @@ class ContactTables:
     def explicit(self) -> bool:
         """Whether a contact has the force of the last state."""
         return any(contact.treatment == "explicit" for contact in self.contacts)
-
-    def _clamped(self) -> np.ndarray:
-        """(slots,) whether a slot is held in all directions by supports that never move."""
-        held = np.zeros((self.model.slots, 3))
-        for support in self.model.description.supports:
-            if support.law is None and support.node_laws is None and support.rotation is None:
-                held[support.body.slot_offset + support.slots] += support.components
-        return np.asarray((held > 0).all(axis=1))
 
     def _share(self, contact: Contact, p: ContactPoints) -> np.ndarray:
         """(F, P) area of each point over that of the region; 0 where it only moves with clamped slots."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.errors import ModelError
 from ..kernels.terms.contact_data import contact_struct, facet_struct
 from ..kernels.terms.pair_data import master_struct
 from ..model.contact_points import ContactPoints
@@ -21,7 +22,7 @@ from ..model.pairs import (
     pair_numbers,
     pair_points,
 )
-from .contact_tables import CONSTANT, LAWS, SMOOTHING, FacetGroup, beta_of, hunt_crossley_damping
+from .contact_tables import CONSTANT, LAWS, SMOOTHING, FacetGroup, beta_of, clamped_slots, hunt_crossley_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -40,6 +41,7 @@ class PairTables:
         groups: slave facets. surfaces, masters: master surfaces, each once, and their facets.
         host: points of each contact. shares: (F, P) area of each point over that of the region.
         points, rows, facets: points and slave facets in all; master facets.
+        far: how far off a gap is told, m.
         first, row_start: first point and row of each contact.
     """
 
@@ -62,11 +64,22 @@ class PairTables:
                 self.surfaces.append(contact.master)
             self.of.append(same[0] if same else len(self.surfaces) - 1)
         self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
+        self._check_clamped()
         self.regions = [self._region(contact) for contact in self.contacts]
         self.shares = [p.area / region for p, region in zip(self.host, self.regions)]
         self.facets = sum(len(m.conn) for m in self.masters)
         self.points = self.rows = 0
         self.groups: list[FacetGroup] = []
+
+    def _check_clamped(self) -> None:
+        """ModelError for a contact of which nothing can move."""
+        clamped = clamped_slots(self.model)
+        for contact, slots in zip(self.contacts, self.slots):
+            if clamped[slots].all():
+                raise ModelError(
+                    f"contact {contact.name!r}: all of the surfaces of bodies {contact.first.body.name!r} and "
+                    f"{contact.second.body.name!r} is clamped; leave the contact out, or free one of them"
+                )
 
     @property
     def explicit(self) -> bool:
@@ -108,8 +121,9 @@ class PairTables:
         self.pool = pool + entries
         self.data = self._contacts()
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
-            max(contact.offset, 0.0) for contact in self.contacts
+            abs(contact.offset) for contact in self.contacts
         )
+        self.far = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
         self.size = m.size
 
@@ -165,6 +179,20 @@ class PairTables:
         for name, values in per_world.items():
             put(name, np.tile(values, (m.worlds, 1)), wp.float64)
         return out
+
+    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corners (facets, 3) of the facets in the reference."""
+        nodes = [np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X) for mas in self.masters]
+        low, high = ([getattr(x, name)(axis=1) for x in nodes] for name in ("min", "max"))
+        return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
+
+    @property
+    def box_groups(self) -> wp.array:
+        """Groups of the boxes of [world, facet]: one of each world and surface."""
+        counts = [len(mas.conn) for mas in self.masters]
+        group = np.repeat(np.arange(len(counts)), counts)
+        groups = (np.arange(self.model.worlds)[:, None] * len(counts) + group).ravel()
+        return wp.array(groups, dtype=wp.int32, device=self.model.device)
 
     def _padded(self, values: list[np.ndarray], axis: int, width: int, mode: str = "constant") -> np.ndarray:
         """Facets of all surfaces, with one axis padded to a width."""

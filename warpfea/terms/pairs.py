@@ -8,25 +8,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.errors import ModelError, PenetrationError
+from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
-from ..kernels.terms.contact import RELAX_LANES, contact_kernels
-from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
+from ..kernels.terms.contact import RELAX_LANES
+from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
-from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pair_books import pair_book_kernels
 from ..kernels.terms.pair_data import seat_struct, touching_struct
 from ..kernels.terms.pair_lists import CHUNK, list_kernels
 from ..kernels.terms.pair_seek import seek_kernels
-from ..kernels.terms.pairs import pair_kernels
-from ..model.pairs import bernstein
-from .contact import TOUCHING
+from ..model.state import State
 from .contact_exact import Exact
+from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
-from .contact_tables import block_entries
-from .pair_tables import PairTables
-from .term import LOSS, STORED, At, Column, Term, part
+from .contact_starts import reference_place, store_overlaps, touching_depth
+from .pair_solves import PairSolves
+from .pair_survey import survey
+from .term import LOSS, STORED, At, Column, part
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -39,7 +38,7 @@ KEPT = ("angle", "grown", "lead", "place", "turn")
 """History of colliders and of lumped contacts."""
 
 
-class Pairs(Term):
+class Pairs(PairSolves):
     """All contacts of a model between its bodies.
 
     Attributes:
@@ -48,14 +47,13 @@ class Pairs(Term):
 
     name = "pairs"
     columns = (Column("contact_pairs", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
+    fields = CONTACT_FIELDS
     parts = {"pairs": "contact between bodies: search, forces, products, history"}
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.traits = Traits(walls=True)
-        self.tables = PairTables(model)
-        self.shared, self.books = contact_kernels(model.dtype, False), book_kernels(model.dtype, False)
-        self.seek, self.kernels = seek_kernels(model.dtype), pair_kernels(model.dtype)
+        self.books, self.seek = book_kernels(model.dtype, False), seek_kernels(model.dtype)
         self.lists, self.ending = list_kernels(model.dtype), pair_book_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
@@ -145,29 +143,25 @@ class Pairs(Term):
 
     def _tree(self, touching: Any) -> wp.Bvh:
         """Boxes of the facets in the reference; worlds and surfaces are groups."""
-        t, B = self.tables, self.model.worlds
-        low, high = [], []
-        for mas in t.masters:
-            nodes = np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X)
-            low.append(nodes.min(axis=1))
-            high.append(nodes.max(axis=1))
-        counts = [len(mas.conn) for mas in t.masters]
-        group = np.repeat(np.arange(len(counts)), counts)
-        groups = (np.arange(B)[:, None] * len(counts) + group).ravel()
-        touching.lower.assign(np.tile(np.concatenate(low), (B, 1)).astype(np.float32))
-        touching.upper.assign(np.tile(np.concatenate(high), (B, 1)).astype(np.float32))
-        array = wp.array(groups, dtype=wp.int32, device=self.model.device)
-        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=array)
+        low, high = self.tables.boxes()
+        touching.lower.assign(np.tile(low, (self.model.worlds, 1)))
+        touching.upper.assign(np.tile(high, (self.model.worlds, 1)))
+        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=self.tables.box_groups)
 
-    def register(self, at: At) -> None:
+    def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
+        """The structs of history and seats, with arrays from make(name, dtype, shape of a world)."""
         history, seats = history_struct()(), seat_struct()()
         points = (self.tables.points,)
         for name, var in history_struct().vars.items():
             if name not in KEPT:
                 shape = () if name in ("born", "posed") else points
-                setattr(history, name, at.state.register(f"pairs_{name}", var.type.dtype, shape))
+                setattr(history, name, make(f"pairs_{name}", var.type.dtype, shape))
         for name, var in seat_struct().vars.items():
-            setattr(seats, name, at.state.register(f"pairs_{name}", var.type.dtype, points))
+            setattr(seats, name, make(f"pairs_{name}", var.type.dtype, points))
+        return history, seats
+
+    def register(self, at: At) -> None:
+        history, seats = self.history_of(at.state.register)
         at.scratch[self.name] = {"history": history, "seats": seats}
 
     def modules(self, at: At) -> Iterable[wp.Module]:
@@ -185,7 +179,7 @@ class Pairs(Term):
         new = (active.numpy() != 0) & ~(history.speed.numpy() > 0.0).any(axis=1)
         if not new.any():
             return
-        flags = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
+        flags: wp.array = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
         overlap, born = history.overlap.numpy(), history.born.numpy()
         overlap[new] = 0.0
         born[new] = at.state.time.numpy()[new]
@@ -199,28 +193,14 @@ class Pairs(Term):
         self._seek(at, u, flags, settling=1)
         seat = s["touching"].seat.numpy()
         depth = np.where((seat >= 0) & new[:, None], s["touching"].depth.numpy(), 0.0)
-        u_n = at.state.displacement.numpy()
-        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u_n.dtype).eps * np.abs(u_n).max(axis=(1, 2))
-        for k, contact in enumerate(t.contacts):
-            first, last = t.first[k], t.first[k + 1]
-            part_of = depth[:, first:last]
-            deep = part_of.max(axis=1) > touching
-            if not deep.any():
-                continue
-            if contact.overlap == "refuse":
-                world, point = np.unravel_index(int(part_of.argmax()), part_of.shape)
-                raise ModelError(
-                    f"contact {contact.name!r}: body {contact.slave.body.name!r} begins {part_of.max():.3g} m inside "
-                    f"body {contact.master.body.name!r} (world {world}, reference point {self._where(k, int(point))}); "
-                    "move one of them, or take overlap='offset', which stores the overlap and lets it decay"
-                )
-            overlap[deep, first:last] = np.maximum(part_of[deep], 0.0)
+        touching = touching_depth(self.model.size, at.state.displacement.numpy())
+        store_overlaps(t, depth, touching, overlap)
         history.overlap.assign(overlap)
 
-    def _where(self, k: int, point: int) -> str:
-        """Reference place of a point of a contact."""
-        X = self.tables.host[k].X.reshape(-1, 3)[point]
-        return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
+    def rewind(self, state: State) -> None:
+        """Stored overlaps keep their age."""
+        if "pairs_born" in state.specs:
+            state.pairs_born.assign(state.pairs_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
     # in a step
 
@@ -310,28 +290,6 @@ class Pairs(Term):
             args = [s["masters"], group.data, s["u"], flags, attempt, s["touching"]]
             at.launch(self.kernels.take_functions, (m.worlds, group.count, group.data.points), args)
 
-    @part("pairs")
-    def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        s, m, w, t, k = at.scratch[self.name], self.model, at.work, self.tables, self.kernels
-        attempt, touching, masters = s["attempt"], s["touching"], s["masters"]
-        for group in t.groups:
-            dim = (m.worlds, group.count, group.data.points)
-            at.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
-        for group in t.groups:
-            dim = (m.worlds, group.count, group.conn.shape[1])
-            at.launch(k.product_facets, dim, [group.data, active, attempt, touching, w.pool_product])
-        dim = (m.worlds, t.facets, t.master_conn.shape[1])
-        at.launch(k.product_masters, dim, [masters, active, attempt, touching, w.pool_product])
-
-    @part("pairs")
-    def diagonal(self, at: At, active: wp.array) -> None:
-        s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
-        for group in t.groups:
-            args = [group.data, active, s["attempt"], w.pool_block]
-            at.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
-        args = [s["masters"], active, s["attempt"], s["touching"], w.pool_block]
-        at.launch(self.kernels.diagonal_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
-
     def book(self, at: At, accepted: wp.array) -> wp.array:
         self._finish(at, accepted)
         at.scratch[self.name]["finished"] = True
@@ -369,40 +327,6 @@ class Pairs(Term):
         weights = np.concatenate([share.ravel() for share in self.tables.shares])
         return {"contact_pairs": at.scratch[self.name]["history"].stored.numpy() @ weights}
 
-    # in a linear solve
-
-    def keep(self, at: At) -> list[tuple[str, wp.array]]:
-        s = at.scratch[self.name]
-        t = s["touching"]
-        arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight}
-        return [("stiffness", s["attempt"].stiffness), *arrays.items()]
-
-    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
-        if "pair blocks" not in self.model.cache:
-            conns = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
-            self.model.cache["pair blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
-
-    def blocks(
-        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
-        *, projected: bool,
-    ) -> None:  # fmt: skip
-        """The points' stiffness on their own facets and on master facets; not what couples both."""
-        m, t = self.model, self.tables
-        stiffness, points, start, entry, weight = kept
-        *slaves, masters = m.cache["pair blocks"]
-        add = contact_block_kernels(m.dtype).add_contact
-        for group, (index, begin, source, count) in zip(t.groups, slaves):
-            args = [m.topology, matrix.pattern.data, group.data, index, begin, source, stiffness, weight]
-            at.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
-        index, begin, source, count = masters
-        args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, points, start, entry]
-        add = pair_block_kernels(m.dtype).add_masters
-        at.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
-
-    def block_modules(self) -> set[wp.Module]:
-        dtype = self.model.dtype
-        return {contact_block_kernels(dtype).module, pair_block_kernels(dtype).module}
-
     # results
 
     def explain(self, at: At, world: int) -> tuple[type[PenetrationError], str] | None:
@@ -411,10 +335,10 @@ class Pairs(Term):
             return None
         t = self.tables
         k = int(np.searchsorted(t.first, found - 1, side="right")) - 1
-        contact = t.contacts[k]
+        contact, where = t.contacts[k], reference_place(t, k, found - 1 - int(t.first[k]))
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.slave.body.name!r} (reference place "
-            f"{self._where(k, found - 1 - int(t.first[k]))}) went through body {contact.master.body.name!r}; take a "
+            f"{where}) went through body {contact.master.body.name!r}; take a "
             "smaller dt, a larger stiffness= of the contact, or a thicker body"
         )
 
@@ -437,3 +361,14 @@ class Pairs(Term):
             numbers = {"points": int((t.shares[k] > 0.0).sum()), "facets": len(t.masters[t.of[k]].conn), "left_out": 0}
             out.append(names | {"law": contact.law, "model": contact.model} | numbers)
         return out
+
+    # at a state
+
+    def nodal_force(self, state: State) -> np.ndarray:
+        """Elastic forces of all contacts on slots of both bodies, (worlds, slots, 3), N, at a state."""
+        return survey(self, state).nodal_force()
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        bodies = [side.body for contact in self.tables.contacts for side in (contact.slave, contact.master)]
+        patches = survey(self, state).patches(body) if body in bodies else []
+        return contact_field(field, body, state.worlds, patches)

@@ -96,10 +96,18 @@ class Column:
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """A scalar field at nodes that users may ask for: title and units."""
+    """A scalar field at nodes that users may ask for.
+
+    Attributes:
+        title, units: of legends.
+        join: what becomes of the samples of two terms that have this very field; None: it is one term's alone.
+        at_node: what becomes of the samples of a node, where terms override `samples` alone; None: they have `sample`.
+    """
 
     title: str
     units: str
+    join: np.ufunc | None = None
+    at_node: np.ufunc | None = None
 
 
 @dataclass(eq=False)
@@ -328,6 +336,17 @@ class Term:
         """Modules that `blocks` launches."""
         return ()
 
+    def couples(self) -> list[tuple[int, int]]:
+        """Numbers of two bodies each that its tangent couples, but `blocks` does not: the rest is for `couple`."""
+        return []
+
+    def reserve_motions(self, at: At, motions: Any) -> Iterable[wp.Module]:
+        """Make what `couple` needs, before launches are recorded; the modules that it launches."""
+        return ()
+
+    def couple(self, at: At, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        """Put what couples bodies into the matrix of the rigid motions of `reserve_motions` (solvers/motions.py)."""
+
     def preconditions(self, at: At) -> bool:
         """Whether `precondition` has something to add."""
         return False
@@ -352,7 +371,7 @@ class Term:
         return {}
 
     def sample(self, field: str, body: Any, state: State) -> np.ndarray:
-        """(worlds, nodes of the body's mesh) values of one of `fields`."""
+        """(worlds, nodes of the body's mesh) values of one of `fields` without `at_node`."""
         raise NotImplementedError
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray | None:

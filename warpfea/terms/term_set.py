@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -213,9 +214,29 @@ class TermSet:
         return {name: text for term in self.all for name, text in term.parts.items()}
 
     @property
-    def fields(self) -> dict[str, tuple[Term, FieldSpec]]:
+    def fields(self) -> dict[str, FieldSpec]:
         """Fields that users may ask for beside those of the elements."""
-        return {name: (term, spec) for term in self.all for name, spec in term.fields.items()}
+        return {name: spec for term in self.all for name, spec in term.fields.items()}
+
+    def samples(self, name: str, body: Any, state: State) -> np.ndarray | None:
+        """(worlds, nodes x samples) values of a field; None of a term that has values of nodes alone."""
+        owners = [term for term in self.all if name in term.fields]
+        found = [term.samples(name, body, state) for term in owners]
+        join = self.fields[name].join
+        return functools.reduce(join, found) if join else found[0]  # type: ignore[arg-type]
+
+    def sample(self, name: str, body: Any, state: State) -> np.ndarray:
+        """(worlds, nodes) values of a field. ModelError where a term gives another shape."""
+        spec, shape = self.fields[name], (self.model.worlds, len(body.mesh.points))
+        if spec.at_node:
+            values = self.samples(name, body, state)
+            assert values is not None
+            return np.asarray(spec.at_node.reduce(values.reshape(*shape, -1), axis=2))
+        term = next(term for term in self.all if name in term.fields)
+        out = np.asarray(term.sample(name, body, state))
+        if out.shape != shape:
+            raise ModelError(f"term {term.name!r}: sample({name!r}) gave {out.shape}; expected {shape}")
+        return out
 
     # what users set and ask for
 

@@ -23,7 +23,7 @@ from .settings import Setting
 __all__ = ["DONE", "FAILED", "LONG", "REFUSED", "Outcome", "measure"]
 
 DONE, FAILED, LONG, REFUSED = "done", "failed", "too long", "refused"
-HELD = ("kinetic", "strain", "contact")
+HELD = ("kinetic", "strain", "contact", "contact_pairs")
 CHANGES = ("potential", "work", "viscous", "contact_loss", "friction", "collider_work")
 """Columns of the energy ledger that say how much energy there is to exchange: their size, or their change."""
 

@@ -3,7 +3,7 @@
 Sizes are numbers of unknowns, met as closely as the problem allows. The error of the tip is measured against the same
 mesh and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
 The other kinds of measurement are in files of their own: peer.py, growth.py, product.py, cpu.py, scenes.py,
-contact.py, price.py.
+contact.py, price.py, pairs.py.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from .contact import contact
 from .cpu import cpu
 from .growth import growth
 from .measure import TIGHTER, WARM_UP, Row, check_sizes, measure, write
+from .pairs import pairs
 from .peer import peer
 from .price import price
 from .problems import PROBLEMS
@@ -36,6 +37,7 @@ OPTIONS = {
     "scenes": {"rows", "before"},
     "contact": {"unknowns", "dtype", "steps", "repeat", "tol"},
     "price": {"rows", "steps", "repeat"},
+    "pairs": {"rows", "dtype", "steps"},
 }
 """Options of each kind of measurement, besides those of all."""
 
@@ -54,7 +56,7 @@ def bench(options: argparse.Namespace) -> None:
         check_target(options.out, (".json",))
     do = {
         "table": table, "peer": peer, "growth": growth, "product": product, "cpu": cpu, "scenes": scenes,
-        "contact": contact, "price": price,
+        "contact": contact, "price": price, "pairs": pairs,
     }  # fmt: skip
     with quiet_warp():
         do[kind](options)

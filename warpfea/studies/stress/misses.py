@@ -17,7 +17,6 @@ MISSES: dict[tuple[str, str, str], str] = {
     ("soft-thin-limbs", "float32", ""): "refused by name: float32 can't hold it",
     ("thin-static/T10-500", "float32", "cuda"): _THIN,
     ("contact-graze/1e-12", "float64", ""): "a touch within rounding takes up to 150 iterations and halvings",
-    ("contact-rest/10000-1e-05", "float32", "cuda"): "impulse 1.8 % off in the table of the H200, made before its cure",
 }
 """Reasons by row, precision and kind of device ("": any)."""
 

@@ -1,4 +1,4 @@
-"""Five small motions that step sizes are adapted to, each with its time scale."""
+"""Six small motions that step sizes are adapted to, each with its time scale."""
 
 from __future__ import annotations
 
@@ -70,17 +70,31 @@ def free_flight() -> tuple[wf.ModelBuilder, float]:
 
 
 def contact() -> tuple[wf.ModelBuilder, float]:
-    """A ball falls on a floor and comes up again."""
-    b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
-    radius, drop = 0.05, 0.01
-    mesh = wf.mesh.sphere(radius, cells=2, center=(0.0, 0.0, drop + radius))
-    ball = b.add_solid(mesh, material=wf.SVK(E=1e8, nu=0.3, density=1100.0))
-    floor = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)))
-    b.add_contact(ball, floor, model="sphere", radius=radius, restitution=1.0, stiffness=0.002)
+    """A hard damped ball that turns falls on a floor, touches it for a hundredth of the run, and comes up again."""
+    hard = wf.SVK(E=1e10, nu=0.3, density=1100.0, damping=wf.KelvinVoigt(eta=1e5, lambda_v=1e5))
+    b, ball = _ball(hard, stiffness=0.2)
+    b.set_initial(ball, angular_velocity=(0.0, 10.0, 0.0))
     return b, 0.08
 
 
+def soft_contact() -> tuple[wf.ModelBuilder, float]:
+    """A ball falls on a soft floor, stays in it for two fifths of the run, and comes up again."""
+    b, _ = _ball(wf.SVK(E=1e8, nu=0.3, density=1100.0), stiffness=0.002)
+    return b, 0.08
+
+
+def _ball(material: wf.SVK, *, stiffness: float) -> tuple[wf.ModelBuilder, wf.Body]:
+    """A ball 1 cm above a floor, with the stiffness of the contact over Hertz's."""
+    b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    radius, drop = 0.05, 0.01
+    mesh = wf.mesh.sphere(radius, cells=2, center=(0.0, 0.0, drop + radius))
+    ball = b.add_solid(mesh, material=material)
+    floor = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)))
+    b.add_contact(ball, floor, model="sphere", radius=radius, restitution=1.0, stiffness=stiffness)
+    return b, ball
+
+
 CASES: dict[str, Callable[[], tuple[wf.ModelBuilder, float]]] = {
-    f.__name__: f for f in (stiff, impact, dead_points, free_flight, contact)
+    f.__name__: f for f in (stiff, impact, dead_points, free_flight, contact, soft_contact)
 }
 """Name -> function that gives a scene and its end, s."""

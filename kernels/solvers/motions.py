@@ -1,0 +1,208 @@
+"""Rigid motions of bodies that terms couple: the matrix R^T H R, and the restriction and prolongation of its solutions.
+
+A preconditioner made of the bodies' own blocks takes each body that touches another for one on springs. Chains of
+them that move together are then far too stiff, the more the longer they are, and their motions as rigid bodies at the
+place that the preconditioner is made at correct that: z += R (R^T H R)^-1 R^T r, with what couples bodies in R^T H R.
+
+An unknown of a body is a translation along or a turn about an axis through its centre, over its size; a slot moves by
+t + w x a with a = (x - c)/size, a gradient by w x g/size. Motions that a support resists are left out.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.structs import pattern_struct
+from ..common.types import SMALL, kernel_module, precision
+
+__all__ = ["MOTIONS", "bodies_struct", "motion_functions", "motion_kernels"]
+
+MOTIONS = 6
+"""Of a body: three translations, three turns."""
+
+
+@functools.cache
+def bodies_struct(dtype: str):
+    """The bodies whose motions these are, and where their slots are."""
+    T = precision(dtype).T
+
+    @wp.struct
+    class Bodies:
+        first: wp.array(dtype=wp.int32)  # [body] first slot
+        last: wp.array(dtype=wp.int32)  # the slot after its last one
+        size: wp.array(dtype=wp.float64)  # m
+        move: wp.array(dtype=wp.vec3d)  # 1 for translations that nothing prescribes
+        turn: wp.array(dtype=wp.vec3d)  # 1 for turns, or 0
+        sample: wp.array2d(dtype=wp.int32)  # [place, body] slots whose mean is the centre
+        of_slot: wp.array(dtype=wp.int32)  # [slot] body or -1
+        is_place: wp.array(dtype=T)  # [slot] 1, or 0 of a gradient
+        X: wp.array(dtype=wp.vec3d)  # [slot] reference place, m, or gradient
+        arm: wp.array2d(dtype=wp.vec3d)  # [world, slot] a
+
+    return Bodies
+
+
+@functools.cache
+def motion_functions(dtype: str) -> _types.SimpleNamespace:
+    """Device functions that terms make their parts of the matrix with."""
+    mat33d = wp.mat33d
+    Bodies = bodies_struct(dtype)
+
+    @wp.func
+    def moves(bodies: Bodies, body: int, slot: int) -> mat33d:
+        """How a slot moves with the translations of its body: the columns."""
+        return wp.float64(bodies.is_place[slot]) * wp.diag(bodies.move[body])
+
+    @wp.func
+    def turns(bodies: Bodies, world: int, body: int, slot: int) -> mat33d:
+        """And with its turns: the columns e_k x a."""
+        return -wp.skew(bodies.arm[world, slot]) @ wp.diag(bodies.turn[body])
+
+    return _types.SimpleNamespace(moves=moves, turns=turns)
+
+
+@functools.cache
+def motion_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the slots."""
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
+    Bodies, Pattern = bodies_struct(dtype), pattern_struct()
+    rigid = motion_functions(dtype)
+    moves, turns = rigid.moves, rigid.turns
+    EPS = {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]
+    module = kernel_module(f"motions_{dtype}", max_unroll=SMALL)
+
+    @wp.kernel(module=module)
+    def arms(
+        bodies: Bodies, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)
+    ):  # fmt: skip
+        """a of each slot at displacements u."""
+        world, slot = wp.tid()
+        body = bodies.of_slot[slot]
+        if active[world] == 0 or body < 0:
+            return
+        c = vec3d()
+        count = bodies.sample.shape[0]
+        for k in range(count):
+            at = bodies.sample[k, body]
+            c += bodies.X[at] + vec3d(u[world, at])
+        x = bodies.X[slot] + vec3d(u[world, slot]) - (f64(bodies.is_place[slot]) / f64(count)) * c
+        bodies.arm[world, slot] = x / bodies.size[body]
+
+    @wp.kernel(module=module)
+    def own_parts(
+        bodies: Bodies, pattern: Pattern, free: wp.array(dtype=vec3), value: wp.array2d(dtype=mat33),
+        active: wp.array(dtype=wp.int32), lanes: int, parts: wp.array4d(dtype=mat33d),
+    ):  # fmt: skip
+        """R^T H R of each body by itself, H its own blocks `value`: a lane's sum over slots, [world, body, lane].
+
+        Translations with translations, turns with translations, turns with turns. What rounding of H may take is
+        added to the diagonal.
+        """
+        world, body, lane = wp.tid()
+        if active[world] == 0:
+            return
+        mm = mat33d()
+        tm = mat33d()
+        tt = mat33d()
+        slot = bodies.first[body] + lane
+        while slot < bodies.last[body]:
+            move = mat33d()
+            turn = mat33d()
+            own_move = moves(bodies, body, slot)
+            own_turn = turns(bodies, world, body, slot)
+            own_free = wp.diag(vec3d(free[slot]))
+            for k in range(pattern.start[slot], pattern.start[slot + 1]):
+                other = pattern.column[k]
+                A = own_free @ mat33d(value[world, k]) @ wp.diag(vec3d(free[other]))
+                move += A @ moves(bodies, body, other)
+                turn += A @ turns(bodies, world, body, other)
+                if other == slot:
+                    move += f64(EPS) * wp.diag(wp.get_diag(A)) @ own_move
+                    turn += f64(EPS) * wp.diag(wp.get_diag(A)) @ own_turn
+            mm += wp.transpose(own_move) @ move
+            tm += wp.transpose(own_turn) @ move
+            tt += wp.transpose(own_turn) @ turn
+            slot += lanes
+        parts[world, body, lane, 0] = mm
+        parts[world, body, lane, 1] = tm
+        parts[world, body, lane, 2] = tt
+
+    @wp.kernel(module=module)
+    def fill(
+        active: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=mat33d), scale: wp.array2d(dtype=T),
+        matrix: wp.array3d(dtype=T),
+    ):  # fmt: skip
+        """The matrix of the bodies by themselves, and its diagonal; rows beyond the bodies are zero."""
+        world, row = wp.tid()
+        if active[world] == 0:
+            return
+        for j in range(matrix.shape[2]):
+            matrix[world, row, j] = T(0.0)
+        scale[world, row] = T(0.0)
+        body = row / MOTIONS
+        if body >= parts.shape[1]:
+            return
+        a = row % 3
+        turn = (row / 3) % 2
+        low = vec3d()
+        high = vec3d()
+        for lane in range(parts.shape[2]):
+            tm = parts[world, body, lane, 1]
+            if turn == 0:
+                low += parts[world, body, lane, 0][a]
+                high += wp.transpose(tm)[a]
+            else:
+                low += tm[a]
+                high += parts[world, body, lane, 2][a]
+        for j in range(3):
+            matrix[world, row, MOTIONS * body + j] = T(low[j])
+            matrix[world, row, MOTIONS * body + 3 + j] = T(high[j])
+        scale[world, row] = T(wp.where(turn == 0, low[a], high[a]))
+
+    @wp.kernel(module=module)
+    def restrict(
+        bodies: Bodies, r: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=T)
+    ):  # fmt: skip
+        """R^T r; a block of threads per body. r is zero where a component is prescribed."""
+        world, body, thread = wp.tid()
+        if active[world] == 0:
+            return
+        move = vec3d()
+        turn = vec3d()
+        slot = bodies.first[body] + thread
+        while slot < bodies.last[body]:
+            x = vec3d(r[world, slot])
+            move += f64(bodies.is_place[slot]) * x
+            turn += wp.cross(bodies.arm[world, slot], x)
+            slot += wp.block_dim()
+        for k in range(3):
+            s = wp.tile_extract(wp.tile_sum(wp.tile(move[k])), 0)
+            w = wp.tile_extract(wp.tile_sum(wp.tile(turn[k])), 0)
+            if thread == 0:
+                out[world, MOTIONS * body + k] = T(s * bodies.move[body][k])
+                out[world, MOTIONS * body + 3 + k] = T(w * bodies.turn[body][k])
+
+    @wp.kernel(module=module)
+    def prolong(
+        bodies: Bodies, x: wp.array2d(dtype=T), free: wp.array(dtype=vec3), active: wp.array(dtype=wp.int32),
+        z: wp.array2d(dtype=vec3),
+    ):  # fmt: skip
+        """z += R x on free components."""
+        world, slot = wp.tid()
+        body = bodies.of_slot[slot]
+        if active[world] == 0 or body < 0:
+            return
+        move = vec3d()
+        turn = vec3d()
+        for k in range(3):
+            move[k] = f64(x[world, MOTIONS * body + k]) * bodies.move[body][k]
+            turn[k] = f64(x[world, MOTIONS * body + 3 + k]) * bodies.turn[body][k]
+        s = f64(bodies.is_place[slot]) * move + wp.cross(turn, bodies.arm[world, slot])
+        z[world, slot] = z[world, slot] + wp.cw_mul(vec3(s), free[slot])
+
+    return _types.SimpleNamespace(
+        module=module, arms=arms, own_parts=own_parts, fill=fill, restrict=restrict, prolong=prolong
+    )

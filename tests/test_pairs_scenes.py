@@ -1,0 +1,100 @@
+"""Scenes of contact between bodies: they run without a refused step, and do what mechanics says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import warpfea as wf
+from warpfea.builder.scene import find
+
+G = 9.81
+
+
+def simulate(name, t_end=None, **parameters):
+    """A scene at its own settings until t_end, with every step converged and its ledger closed; and its model."""
+    scene = find(name)
+    model = scene(**parameters).finalize(device="cpu")
+    sim = wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, solver=wf.NewtonPCG(tol=scene.tol))
+    for _ in range(round((t_end or scene.t_end) / scene.dt)):
+        assert sim.step().converged.all()
+    e = sim.energies()
+    scale = max(abs(e[name][0]) for name in ("kinetic", "potential", "contact_loss", "work"))
+    assert abs(e["ledger_residual"][0]) < 10.0 * scene.tol * scale
+    return sim, model
+
+
+def test_every_joint_of_a_stack_carries_what_is_above_it():
+    sim, model = simulate("block_stack")
+    blocks, weight = 4, 1000.0 * 0.1**3 * G
+    for k in range(blocks):
+        force = sim.contact_record(f"joint {k + 1}").force[0]
+        assert force[-20:, 2].mean() == pytest.approx((blocks - k) * weight, rel=5e-3)
+        assert np.abs(force[-1, :2]).max() < 2e-3 * force[-1, 2]
+    top = sim.probe("top").displacement[0]
+    assert np.abs(top[-1, :2]).max() < 1e-5
+    assert np.ptp(top[-20:, 2]) < 1e-5
+
+
+def test_ball_bends_the_plate_and_comes_up_again():
+    sim, model = simulate("ball_on_plate", t_end=0.24)
+    ball, plate = (sim.probe(name).displacement[0] for name in ("ball", "plate"))
+    drop = 0.03
+    low = int(np.argmin(ball[:, 2]))
+    assert -drop - 0.03 < ball[low, 2] < -drop - 0.005
+    assert plate[:, 2].min() < -2e-3
+    assert 0.2 * drop < ball[low:, 2].max() - (-drop) < drop  # of its height something, and no more than that
+    record = sim.contact_record("impact")
+    assert (record.normal_force[0] >= 0.0).all()
+    # the impulse of the plate turns the ball round
+    impulse = 2e-3 * (record.force[0] @ np.array((0, 0, 1))).cumsum()
+    mass = model.lumped_host[model.bodies[1].slots].sum()
+    momentum = model.lumped_host[model.bodies[1].slots] @ sim.state.velocity.numpy()[0, model.bodies[1].slots]
+    assert momentum[2] == pytest.approx(impulse[-1] - mass * G * 0.24, abs=1e-4)
+
+
+def test_arch_stands_with_enough_friction():
+    sim, model = simulate("arch")
+    weight = 0.5 * model.mass * G
+    feet = [sim.contact_record(name).force[0, -1] for name in ("left foot", "right foot")]
+    for foot in feet:
+        assert foot[2] == pytest.approx(weight, rel=2e-3)
+    assert feet[0][0] == pytest.approx(-feet[1][0], rel=1e-3)
+    assert 0.1 < feet[0][0] / feet[0][2] < 0.6  # the thrust stays within the friction
+    assert abs(sim.probe("crown").displacement[0, -1, 2]) < 3e-3
+    assert np.abs(sim.probe("crown").velocity[0, -1]).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_arch_falls_with_too_little_friction():
+    sim, _ = simulate("arch", t_end=0.8, mu=0.25)
+    assert sim.probe("crown").displacement[0, -1, 2] < -0.2
+
+
+@pytest.mark.slow
+def test_driver_turns_the_wheel_the_other_way():
+    sim, _ = simulate("gears")
+    turned = [sim.joint_value(f"{name} axle")[0] for name in ("driver", "wheel")]
+    assert turned[0] == pytest.approx(8.0 * (0.3 - 0.05), rel=1e-3)
+    # the wheel may run ahead or lag by the play of its teeth, less than half of their pitch
+    assert turned[1] == pytest.approx(-turned[0], abs=math.pi / 6)
+    assert sim.contact_record("mesh").normal_force.max() > 10.0
+
+
+def test_finger_pushes_the_beam_off_the_shell():
+    sim, _ = simulate("finger_beam_shell")
+    probe, table, push = sim.probe("beam"), sim.contact_record("table"), sim.contact_record("push")
+    beam, weight = probe.displacement[0], 1000.0 * 0.02**2 * 0.12 * G
+    resting = (probe.time > 0.05) & (probe.time < 0.13)
+    assert table.force[0, resting, 2].mean() == pytest.approx(weight, rel=0.05)
+    pushed = push.normal_force[0] > 0.0
+    assert pushed.sum() > 20
+    assert push.force[0, pushed, 0].max() <= 0.0  # on the finger
+    assert sim.probe("fingertip").displacement[0, :, 0].max() < 0.08
+    slides = (probe.time > 0.16) & (probe.time < 0.24)
+    assert -table.force[0, slides, 0] == pytest.approx(0.3 * table.normal_force[0, slides], rel=0.15)
+    assert beam[-1, 0] > 0.05 - 0.02 + 0.01  # past the edge, and it falls freely
+    assert table.normal_force[0, -10:].max() == push.normal_force[0, -10:].max() == 0.0
+    assert (probe.velocity[0, -1, 2] - probe.velocity[0, -11, 2]) / 0.04 == pytest.approx(-G, rel=0.02)

@@ -1,0 +1,130 @@
+"""A coarse space of the rigid motions of bodies that terms couple, see kernels/solvers/motions.py."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.solvers.motions import MOTIONS, bodies_struct, motion_kernels
+from .dense import DenseInverse
+from .levels import BOTTOM_SLOTS
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
+    from .assembled import Pattern
+    from .residual import Residual
+
+__all__ = ["Motions", "lanes_for", "motion_bodies"]
+
+SAMPLES = 16
+"""Slots whose mean is the centre of a body."""
+MOST_LANES, SHARE = 128, 16
+"""Most partial sums of a sum, and numbers in each that make more of them worth while."""
+
+
+def lanes_for(count: int) -> int:
+    """Partial sums for so many numbers: a power of two that does not depend on the number of worlds."""
+    return int(min(MOST_LANES, 1 << max(0, (max(count, 1) - 1) // SHARE).bit_length()))
+
+
+def motion_bodies(model: Model) -> dict[int, int]:
+    """Bodies that a term couples to another one free to move as a whole: their numbers among the motions.
+
+    Bodies without a free motion are left out, and so are all where their matrix would be too large to invert.
+    """
+    free = [bool(allowed.any()) for allowed in map(_allowed, [model] * len(model.bodies), range(len(model.bodies)))]
+    pairs = [(a, b) for term in model.terms for a, b in term.couples() if a != b and free[a] and free[b]]
+    chosen = sorted({body for pair in pairs for body in pair})
+    most = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
+    return {body: k for k, body in enumerate(chosen)} if 2 * len(chosen) <= most else {}
+
+
+def _allowed(model: Model, body: int) -> np.ndarray:
+    """(6,) translations that nothing prescribes, and turns where nothing at all is."""
+    b = model.bodies[body]
+    free = model.free_host[b.slot_offset : b.slot_offset + b.slot_count]
+    return np.concatenate([free.min(axis=0), np.full(3, free.min())])
+
+
+class Motions:
+    """The motions of `motion_bodies`, their matrix, and its inverse.
+
+    Attributes:
+        bodies: device struct. number: of a body of the model among them.
+        dense: the inverse; a term's `couple` adds to its `matrix`.
+    """
+
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual, pattern: Pattern) -> None:
+        self.model, self.launch, self.residual, self.pattern = model, launch, residual, pattern
+        self.kernels = motion_kernels(model.dtype)
+        self.number = motion_bodies(model)
+        n, B, T = len(self.number), model.worlds, model.types.T
+        self.bodies = self._bodies()
+        self.bodies.arm = work.array("motions arm", (B, model.slots), wp.vec3d)
+        most = max(model.bodies[k].slot_count for k in self.number)
+        self.parts = work.array("motions parts", (B, n, lanes_for(most), 3), wp.mat33d)
+        self.dense = DenseInverse(model, work, launch, "motions", MOTIONS * n)
+        self.r, self.x = (work.array(f"motions {name}", (B, MOTIONS * n), T) for name in "rx")
+
+    def _bodies(self) -> Any:
+        m, chosen = self.model, [self.model.bodies[k] for k in self.number]
+        of_slot = np.full(m.slots, -1)
+        place = m.slot_kind == 0
+        X = np.array(m.reference, dtype=float)
+        sample, size = [], []
+        for k, body in enumerate(chosen):
+            own = slice(body.slot_offset, body.slot_offset + body.slot_count)
+            of_slot[own] = k
+            X[own] += np.asarray(body.origin) * place[own, None]
+            at = body.slot_offset + np.flatnonzero(place[own])
+            sample.append(at[np.linspace(0, len(at) - 1, SAMPLES).round().astype(int)])
+            size.append(float(np.ptp(X[at], axis=0).max()))
+        allowed = np.array([_allowed(m, k) for k in self.number])
+        out = bodies_struct(m.dtype)()
+        tables: dict[str, tuple[Any, Any]] = {
+            "first": ([body.slot_offset for body in chosen], wp.int32),
+            "last": ([body.slot_offset + body.slot_count for body in chosen], wp.int32),
+            "size": (size, wp.float64),
+            "move": (allowed[:, :3], wp.vec3d),
+            "turn": (allowed[:, 3:], wp.vec3d),
+            "sample": (np.array(sample).T, wp.int32),
+            "of_slot": (of_slot, wp.int32),
+            "is_place": (place, m.types.T),
+            "X": (X, wp.vec3d),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(out, name, m.array("motions", np.ascontiguousarray(values), dtype))
+        return out
+
+    def lanes(self, count: int) -> int:
+        """Partial sums for so many numbers."""
+        return lanes_for(count)
+
+    def modules(self) -> set[wp.Module]:
+        """Modules that it launches."""
+        return {self.kernels.module, self.dense.making.module, self.dense.kernels.module}
+
+    def begin(self, u: wp.array, value: wp.array, flags: wp.array) -> None:
+        """The matrix of the bodies by themselves at displacements u; `value`: H without what couples them."""
+        m, k, dense = self.model, self.kernels, self.dense
+        self.launch(k.arms, (m.worlds, m.slots), [self.bodies, u, flags])
+        lanes = self.parts.shape[2]
+        args = [self.bodies, self.pattern.data, m.topology.free, value, flags, lanes, self.parts]
+        self.launch(k.own_parts, self.parts.shape[:3], args)
+        self.launch(k.fill, (m.worlds, dense.size), [flags, self.parts, dense.scale, dense.matrix])
+
+    def end(self, flags: wp.array) -> None:
+        """Invert it, once terms have added to it."""
+        self.dense.invert(flags, keep=False, reduce=self.residual.reduce)
+
+    def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
+        """z += R (R^T H R)^-1 R^T r."""
+        m, k, launch = self.model, self.kernels, self.launch
+        args = [self.bodies, r, active, self.r]
+        launch.tiled(k.restrict, (m.worlds, len(self.number)), args)
+        self.dense.apply(self.r, self.x, active)
+        launch(k.prolong, (m.worlds, m.slots), [self.bodies, self.x, m.topology.free, active, z])

@@ -1,0 +1,123 @@
+"""Contact between bodies at a state, whatever simulation it is of: gaps, elastic forces, places on both bodies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.launch import Launcher
+from ..kernels.terms.contact_data import attempt_struct
+from ..kernels.terms.pair_data import touching_struct
+from ..kernels.terms.pair_survey import survey_kernels
+from ..model.pairs import exponents
+from ..model.state import State
+from .contact_fields import Patch, nearest_samples, nodal_force
+
+if TYPE_CHECKING:
+    from .pair_tables import PairTables
+    from .pairs import Pairs
+
+__all__ = ["Survey", "survey"]
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """All points of slave surfaces at a state, [world, point].
+
+    Attributes:
+        gap: m, 1e30 of points with no facet near. normal: elastic normal force, N. force: on the slave, N, (..., 3).
+        facet: of the master surfaces, -1: none. spot: coordinates there. weight: (..., L) of the facet's slots.
+    """
+
+    tables: PairTables
+    gap: np.ndarray
+    normal: np.ndarray
+    force: np.ndarray
+    facet: np.ndarray
+    spot: np.ndarray
+    weight: np.ndarray
+
+    def nodal_force(self) -> np.ndarray:
+        """Forces on slots of both bodies (worlds, slots, 3), N."""
+        t = self.tables
+        out = nodal_force(t, self.force)
+        for world, point in zip(*np.nonzero(self.force.any(axis=2))):
+            slots = t.master_conn[self.facet[world, point]]
+            np.add.at(out[world], slots, -np.outer(self.weight[world, point], self.force[world, point]))
+        return out
+
+    def patches(self, body: Any) -> list[Patch]:
+        """The points that count on a body, as slave or as master."""
+        t, out = self.tables, []
+        for k, contact in enumerate(t.contacts):
+            points = slice(t.first[k], t.first[k + 1])
+            gap, normal, area = self.gap[:, points], self.normal[:, points], t.host[k].area.ravel()
+            if contact.slave.body is body:
+                nearest = np.broadcast_to(nearest_samples(t, k, contact.slave.body), gap.shape)
+                out.append(Patch(nearest, np.broadcast_to(area, gap.shape), normal, gap))
+            if contact.master.body is body:
+                X = self._places(points)
+                nearest = np.full(gap.shape, -1)
+                seated = self.facet[:, points] >= 0
+                nearest[seated] = nearest_samples(t, k, contact.master.body, X[seated])
+                # of the master the area that is pressed: what lies beside the slave is no part of it
+                out.append(Patch(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
+        return out
+
+    def _places(self, points: slice) -> np.ndarray:
+        """(worlds, points, 3) reference places on master facets, m."""
+        t = self.tables
+        facet, spot = self.facet[:, points], self.spot[:, points]
+        out = np.zeros((*facet.shape, 3))
+        first = 0
+        for mas in t.masters:
+            mine = (facet >= first) & (facet < first + len(mas.conn))
+            power = exponents(mas.corners, mas.degree)
+            value = np.prod(spot[mine][:, None, :2] ** power, axis=2)
+            out[mine] = np.einsum("pm,pmk->pk", value, mas.X[facet[mine] - first])
+            first += len(mas.conn)
+        return out
+
+
+def survey(term: Pairs, state: State) -> Survey:
+    """Look at all points of a state; springs of friction are those that it knows."""
+    m, t, B = term.model, term.tables, state.worlds
+    launch = Launcher(m.device)
+
+    def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=m.device)
+
+    def take(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+        return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
+
+    history, seats = term.history_of(take)
+    every = wp.ones(B, dtype=wp.int32, device=m.device)
+    u = state.displacement
+    if term.exact:
+        u = zeros(u.shape, wp.vec3d)
+        term.exact.widen(launch, state.displacement, every, u)
+    touching = touching_struct(m.dtype)()
+    masters = t.masters_of(wp.uint64(0))
+    for name, shape, dtype in (
+        ("C", (B, t.facets * masters.most), wp.vec3d), ("D", (B, t.facets * masters.most), wp.vec3d),
+        ("lower", (B * t.facets,), wp.vec3), ("upper", (B * t.facets,), wp.vec3),
+        ("wanted_lower", (B * t.facets,), wp.vec3), ("wanted_upper", (B * t.facets,), wp.vec3),
+        ("stale", (1,), wp.int32),
+    ):  # fmt: skip
+        setattr(touching, name, zeros(shape, dtype))
+    touching.C0 = touching.C
+    launch(term.seek.controls, (B, t.facets, masters.most), [masters, u, every, touching.C, touching.D])
+    launch(term.seek.check_boxes, (B, t.facets), [masters, every, touching])
+    tree = wp.Bvh(touching.wanted_lower, touching.wanted_upper, groups=t.box_groups)
+    P, L = t.points, t.master_conn.shape[1]
+    gap, normal, facet = zeros((B, P), wp.float64), zeros((B, P), wp.float64), zeros((B, P), wp.int32)
+    force, spot, weight = zeros((B, P), wp.vec3d), zeros((B, P), wp.vec3d), zeros((B, P, L), wp.float64)
+    found = [gap, normal, force, facet, spot, weight]
+    for group in t.groups:
+        args = [t.data, t.masters_of(tree.id), group.data, history, seats, state.time, u, t.far]
+        args += [attempt_struct(m.dtype)(), touching, *found]
+        launch(survey_kernels(m.dtype).survey, (B, group.count, group.data.points), args)
+    return Survey(t, *(array.numpy() for array in (gap, normal, force, facet, spot, weight)))
