@@ -344,6 +344,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         pad = wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)
         anchored = t.first[world, point] > 0
+        if settling != 0:  # what lies before one face of a body is beside another
+            off = f64(0.0)
         if anchored:
             f = t.first[world, point] - 1
             from0 = t.spot0[world, point]
