@@ -6,7 +6,7 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=2e-3, t_end=0.3, tol=1e-6, fps=100.0, speed=0.25, picture=0.13)
+@scene(dt=2e-3, t_end=0.3, tol=1e-6, fps=100.0, speed=0.25, picture=0.11)
 def ball_on_plate(
     *,
     radius: float = 0.05,

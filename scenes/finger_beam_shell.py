@@ -6,7 +6,7 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=4e-3, t_end=0.44, tol=1e-6, fps=100.0, speed=0.25, picture=0.3)
+@scene(dt=4e-3, t_end=0.44, tol=1e-6, fps=100.0, speed=0.25, picture=0.22)
 def finger_beam_shell(
     *,
     travel: float = 0.08,

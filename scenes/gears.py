@@ -11,7 +11,7 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=2e-3, t_end=0.3, tol=1e-6, fps=100.0, speed=0.25, picture=0.2)
+@scene(dt=2e-3, t_end=0.3, tol=1e-6, fps=100.0, speed=0.25, picture=0.108)
 def gears(
     *,
     teeth: int = 6,

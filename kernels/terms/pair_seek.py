@@ -22,6 +22,8 @@ __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
 THROUGH = -2
 """Seat of a point that has left through another side."""
+TURNED = 0.1
+"""Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
 LOST = 0.25
 """A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
 MARGIN = 0.25
@@ -157,16 +159,16 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def anchor(
         mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock, at: Attempt, t: Touching,
-        v_n: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int, f: int, guess: vec3d,
+        v_n: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int, f: int, start: vec3d,
     ):  # fmt: skip
         """Measure the motion of a point from a facet: its place on it as the attempt began, depth and speed then."""
-        found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], guess)
+        found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], start)
         spot = vec3d(found[0], found[1], found[2])
         live = his.speed[world, point] > f64(0.0)
         if found[3] == f64(0.0):
             if not live:
                 return
-            spot = guess
+            spot = start
         s = jet(mas, t.C0, t.D0, world, f, spot)
         n = outward(s)
         t.first[world, point] = f + 1
@@ -391,7 +393,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     gap = spot[2] * wp.dot(n, s.c)
                     fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
                     if anchored:
-                        fits = fits and wp.dot(n, facing) > f64(0.0)
+                        fits = fits and wp.dot(n, facing) > f64(TURNED)
                     elif settling == 0:
                         foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
                         fits = fits and wp.dot(x0 - foot.x, outward(foot)) >= -left

@@ -23,7 +23,7 @@ def thickness_kernel() -> wp.Kernel:
     ):  # fmt: skip
         """Distance from x along -n to the other side of a closed mesh.
 
-        Of a curved face the triangle that stands for it may lie below x: a side that the ray comes in by does not count.
+        Of a curved face the triangle that stands for it may lie below x: a side that the ray comes in by is passed.
         """
         i = wp.tid()
         skip = float(1.0e-5)

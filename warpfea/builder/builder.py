@@ -25,7 +25,7 @@ from .attachments import Ground
 from .beams import beam_geometry
 from .bodies import MeshLike, as_mesh, make_solid, make_structure, unused_name
 from .checks import check_densities, gravity_of, owner_of, warn_implausible
-from .contacts import make_collider, make_contact, make_pair
+from .contacts import add_contact, make_collider
 from .joints import make_constraint, make_joint
 from .shells import shell_geometry
 from .supports import clamp_support, drive_supports
@@ -385,33 +385,28 @@ class ModelBuilder:
             model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
             radius: m; "patch": of the disc whose area counts instead of the surface's; "sphere": of the body there.
             offset: gap at which contact begins, m.
-            points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4.
+            points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4, between bodies 16.
             smoothing: "paper": depth over which its damping is ramped in, m; "smooth": (eps in N, v_eps in m/s).
             overlap: of bodies that overlap at the start: "refuse", or "offset": stored, it decays in `overlap_time`, s
                 (statics: part of the load).
             name: unique name; by default "BODY on COLLIDER".
 
+        Bodies that no contact names pass through each other. Between two, forces of reports are those on the first.
+
         Returns:
-            Contact: the handle for reports.
+            Contact, PairContact: the handle for reports.
 
         Raises:
             ModelError: a value out of range, an unknown name, no faces, or a handle of another builder.
-            NotImplementedError: a body with itself.
+            NotImplementedError: a body with itself, model = "sphere" or law = "smooth" between bodies.
         """
         self._own(surface, "add_contact", Body, SurfaceSet)
-        if collider is None:
-            raise NotImplementedError("add_contact: a body with itself is a later part; give a collider or a body")
+        if isinstance(collider, (Body, SurfaceSet)):
+            self._own(collider, "add_contact", Body, SurfaceSet)
         options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
                        stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
                        smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip
-        if isinstance(collider, (Body, SurfaceSet)):
-            self._own(collider, "add_contact", Body, SurfaceSet)
-            pair = make_pair(self.description, surface, collider, name, **options)
-            self.description.pairs.append(pair)
-            return pair
-        made = make_contact(self.description, surface, collider, name, **options)
-        self.description.contacts.append(made)
-        return made
+        return add_contact(self.description, surface, collider, name, **options)
 
     def finalize(self, *, device: Any = None, dtype: str = "float64", worlds: int = 1) -> Model:
         """Make the constant Model of what was described so far; what is added later is for the next `finalize`.

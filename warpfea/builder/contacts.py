@@ -71,6 +71,19 @@ def contact_surface(thing: Body | SurfaceSet) -> SurfaceSet:
     return surface
 
 
+def add_contact(
+    d: Description, thing: Body | SurfaceSet, other: Any, name: str | None, **options: Any
+) -> Contact | PairContact:  # fmt: skip
+    """Record a contact with a collider or another body; see ModelBuilder.add_contact."""
+    if other is None:
+        raise NotImplementedError("add_contact: a body with itself is a later part; give a collider or a body")
+    if isinstance(other, (Body, SurfaceSet)):
+        d.pairs.append(make_pair(d, thing, other, name, **options))
+        return d.pairs[-1]
+    d.contacts.append(make_contact(d, thing, other, name, **options))
+    return d.contacts[-1]
+
+
 def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: str | None, **options: Any) -> Contact:
     """See ModelBuilder.add_contact.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.errors import ModelError, PenetrationError
+from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
 from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
@@ -21,6 +21,7 @@ from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle
 from .contact_parameters import collider_parameters, contact_parameters
 from .contact_places import Places, at_points
 from .contact_sheets import refuse_across
+from .contact_starts import reference_place, store_overlaps, touching_depth
 from .contact_tables import ContactTables, block_entries
 from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, Term, part
 from .time_laws import TimeLaws
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
     from .workspace import Workspace
 
 __all__ = ["Contact"]
-
-TOUCHING = 1e-9
-"""Depth at the start, over the model's size, that counts as touch; roundings of displacements come on top."""
 
 
 class Contact(Term):
@@ -172,37 +170,16 @@ class Contact(Term):
         history.overlap.assign(overlap)
         history.born.assign(born)
         gap, _ = self.at_points(state, history, places=False)
-        u = state.displacement.numpy()
-        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2))
+        touching = touching_depth(self.model.size, state.displacement.numpy())
         if self.tables.sheets and new.any():
             refuse_across(self, s["attempt"], state.displacement, touching, new, at.launch)
-        for k, contact in enumerate(self.tables.contacts):
-            first, last = self.tables.first[k], self.tables.first[k + 1]
-            depth = np.where(new[:, None], -gap[:, first:last], 0.0)
-            deep = depth.max(axis=1) > touching
-            if not deep.any():
-                continue
-            if contact.overlap == "refuse":
-                world, point = np.unravel_index(int(depth.argmax()), depth.shape)
-                where = self.where(k, int(point))
-                raise ModelError(
-                    f"contact {contact.name!r}: body {contact.body.name!r} begins {depth.max():.3g} m inside collider "
-                    f"{contact.collider.name!r} (world {world}, reference point {where}); move one of them, or take "
-                    "overlap='offset', which stores the overlap and lets it decay"
-                )
-            depth = np.maximum(depth[deep], 0.0)
-            overlap[deep, first:last] = depth.max(axis=1, keepdims=True) if contact.model == "sphere" else depth
+        store_overlaps(self.tables, np.where(new[:, None], -gap, 0.0), touching, overlap)
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
         """Stored overlaps keep their age."""
         if "contact_born" in state.specs:
             state.contact_born.assign(state.contact_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
-
-    def where(self, k: int, point: int) -> str:
-        """Reference place of a point of a contact."""
-        X = self.tables.host[k].X.reshape(-1, 3)[point]
-        return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
 
     def _poses(self, at: At, active: wp.array) -> None:
         s = at.scratch[self.name]
@@ -358,9 +335,10 @@ class Contact(Term):
                 f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than {MOST_TURN:g} rad in "
                 "the step, in which it is touched; take a smaller dt"
             )
+        where = reference_place(t, k, number - int(t.first[k]))
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
-            f"{self.where(k, number - int(t.first[k]))}) went through collider {contact.collider.name!r}; take a "
+            f"{where}) went through collider {contact.collider.name!r}; take a "
             "smaller dt, a larger stiffness= of the contact, or a thicker shape"
         )
 

@@ -11,6 +11,7 @@ from ..base.errors import ModelError
 from ..base.launch import Launcher
 from ..kernels.terms.contact_sheets import sheet_kernels
 from ..model.triangle_mesh import TriMesh
+from .contact_starts import reference_place
 from .contact_tables import ContactTables
 
 __all__ = ["refuse_across"]
@@ -30,7 +31,7 @@ def refuse_across(
     points = _points_across(t, attempt, displacement, tolerance, launch)
     for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
         k = int(np.searchsorted(t.row_start, row, side="right")) - 1
-        contact, where = t.contacts[k], term.where(k, int(points[world, row]) - 1 - int(t.first[k]))
+        contact, where = t.contacts[k], reference_place(t, k, int(points[world, row]) - 1 - int(t.first[k]))
         raise ModelError(
             f"contact {contact.name!r}: body {contact.body.name!r} begins on both sides of collider "
             f"{contact.collider.name!r}, or on it and behind (world {world}, reference point {where}); move one of "

@@ -180,6 +180,12 @@ class PairTables:
             put(name, np.tile(values, (m.worlds, 1)), wp.float64)
         return out
 
+    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corners (facets, 3) of the facets in the reference."""
+        nodes = [np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X) for mas in self.masters]
+        low, high = ([getattr(x, name)(axis=1) for x in nodes] for name in ("min", "max"))
+        return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
+
     @property
     def box_groups(self) -> wp.array:
         """Groups of the boxes of [world, facet]: one of each world and surface."""

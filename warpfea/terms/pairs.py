@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.errors import ModelError, PenetrationError
+from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
 from ..kernels.terms.contact import RELAX_LANES
@@ -18,12 +18,11 @@ from ..kernels.terms.pair_books import pair_book_kernels
 from ..kernels.terms.pair_data import seat_struct, touching_struct
 from ..kernels.terms.pair_lists import CHUNK, list_kernels
 from ..kernels.terms.pair_seek import seek_kernels
-from ..model.pairs import bernstein
 from ..model.state import State
-from .contact import TOUCHING
 from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
+from .contact_starts import reference_place, store_overlaps, touching_depth
 from .pair_solves import PairSolves
 from .pair_survey import survey
 from .term import LOSS, STORED, At, Column, part
@@ -144,15 +143,10 @@ class Pairs(PairSolves):
 
     def _tree(self, touching: Any) -> wp.Bvh:
         """Boxes of the facets in the reference; worlds and surfaces are groups."""
-        t, B = self.tables, self.model.worlds
-        low, high = [], []
-        for mas in t.masters:
-            nodes = np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X)
-            low.append(nodes.min(axis=1))
-            high.append(nodes.max(axis=1))
-        touching.lower.assign(np.tile(np.concatenate(low), (B, 1)).astype(np.float32))
-        touching.upper.assign(np.tile(np.concatenate(high), (B, 1)).astype(np.float32))
-        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=t.box_groups)
+        low, high = self.tables.boxes()
+        touching.lower.assign(np.tile(low, (self.model.worlds, 1)))
+        touching.upper.assign(np.tile(high, (self.model.worlds, 1)))
+        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=self.tables.box_groups)
 
     def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
         """The structs of history and seats, with arrays from make(name, dtype, shape of a world)."""
@@ -199,33 +193,14 @@ class Pairs(PairSolves):
         self._seek(at, u, flags, settling=1)
         seat = s["touching"].seat.numpy()
         depth = np.where((seat >= 0) & new[:, None], s["touching"].depth.numpy(), 0.0)
-        u_n = at.state.displacement.numpy()
-        touching = TOUCHING * self.model.size + 4.0 * np.finfo(u_n.dtype).eps * np.abs(u_n).max(axis=(1, 2))
-        for k, contact in enumerate(t.contacts):
-            first, last = t.first[k], t.first[k + 1]
-            part_of = depth[:, first:last]
-            deep = part_of.max(axis=1) > touching
-            if not deep.any():
-                continue
-            if contact.overlap == "refuse":
-                world, point = np.unravel_index(int(part_of.argmax()), part_of.shape)
-                raise ModelError(
-                    f"contact {contact.name!r}: body {contact.slave.body.name!r} begins {part_of.max():.3g} m inside "
-                    f"body {contact.master.body.name!r} (world {world}, reference point {self._where(k, int(point))}); "
-                    "move one of them, or take overlap='offset', which stores the overlap and lets it decay"
-                )
-            overlap[deep, first:last] = np.maximum(part_of[deep], 0.0)
+        touching = touching_depth(self.model.size, at.state.displacement.numpy())
+        store_overlaps(t, depth, touching, overlap)
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
         """Stored overlaps keep their age."""
         if "pairs_born" in state.specs:
             state.pairs_born.assign(state.pairs_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
-
-    def _where(self, k: int, point: int) -> str:
-        """Reference place of a point of a contact."""
-        X = self.tables.host[k].X.reshape(-1, 3)[point]
-        return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
 
     # in a step
 
@@ -360,10 +335,10 @@ class Pairs(PairSolves):
             return None
         t = self.tables
         k = int(np.searchsorted(t.first, found - 1, side="right")) - 1
-        contact = t.contacts[k]
+        contact, where = t.contacts[k], reference_place(t, k, found - 1 - int(t.first[k]))
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.slave.body.name!r} (reference place "
-            f"{self._where(k, found - 1 - int(t.first[k]))}) went through body {contact.master.body.name!r}; take a "
+            f"{where}) went through body {contact.master.body.name!r}; take a "
             "smaller dt, a larger stiffness= of the contact, or a thicker body"
         )
 

@@ -148,7 +148,7 @@ def watch(sim: wf.Simulation, s: Scene, steps: int, *, mu: float = 0.0, moves: b
 def total(sim: wf.Simulation) -> float:
     """Energy that the model has: of motion, strain, place and contact, J."""
     e = sim.energies()
-    return float(sum(e[name][0] for name in ("kinetic", "strain", "potential", "contact")))
+    return float(sum(e[name][0] for name in ("kinetic", "strain", "potential", "contact", "contact_pairs")))
 
 
 def speed_of(sim: wf.Simulation, s: Scene) -> np.ndarray:
