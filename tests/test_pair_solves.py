@@ -160,6 +160,17 @@ def test_bodies_that_touch_no_free_one_have_no_motions():
     assert twolevel.motion_bodies(stack(2, 1e6, foreign=True)) == {1: 0, 2: 1}
 
 
+@pytest.mark.parametrize("kind", ["banded", "two-level"])
+def test_worlds_are_as_alone(kind):
+    states = []
+    for worlds in (1, 3):
+        sim = simulation(stack(3, 1e7, worlds=worlds), kind)
+        sim.step(4)
+        states.append(sim.state.displacement.numpy())
+    assert np.abs(states[0]).max() > 0.0
+    assert np.array_equal(np.repeat(states[0], 3, axis=0), states[1])
+
+
 def test_float32_takes_them_too():
     model = stack(4, 1e8, dtype="float32")
     sim = simulation(model, "banded")

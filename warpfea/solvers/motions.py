@@ -22,7 +22,7 @@ __all__ = ["Motions", "lanes_for", "motion_bodies"]
 
 SAMPLES = 16
 """Slots whose mean is the centre of a body."""
-MOST_LANES, SHARE = 128, 16
+MOST_LANES, SHARE = 256, 4
 """Most partial sums of a sum, and numbers in each that make more of them worth while."""
 
 

@@ -20,7 +20,7 @@ from ...simulation.simulation import Simulation
 from ...solvers.twolevel import TwoLevel
 from .measure import solver
 
-__all__ = ["SOLVES", "SolveRow", "solve_rows", "solves"]
+__all__ = ["FORCING", "SOLVES", "STEPS", "SolveRow", "count_solves", "solve_rows", "solves"]
 
 FORCING = 1e-8
 STEPS = 3
@@ -52,10 +52,8 @@ class SolveRow:
     bar: float | None
 
 
-def solves(before: Simulation) -> tuple[list[int], int]:
-    """Iterations of each linear solve of the steps after those of a simulation, and levels of the preconditioner."""
-    options = solver(None, forcing=FORCING, preconditioner="two-level")
-    sim = Simulation(before.model, before.state, dt=before.dt, solver=options, ledger=False, capture=False)
+def count_solves(sim: Simulation, steps: int) -> list[int]:
+    """Iterations of each linear solve of so many steps, with matrix and preconditioner of that very iterate."""
     loop, work = sim.stepper.newton, sim.stepper.work
     solve, counts, preconditioner = loop.pcg.solve, [], loop.preconditioner
     assert isinstance(preconditioner, TwoLevel)
@@ -67,7 +65,16 @@ def solves(before: Simulation) -> tuple[list[int], int]:
         counts.append(int(work.pcg.iterations.numpy()[0]))
 
     loop.pcg.solve = anew  # type: ignore[method-assign]
-    sim.step(STEPS)
+    sim.step(steps)
+    return counts
+
+
+def solves(before: Simulation) -> tuple[list[int], int]:
+    """Iterations of each linear solve of the steps after those of a simulation, and levels of the preconditioner."""
+    options = solver(None, forcing=FORCING, preconditioner="two-level")
+    sim = Simulation(before.model, before.state, dt=before.dt, solver=options, ledger=False, capture=False)
+    counts, preconditioner = count_solves(sim, STEPS), sim.stepper.newton.preconditioner
+    assert isinstance(preconditioner, TwoLevel)
     return counts, len(preconditioner.levels)
 
 

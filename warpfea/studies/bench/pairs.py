@@ -28,7 +28,7 @@ import warp as wp
 
 from ...kernels.terms.contact_data import RECORD
 from ...simulation.simulation import Simulation
-from ...solvers.twolevel import TwoLevel
+from .contact_solves import FORCING, STEPS, count_solves
 from .measure import by_label, solver
 from .measure import write as write_file
 from .pair_scenes import blocks, finger, pile, resting
@@ -175,20 +175,8 @@ def measure_pile(
 def measure_solves(label: str, cubes: int, E: float, *, kind: str, device: Any) -> SolvesRow:
     """Iterations of the solves of three steps."""
     model = resting(cubes, 4, "T4", E).finalize(device=device)
-    how = solver(None, forcing=1e-8, preconditioner=kind)
-    sim = Simulation(model, dt=DT, solver=how, ledger=False, capture=False)
-    loop, work = sim.stepper.newton, sim.stepper.work
-    solve, counts, preconditioner = loop.pcg.solve, [], loop.preconditioner
-    assert isinstance(preconditioner, TwoLevel)
-
-    def anew(active: wp.array) -> None:
-        loop.residual.take(active)
-        preconditioner.renew(active)
-        solve(active)
-        counts.append(int(work.pcg.iterations.numpy()[0]))
-
-    loop.pcg.solve = anew  # type: ignore[method-assign]
-    sim.step(3)
+    how = solver(None, forcing=FORCING, preconditioner=kind)
+    counts = count_solves(Simulation(model, dt=DT, solver=how, ledger=False, capture=False), STEPS)
     mean = statistics.mean(counts)
     return SolvesRow(label, kind, model.info()["unknowns"], counts, mean, None, GROWTH)
 
