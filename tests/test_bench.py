@@ -1,4 +1,4 @@
-"""`warpfea bench --peer`, `--growth` and `--cpu`, in this process on tiny rows; the peer's table and its meshes."""
+"""`warpfea bench --peer`, `--growth`, `--cpu` and others, in this process on tiny rows; the table of the peer."""
 
 import json
 import pathlib
@@ -197,6 +197,23 @@ def test_contact_stands_beside_a_step_without(bench):
     assert {"schema", "command", "commit", "machine", "versions"} <= set(content)
 
 
+def test_pairs_measure_rows_of_each_kind(bench):
+    rows = "pile-4-loose,pile-4-T10-tight,search-1e3,core-1e4,worlds-blocks-1,worlds-finger-16"
+    code, text, content = bench("--pairs", "--rows", rows, "--steps", "2")
+    assert code == 0, text
+    found = {row["label"]: row for row in content["rows"]}
+    assert list(found) == rows.split(",")
+    assert found["pile-4-loose"]["nodes"] == found["pile-4-T10-tight"]["nodes"] == 1250
+    assert found["pile-4-loose"]["times_faster"] == pytest.approx(10.0 / found["pile-4-loose"]["ms_per_step"])
+    assert found["pile-4-T10-tight"]["peer_ms"] is None
+    assert found["pile-4-T10-tight"]["residual"] <= 1e-6
+    assert 0.03 * found["core-1e4"]["points"] < found["core-1e4"]["touching"] < 0.1 * found["core-1e4"]["points"]
+    assert found["core-1e4"]["goal"] == 6.0
+    assert found["search-1e3"]["goal"] is None
+    assert found["worlds-finger-16"]["worlds"] == 16
+    assert all(label in text for label in found)
+
+
 BAD = {
     "unknown row": (["--peer", "--rows", "bar-1"], ["'bar-1'", "bar-3x2x1"]),
     "no such folder": (["--peer", "--meshes", "nowhere"], ["nowhere"]),
@@ -208,6 +225,7 @@ BAD = {
     "limit of contact": (["--contact", "--limit", "3"], ["--limit", "--contact"]),
     "limit of the peer": (["--peer", "--limit", "3"], ["--limit", "--peer"]),
     "precision on the CPU": (["--cpu", "--dtype", "float32"], ["--dtype", "--cpu"]),
+    "repeats of pairs": (["--pairs", "--repeat", "3"], ["--repeat", "--pairs"]),
     "unknown row of the CPU": (["--cpu", "--rows", "bar"], ["'bar'", "brick-1080"]),
     "too small": (["--growth", "--sizes", "5"], ["5", "270"]),
 }

@@ -22,6 +22,8 @@ __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
 THROUGH = -2
 """Seat of a point that has left through another side."""
+TURNED = 0.1
+"""Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
 LOST = 0.25
 """A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
 MARGIN = 0.25
@@ -391,7 +393,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     gap = spot[2] * wp.dot(n, s.c)
                     fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
                     if anchored:
-                        fits = fits and wp.dot(n, facing) > f64(0.0)
+                        fits = fits and wp.dot(n, facing) > f64(TURNED)
                     elif settling == 0:
                         foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
                         fits = fits and wp.dot(x0 - foot.x, outward(foot)) >= -left

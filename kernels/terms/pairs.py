@@ -271,35 +271,34 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         t.flux[world, point] = times(at.stiffness[world, point], d)
 
     @wp.kernel(module=module)
-    def product_facets(
-        facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=vec3)
+    def product_sides(
+        mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching,
+        pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
-        """Their sums on the slots of the points' own facets."""
-        world, item, i = wp.tid()
+        """Their sums on the slots of the points' own facets, and of master facets where the launch goes on to these."""
+        world, index = wp.tid()
         if active[world] == 0:
             return
         out = vec3()
-        if at.touched[world, facets.row + item] == STIFF:
-            for q in range(facets.points):
-                point = facets.point + item * facets.points + q
-                if at.state[world, point] == STIFF:
-                    out += facets.shape[q, i, item] * t.flux[world, point]
-        pool[world, facets.pool + i * facets.count + item] = out
-
-    @wp.kernel(module=module)
-    def product_masters(
-        mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=vec3)
-    ):  # fmt: skip
-        """Their sums on the slots of master facets."""
-        world, f, i = wp.tid()
-        if active[world] == 0:
+        own = facets.count * facets.conn.shape[0]
+        if index < own:
+            item = index % facets.count
+            i = index / facets.count
+            if at.touched[world, facets.row + item] == STIFF:
+                for q in range(facets.points):
+                    point = facets.point + item * facets.points + q
+                    if at.state[world, point] == STIFF:
+                        out += facets.shape[q, i, item] * t.flux[world, point]
+            pool[world, facets.pool + index] = out
             return
-        out = vec3()
+        index -= own
+        f = index % mas.count
+        i = index / mas.count
         for k in range(t.points[world, f]):
             point = t.entry[world, t.start[world, f] + k]
             if at.state[world, point] == STIFF:
                 out -= t.weight[world, point, i] * t.flux[world, point]
-        pool[world, mas.pool + i * mas.count + f] = out
+        pool[world, mas.pool + index] = out
 
     @wp.kernel(module=module)
     def diagonal_masters(
@@ -319,6 +318,6 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module, explicit_forces=explicit_forces, forces=forces, take_functions=take_functions,
-        gather_masters=gather_masters, product_points=product_points, product_facets=product_facets,
-        product_masters=product_masters, diagonal_masters=diagonal_masters,
+        gather_masters=gather_masters, product_points=product_points, product_sides=product_sides,
+        diagonal_masters=diagonal_masters,
     )  # fmt: skip

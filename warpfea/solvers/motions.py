@@ -24,8 +24,6 @@ SAMPLES = 16
 """Slots whose mean is the centre of a body."""
 MOST_LANES, SHARE = 128, 16
 """Most partial sums of a sum, and numbers in each that make more of them worth while."""
-LARGE, BLOCKS = 1024, (64, 256)
-"""Slots of a body from which on the larger block of threads restricts it."""
 
 
 def lanes_for(count: int) -> int:
@@ -68,7 +66,6 @@ class Motions:
         self.bodies = self._bodies()
         self.bodies.arm = work.array("motions arm", (B, model.slots), wp.vec3d)
         most = max(model.bodies[k].slot_count for k in self.number)
-        self.block_dim = BLOCKS[most > LARGE]
         self.parts = work.array("motions parts", (B, n, lanes_for(most), 3), wp.mat33d)
         self.dense = DenseInverse(model, work, launch, "motions", MOTIONS * n)
         self.r, self.x = (work.array(f"motions {name}", (B, MOTIONS * n), T) for name in "rx")
@@ -128,6 +125,6 @@ class Motions:
         """z += R (R^T H R)^-1 R^T r."""
         m, k, launch = self.model, self.kernels, self.launch
         args = [self.bodies, r, active, self.r]
-        launch.tiled(k.restrict, (m.worlds, len(self.number)), args, block_dim=self.block_dim)
+        launch.tiled(k.restrict, (m.worlds, len(self.number)), args)
         self.dense.apply(self.r, self.x, active)
         launch(k.prolong, (m.worlds, m.slots), [self.bodies, self.x, m.topology.free, active, z])

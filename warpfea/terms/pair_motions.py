@@ -23,7 +23,8 @@ class PairMotions:
         m, t = at.model, tables
         self.at, self.tables, self.masters, self.motions = at, tables, masters, motions
         self.kernels = pair_motion_kernels(m.dtype)
-        sides = [tuple(motions.number.get(m.bodies.index(s.body), -1) for s in (c.slave, c.master)) for c in t.contacts]
+        number = {id(body): motions.number.get(k, -1) for k, body in enumerate(m.bodies)}
+        sides = [(number[id(c.slave.body)], number[id(c.master.body)]) for c in t.contacts]
         coupled = [k for k, (a, b) in enumerate(sides) if min(a, b) >= 0 and a != b]
         pairs = sorted({(min(sides[k]), max(sides[k])) for k in coupled})
         found = [[(k, int(sides[k] != pair)) for k in coupled if tuple(sorted(sides[k])) == pair] for pair in pairs]

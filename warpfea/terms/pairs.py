@@ -11,25 +11,21 @@ import warp as wp
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
-from ..kernels.terms.contact import RELAX_LANES, contact_kernels
-from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
+from ..kernels.terms.contact import RELAX_LANES
+from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels
 from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
-from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pair_books import pair_book_kernels
 from ..kernels.terms.pair_data import seat_struct, touching_struct
 from ..kernels.terms.pair_lists import CHUNK, list_kernels
 from ..kernels.terms.pair_seek import seek_kernels
-from ..kernels.terms.pairs import pair_kernels
 from ..model.state import State
 from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
 from .contact_starts import reference_place, store_overlaps, touching_depth
-from .contact_tables import block_entries
-from .pair_motions import PairMotions
+from .pair_solves import PairSolves
 from .pair_survey import survey
-from .pair_tables import PairTables
-from .term import LOSS, STORED, At, Column, Term, part
+from .term import LOSS, STORED, At, Column, part
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -42,7 +38,7 @@ KEPT = ("angle", "grown", "lead", "place", "turn")
 """History of colliders and of lumped contacts."""
 
 
-class Pairs(Term):
+class Pairs(PairSolves):
     """All contacts of a model between its bodies.
 
     Attributes:
@@ -57,9 +53,7 @@ class Pairs(Term):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.traits = Traits(walls=True)
-        self.tables = PairTables(model)
-        self.shared, self.books = contact_kernels(model.dtype, False), book_kernels(model.dtype, False)
-        self.seek, self.kernels = seek_kernels(model.dtype), pair_kernels(model.dtype)
+        self.books, self.seek = book_kernels(model.dtype, False), seek_kernels(model.dtype)
         self.lists, self.ending = list_kernels(model.dtype), pair_book_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
@@ -296,28 +290,6 @@ class Pairs(Term):
             args = [s["masters"], group.data, s["u"], flags, attempt, s["touching"]]
             at.launch(self.kernels.take_functions, (m.worlds, group.count, group.data.points), args)
 
-    @part("pairs")
-    def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        s, m, w, t, k = at.scratch[self.name], self.model, at.work, self.tables, self.kernels
-        attempt, touching, masters = s["attempt"], s["touching"], s["masters"]
-        for group in t.groups:
-            dim = (m.worlds, group.count, group.data.points)
-            at.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
-        for group in t.groups:
-            dim = (m.worlds, group.count, group.conn.shape[1])
-            at.launch(k.product_facets, dim, [group.data, active, attempt, touching, w.pool_product])
-        dim = (m.worlds, t.facets, t.master_conn.shape[1])
-        at.launch(k.product_masters, dim, [masters, active, attempt, touching, w.pool_product])
-
-    @part("pairs")
-    def diagonal(self, at: At, active: wp.array) -> None:
-        s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
-        for group in t.groups:
-            args = [group.data, active, s["attempt"], w.pool_block]
-            at.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
-        args = [s["masters"], active, s["attempt"], s["touching"], w.pool_block]
-        at.launch(self.kernels.diagonal_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
-
     def book(self, at: At, accepted: wp.array) -> wp.array:
         self._finish(at, accepted)
         at.scratch[self.name]["finished"] = True
@@ -354,52 +326,6 @@ class Pairs(Term):
         """Energy that the history says is stored, by points."""
         weights = np.concatenate([share.ravel() for share in self.tables.shares])
         return {"contact_pairs": at.scratch[self.name]["history"].stored.numpy() @ weights}
-
-    # in a linear solve
-
-    def keep(self, at: At) -> list[tuple[str, wp.array]]:
-        s = at.scratch[self.name]
-        t = s["touching"]
-        arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight, "listed": t.listed}
-        return [("stiffness", s["attempt"].stiffness), *arrays.items()]
-
-    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
-        if "pair blocks" not in self.model.cache:
-            conns = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
-            self.model.cache["pair blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
-
-    def blocks(
-        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
-        *, projected: bool,
-    ) -> None:  # fmt: skip
-        """The points' stiffness on their own facets and on master facets; not what couples both."""
-        m, t = self.model, self.tables
-        stiffness, points, start, entry, weight, _ = kept
-        *slaves, masters = m.cache["pair blocks"]
-        add = contact_block_kernels(m.dtype).add_contact
-        for group, (index, begin, source, count) in zip(t.groups, slaves):
-            args = [m.topology, matrix.pattern.data, group.data, index, begin, source, stiffness, weight]
-            at.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
-        index, begin, source, count = masters
-        args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, points, start, entry]
-        add = pair_block_kernels(m.dtype).add_masters
-        at.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
-
-    def block_modules(self) -> set[wp.Module]:
-        dtype = self.model.dtype
-        return {contact_block_kernels(dtype).module, pair_block_kernels(dtype).module}
-
-    def couples(self) -> list[tuple[int, int]]:
-        number = self.model.bodies.index
-        return [(number(contact.first.body), number(contact.second.body)) for contact in self.tables.contacts]
-
-    def reserve_motions(self, at: At, motions: Any) -> Iterable[wp.Module]:
-        s = at.scratch[self.name]
-        s["motions"] = PairMotions(at, self.tables, s["masters"], motions)
-        return {s["motions"].kernels.module}
-
-    def couple(self, at: At, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
-        at.scratch[self.name]["motions"].add(kept, dq_dv, active)
 
     # results
 

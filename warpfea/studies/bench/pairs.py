@@ -143,7 +143,7 @@ def deepest(sim: Simulation) -> float:
 
 
 def measure_pile(
-    label: str, n: int, cells: int, element: str, how: str, dtype: str, device: Any, limit: int | None
+    label: str, n: int, cells: int, element: str, how: str, *, dtype: str, device: Any, limit: int | None
 ) -> PileRow:  # fmt: skip
     """The row of a pile; at most `limit` steps."""
     began = clock.perf_counter()
@@ -172,7 +172,7 @@ def measure_pile(
     )  # fmt: skip
 
 
-def measure_solves(label: str, cubes: int, E: float, kind: str, device: Any) -> SolvesRow:
+def measure_solves(label: str, cubes: int, E: float, *, kind: str, device: Any) -> SolvesRow:
     """Iterations of the solves of three steps."""
     model = resting(cubes, 4, "T4", E).finalize(device=device)
     how = solver(None, forcing=1e-8, preconditioner=kind)
@@ -193,7 +193,7 @@ def measure_solves(label: str, cubes: int, E: float, kind: str, device: Any) -> 
     return SolvesRow(label, kind, model.info()["unknowns"], counts, mean, None, GROWTH)
 
 
-def measure_worlds(label: str, name: str, worlds: int, dtype: str, device: Any, steps: int) -> WorldsRow:
+def measure_worlds(label: str, name: str, worlds: int, *, dtype: str, device: Any, steps: int) -> WorldsRow:
     """Throughput of so many worlds."""
     build, dt = WORLD_SCENES[name]
     model = build().finalize(device=device, dtype=dtype, worlds=worlds)
@@ -226,16 +226,18 @@ def pairs(options: argparse.Namespace) -> None:
     heads: set[str] = set()
     for case in cases:
         todo: list[Callable[[], Any]]
+        more: dict[str, Any]
         if case.kind == "pile":
-            todo = [partial(measure_pile, case.label, *case.given, d, device, options.steps) for d in dtypes]
+            more = {"device": device, "limit": options.steps}
+            todo = [partial(measure_pile, case.label, *case.given, dtype=d, **more) for d in dtypes]
         elif case.kind == "solves":
-            todo = [partial(measure_solves, case.label, *case.given, kind, device) for kind in kinds]
+            todo = [partial(measure_solves, case.label, *case.given, kind=kind, device=device) for kind in kinds]
         elif case.kind == "search":
             facets, core = case.given
             todo = [partial(search, case.label, facets, "cpu" if core else device)]
         else:
-            steps = options.steps or WORLD_STEPS
-            todo = [partial(measure_worlds, case.label, *case.given, d, device, steps) for d in dtypes]
+            more = {"device": device, "steps": options.steps or WORLD_STEPS}
+            todo = [partial(measure_worlds, case.label, *case.given, dtype=d, **more) for d in dtypes]
         for do in todo:
             row = do()
             if isinstance(row, SolvesRow):
