@@ -200,7 +200,7 @@ def meet(setting: Setting, value: tuple[str, str]) -> Answer:
 @case("pairs-touch", GROUP, values=("plate", "same faces"), quick="both", refusal=SINGLE)
 def exact_touch(setting: Setting, name: str) -> Answer:
     """A cube that begins in exact touch with a plate, or face on face with a cube of its own, under its weight."""
-    same = {"width": SIDE, "across": 2} if name == "same faces" else {}
+    same: dict[str, Any] = {"width": SIDE, "across": 2} if name == "same faces" else {}
     s = pair(mu=0.5, restitution=0.5, **same)
     seen = watch(wf.Simulation(s.model(setting), dt=1e-3), s, 50, mu=0.5)
     return seen.answer(setting, None, exact(setting, 1e-6, 1e-2), "impulse of the records")
