@@ -28,7 +28,14 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
     Attempt, Clock = attempt_struct(dtype), clock_struct()
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
     k, jet = touch_functions(dtype, False), place_functions(dtype).jet
-    in_plane, pull, plane, friction_force, coefficient = k.in_plane, k.pull, k.plane, k.friction_force, k.coefficient
+    Touch, in_plane, pull, plane, friction_force, coefficient = (
+        k.Touch,
+        k.in_plane,
+        k.pull,
+        k.plane,
+        k.friction_force,
+        k.coefficient,
+    )
     elastic = law_functions().elastic
     touch_of = pair_functions(dtype).touch_of
     frame = seek_kernels(dtype).frame
@@ -49,6 +56,42 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
         his.mark[world, point] = 0
         seats.seat[world, point] = 0
         seats.spot[world, point] = vec3d()
+
+    @wp.func
+    def tell_force(at: Attempt, world: int, row: int, force: vec3d, x: vec3d):
+        """A force and its moment into the record of a facet."""
+        moment = wp.cross(x, force)
+        for j in range(3):
+            add(at.rows, j, world, row, force[j])
+            add(at.rows, 3 + j, world, row, moment[j])
+
+    @wp.func
+    def spring_after(law: int, s: Touch, held: vec3d, w: wp.vec4d, pulled: vec3d) -> vec3d:
+        """The friction spring that stays where the force is cut to the cap; by Eq. (83) of the paper's law."""
+        trial = vec3d(w[0], w[1], w[2])
+        size = wp.length(trial)
+        if size <= held[0]:
+            return s.q
+        if held[0] <= f64(0.0):
+            return vec3d()
+        if law == PAPER:
+            return (f64(1.0) / held[1]) * pulled - ((w[3] - held[1]) / held[1]) * s.slip
+        return s.q - ((size - held[0]) / (w[3] * size)) * trial
+
+    @wp.func
+    def remember(
+        his: History, seats: Seats, at: Attempt, t: Touching, world: int, point: int, f: int, cap: f64, slips: int,
+        closing: f64,
+    ):  # fmt: skip
+        """Where a point is in contact, the largest speed of its approach, and whether it slips."""
+        his.cap[world, point] = cap
+        his.speed[world, point] = wp.max(at.speed[world, point], closing)
+        mark = wp.int32(1)
+        if slips != 0 and cap > f64(0.0):
+            mark += SLIPS
+        his.mark[world, point] = mark
+        seats.seat[world, point] = f + 1
+        seats.spot[world, point] = t.spot[world, point]
 
     @wp.kernel(module=module)
     def finish(
@@ -91,8 +134,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
             normal = s.law[0]
             pulled = friction_force(con, world, c, s, held, inv_h)
             w = pull(con, world, c, s, held, inv_h)
-            trial = vec3d(w[0], w[1], w[2])
-            slips = wp.where(wp.length(trial) > held[0], 1, 0)
+            slips = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > held[0], 1, 0)
             if live:
                 base = plane(s.m, t.whole[world, point] - t.motion[world, point])
             force = normal * s.n - pulled
@@ -105,14 +147,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
                              f64(1.0))  # fmt: skip
                 slips = wp.where(wp.length(pulled) >= f64(0.999999) * held[0], 1, 0)
             elif normal > f64(0.0) and held[1] > f64(0.0):
-                kept = s.q
-                if slips != 0:
-                    kept = vec3d()
-                    if held[0] > f64(0.0):
-                        size = wp.length(trial)
-                        kept = s.q - ((size - held[0]) / (w[3] * size)) * trial
-                        if law == PAPER:
-                            kept = (f64(1.0) / held[1]) * pulled - ((w[3] - held[1]) / held[1]) * s.slip
+                kept = spring_after(law, s, held, w, pulled)
             spring = elastic(0, con.scale[world, c] * con.normal[c], s.depth)
             stored = spring[1] + f64(0.5) * held[1] * wp.dot(kept, kept)
             slid = s.slip - (kept - base)
@@ -120,15 +155,9 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
             add(booked, 0, world, row, share * stored)
             add(booked, 1, world, row, share * (normal - spring[0]) * s.rise)
             add(booked, 2, world, row, share * rubbed)
-            x = facets.X[q, item] + at.origin[world, point]
             place = jet(mas, t.C, t.D, world, f, t.spot[world, point])
-            x = place.x
-            moment = wp.cross(x, force)
-            side = mas.sign[c]
-            for j in range(3):
-                add(at.rows, j, world, row, side * share * force[j])
-                add(at.rows, 3 + j, world, row, side * share * moment[j])
             add(at.rows, 6, world, row, share * normal)
+            tell_force(at, world, row, (mas.sign[c] * share) * force, place.x)
             if s.depth > f64(0.0):
                 area = facets.area[q, item]
                 add(at.rows, 7, world, row, area * f64(slips) * wp.length(slid))
@@ -138,21 +167,11 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
             if s.depth <= f64(0.0):
                 forget(his, seats, world, point)
             else:
-                speed = at.speed[world, point]
-                if clock.still == 0:
-                    speed = wp.max(speed, s.rise / clock.h[world])
                 if law != PAPER:
                     kept = wp.transpose(frame(place)) * kept
                 his.spring[world, point] = kept
                 his.stored[world, point] = stored
-                his.cap[world, point] = held[0]
-                his.speed[world, point] = speed
-                mark = wp.int32(1)
-                if slips != 0 and held[0] > f64(0.0):
-                    mark += SLIPS
-                his.mark[world, point] = mark
-                seats.seat[world, point] = f + 1
-                seats.spot[world, point] = t.spot[world, point]
+                remember(his, seats, at, t, world, point, f, held[0], slips, s.rise * inv_h)
         for j in range(4):
             at.rows[10 + j, world, row] = booked[j, world, row]
 

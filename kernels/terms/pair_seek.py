@@ -316,6 +316,35 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         t.whole[world, point] = spring + motion
         t.normal[world, point] = (stretch / rise) * n
 
+    @wp.func
+    def beside(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d) -> bool:
+        """Whether a point that did not move far is beside a facet, as the tangent plane in the middle tells."""
+        corners = mas.corners[mas.kind[f]]
+        center = middle(corners)
+        s = jet(mas, t.C, t.D, world, f, center)
+        if outside(corners, center + coordinates(s, x - s.x)) <= f64(GLANCE):
+            return False
+        path = x - x0 - carried(mas, t.C, t.D, t.C0, t.D0, world, f, center)
+        return wp.length(path) <= f64(0.5) * mas.limit[f]
+
+    @wp.func
+    def admits(
+        mas: Masters, t: Touching, world: int, f: int, spot: vec3d, x0: vec3d, pad: f64, left: f64, anchored: bool,
+        facing: vec3d, settling: int,
+    ) -> bool:  # fmt: skip
+        """Whether a place on a facet may be the seat of a point: by its depth, by the facet that it was on, or by the
+        side that it was on as the attempt began."""
+        s = jet(mas, t.C, t.D, world, f, spot)
+        n = outward(s)
+        gap = spot[2] * wp.dot(n, s.c)
+        fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
+        if anchored:
+            fits = fits and wp.dot(n, facing) > f64(TURNED)
+        elif settling == 0:
+            foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
+            fits = fits and wp.dot(x0 - foot.x, outward(foot)) >= -left
+        return fits
+
     @wp.kernel(module=module)
     def seek(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
@@ -330,8 +359,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         t.seat[world, point] = -1
         if facets.share[q, item] == f64(0.0):
             return
-        live = his.speed[world, point] > f64(0.0)
-        if not live and t.near[world, facets.row + item] == 0:
+        if his.speed[world, point] <= f64(0.0) and t.near[world, facets.row + item] == 0:
             return
         c = facets.contact[item]
         shift = along(facets, u, world, q, item)
@@ -346,9 +374,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         anchored = t.first[world, point] > 0
         if settling != 0:  # what lies before one face of a body is beside another
             off = f64(0.0)
+        motion = vec3d()
+        from0 = t.spot0[world, point]
         if anchored:
             f = t.first[world, point] - 1
-            from0 = t.spot0[world, point]
             motion = shift - at.origin[world, point] - carried(mas, t.C, t.D, t.C0, t.D0, world, f, from0)
             found = follow(mas, t.C, t.D, world, f, from0, motion)
             if found[3] == f64(0.0):
@@ -365,40 +394,24 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             facing = vec3d()
             if anchored:
                 f = t.first[world, point] - 1
-                from0 = t.spot0[world, point]
                 facing = outward(jet(mas, t.C, t.D, world, f, from0))
-                motion = shift - at.origin[world, point] - carried(mas, t.C, t.D, t.C0, t.D0, world, f, from0)
                 through = at.depth[world, point] - wp.dot(motion, facing) > f64(LOST) * mas.limit[f]
-            low = wp.min(x, x0) - vec3d(pad, pad, pad)
-            high = wp.max(x, x0) + vec3d(pad, pad, pad)
+            wide = vec3d(pad, pad, pad)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
-            query = wp.bvh_query_aabb(mas.tree, down(low), up(high), root)
+            query = wp.bvh_query_aabb(mas.tree, down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide), root)
             index = wp.int32(0)
             left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch - wp.min(con.offset[c], f64(0.0))
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]
-                center = middle(corners)
-                s = jet(mas, t.C, t.D, world, f, center)
-                first = center + coordinates(s, x - s.x)
-                far = outside(corners, first) > f64(GLANCE)
-                path = x - x0 - carried(mas, t.C, t.D, t.C0, t.D0, world, f, center)
-                if far and wp.length(path) <= f64(0.5) * mas.limit[f]:
+                if beside(mas, t, world, f, x, x0):
                     continue
-                found = locate(mas, t.C, t.D, world, f, x, center)
+                found = locate(mas, t.C, t.D, world, f, x, middle(corners))
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
                 fits = found[3] != f64(0.0) and o <= off
                 if fits:
-                    s = jet(mas, t.C, t.D, world, f, spot)
-                    n = outward(s)
-                    gap = spot[2] * wp.dot(n, s.c)
-                    fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
-                    if anchored:
-                        fits = fits and wp.dot(n, facing) > f64(TURNED)
-                    elif settling == 0:
-                        foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
-                        fits = fits and wp.dot(x0 - foot.x, outward(foot)) >= -left
+                    fits = admits(mas, t, world, f, spot, x0, pad, left, anchored, facing, settling)
                     closer = wp.abs(spot[2]) < height or (wp.abs(spot[2]) == height and f < best)
                     if fits and (o < off or best < 0 or closer):
                         best = f

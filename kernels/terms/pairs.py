@@ -116,6 +116,17 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             out -= f64(t.held_weight[world, point, i]) * vec3d(u[world, mas.conn[i, f]])
         return out
 
+    @wp.func
+    def hold_functions(
+        mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
+        point: int, f: int,
+    ):  # fmt: skip
+        """Motions of friction are told from here on by the functions that are held."""
+        t.held_motion[world, point] = t.motion[world, point]
+        t.held_whole[world, point] = t.whole[world, point]
+        t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
+        t.held_facet[world, point] = f
+
     @wp.kernel(module=module)
     def take_functions(
         mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), flags: wp.array(dtype=wp.int32), at: Attempt,
@@ -129,10 +140,18 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         f = t.seat[world, point]
         for i in range(mas.conn.shape[0]):
             t.held_weight[world, point, i] = t.weight[world, point, i]
-        t.held_motion[world, point] = t.motion[world, point]
-        t.held_whole[world, point] = t.whole[world, point]
-        t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
-        t.held_facet[world, point] = f
+        hold_functions(mas, facets, t, u, world, q, item, point, f)
+
+    @wp.func
+    def put_dead(mas: Masters, at: Attempt, t: Touching, world: int, point: int, f: int, share: f64):
+        """The explicit force of a point, where it was as the attempt began."""
+        work = -share * wp.dot(at.dead[world, point], t.motion[world, point])
+        at.state[world, point] = LOADED
+        at.force[world, point] = -share * at.dead[world, point]
+        at.energy[world, point] = wp.vec2d(work, wp.abs(work))
+        t.friction[world, point] = vec3d()
+        for i in range(mas.conn.shape[0]):
+            t.weight[world, point, i] = T(weigh(mas, f, i, t.spot0[world, point]))
 
     @wp.kernel(module=module)
     def forces(
@@ -150,14 +169,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         f = t.seat[world, point]
         if con.dead[c] != 0 and share > f64(0.0):
             if wp.length_sq(at.dead[world, point]) > f64(0.0):
-                work = -share * wp.dot(at.dead[world, point], t.motion[world, point])
-                at.state[world, point] = LOADED
-                at.force[world, point] = -share * at.dead[world, point]
-                at.energy[world, point] = wp.vec2d(work, wp.abs(work))
                 f = seats.seat[world, point] - 1
-                t.friction[world, point] = vec3d()
-                for i in range(mas.conn.shape[0]):
-                    t.weight[world, point, i] = T(weigh(mas, f, i, t.spot0[world, point]))
+                put_dead(mas, at, t, world, point, f, share)
         elif f == THROUGH:
             at.through[world] = point + 1
             at.state[world, point] = LOADED
@@ -191,10 +204,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 if fresh != 0 or held[0] <= f64(0.0):
                     t.held_weight[world, point, i] = T(w)
             if fresh != 0:
-                t.held_motion[world, point] = s.motion
-                t.held_whole[world, point] = s.whole
-                t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
-                t.held_facet[world, point] = f
+                hold_functions(mas, facets, t, u, world, q, item, point, f)
             if held[0] > f64(0.0):  # by functions that are held, it has a potential
                 shift = relative(mas, facets, t, u, world, q, item, point, t.held_facet[world, point])
                 s.motion = t.held_motion[world, point] + (shift - t.held_shift[world, point])

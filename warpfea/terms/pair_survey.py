@@ -18,7 +18,6 @@ from .contact_fields import Patch, nearest_samples, nodal_force
 
 if TYPE_CHECKING:
     from .pair_tables import PairTables
-    from .pairs import Pairs
 
 __all__ = ["Survey", "survey"]
 
@@ -82,7 +81,7 @@ class Survey:
         return out
 
 
-def survey(term: Pairs, state: State) -> Survey:
+def survey(term: Any, state: State) -> Survey:
     """Look at all points of a state; springs of friction are those that it knows."""
     m, t, B = term.model, term.tables, state.worlds
     launch = Launcher(m.device)
