@@ -10,6 +10,8 @@ from .pair_data import master_struct
 __all__ = ["INNER", "OUTER", "place_functions"]
 
 TURNS = 16
+FEET = 12
+"""Most steps to the foot of a perpendicular: each gains a factor of gap times curvature."""
 """Newton's steps of a place."""
 OUTER = 0.05
 """Part of a side by which a place may lie beyond a facet: the outward vectors of two elements differ."""
@@ -195,6 +197,39 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         """Unit normal of the layer through a place."""
         return wp.normalize(wp.cross(t.a, t.b))
 
+    @wp.struct
+    class Foot:
+        """The closest place on a facet to one that is off it: gap = rise x (coordinate off the facet) + rest."""
+
+        spot: vec3d
+        n: vec3d  # normal there
+        rise: f64
+        rest: f64  # m, of a facet that is curved
+
+    @wp.func
+    def foot_of(
+        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d
+    ) -> Foot:  # fmt: skip
+        """The foot of the perpendicular from a place."""
+        out = Foot()
+        base = vec3d(spot[0], spot[1], f64(0.0))
+        off = jet(mas, C, D, world, f, base).c
+        out.spot = base
+        for _ in range(FEET):
+            t = jet(mas, C, D, world, f, out.spot)
+            out.n = outward(t)
+            lie = way(mas, C, D, world, f, out.spot, base)
+            out.rest = wp.dot(out.n, lie)
+            lie += spot[2] * off
+            t.c = out.n
+            d = coordinates(t, lie - wp.dot(out.n, lie) * out.n)
+            size = wp.max(wp.abs(d[0]), wp.abs(d[1]))
+            if size < f64(1.0e-13) or size > f64(0.5):
+                break
+            out.spot += vec3d(d[0], d[1], f64(0.0))
+        out.rise = wp.dot(out.n, off)
+        return out
+
     @wp.func
     def weigh(mas: Masters, f: int, i: int, spot: vec3d) -> f64:
         """Function of slot i of a facet at a place."""
@@ -207,5 +242,5 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         Jet=Jet, power=power, jet=jet, moved=moved, carried=carried, way=way, coordinates=coordinates,
-        outside=outside, middle=middle, locate=locate, follow=follow, outward=outward, weigh=weigh,
+        outside=outside, middle=middle, locate=locate, follow=follow, outward=outward, foot_of=foot_of, weigh=weigh,
     )  # fmt: skip

@@ -44,8 +44,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
     k, f = touch_functions(dtype, False), place_functions(dtype)
     along, reach, allowance = k.along, k.reach, k.allowance
-    jet, moved, carried, coordinates, outside, middle, locate, follow, outward = (
-        f.jet, f.moved, f.carried, f.coordinates, f.outside, f.middle, f.locate, f.follow, f.outward
+    jet, moved, carried, coordinates, outside, middle, locate, follow, outward, foot_of = (
+        f.jet, f.moved, f.carried, f.coordinates, f.outside, f.middle, f.locate, f.follow, f.outward, f.foot_of
     )  # fmt: skip
     Jet = f.Jet
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
@@ -169,15 +169,14 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             if not live:
                 return
             spot = start
-        s = jet(mas, t.C0, t.D0, world, f, spot)
-        n = outward(s)
+        foot = foot_of(mas, t.C0, t.D0, world, f, spot)
         t.first[world, point] = f + 1
         t.spot0[world, point] = spot
-        t.stretch[world, point] = wp.dot(n, s.c)
-        at.depth[world, point] = at.reach[world, point] - spot[2] * wp.dot(n, s.c)
+        t.stretch[world, point] = wp.vec2d(foot.rise, foot.rest)
+        at.depth[world, point] = at.reach[world, point] - (spot[2] * foot.rise + foot.rest)
         speed = wp.max(his.speed[world, point], f64(SPEED_FLOOR))
         if clock.still == 0:
-            speed = wp.max(speed, approach(mas, facets, t, v_n, world, q, item, f, spot, n))
+            speed = wp.max(speed, approach(mas, facets, t, v_n, world, q, item, f, spot, foot.n))
         at.speed[world, point] = speed
 
     @wp.kernel(module=module)
@@ -285,14 +284,13 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         shift: vec3d, settling: int,
     ):  # fmt: skip
         """What a point at a place of a facet has: depth, that as the attempt began, normal, motion."""
-        s = jet(mas, t.C, t.D, world, f, spot)
-        n = outward(s)
-        rise = wp.dot(n, s.c)
+        foot = foot_of(mas, t.C, t.D, world, f, spot)
         now = reach(con, his, world, c, point, clock.new_time[world], f64(0.0))
         t.seat[world, point] = f
         t.spot[world, point] = spot
-        stretch = rise
-        t.depth[world, point] = now - spot[2] * rise
+        t.foot[world, point] = foot.spot
+        t.normal[world, point] = foot.n
+        t.depth[world, point] = now - (spot[2] * foot.rise + foot.rest)
         if t.first[world, point] == 0 and settling == 0:
             anchor(mas, facets, his, seats, clock, at, t, v_n, world, q, item, point, f, spot)
         motion = shift - at.origin[world, point]
@@ -301,9 +299,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             first = t.first[world, point] - 1
             from0 = t.spot0[world, point]
             motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, first, from0)
-            stretch = t.stretch[world, point]  # of other facets too: it must not vary with the iterate
-            change = (now - at.reach[world, point]) - stretch * (spot[2] - from0[2])
-            t.depth[world, point] = at.depth[world, point] + change
+            if f == first:  # a sum of motions, not a difference of places
+                before = t.stretch[world, point]
+                rise = (spot[2] - from0[2]) * foot.rise + from0[2] * (foot.rise - before[0]) + (foot.rest - before[1])
+                t.depth[world, point] = at.depth[world, point] + (now - at.reach[world, point]) - rise
             t.before[world, point] = at.depth[world, point]
             if his.speed[world, point] > f64(0.0):
                 spring = his.spring[world, point]
@@ -311,10 +310,9 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     spring = frame(jet(mas, t.C, t.D, world, first, from0)) * spring
         else:
             motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, f, spot)
-            t.before[world, point] = t.depth[world, point] + wp.dot(n, motion) - (now - at.reach[world, point])
+            t.before[world, point] = t.depth[world, point] + wp.dot(foot.n, motion) - (now - at.reach[world, point])
         t.motion[world, point] = motion
         t.whole[world, point] = spring + motion
-        t.normal[world, point] = (stretch / rise) * n
 
     @wp.func
     def beside(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d) -> bool:

@@ -1,9 +1,9 @@
 """Contact of points of a body with facets of another: forces, their tangent, and what an accepted step keeps and books.
 
-The law is that of contact with obstacles. Both bodies feel the force at one place, that of the point: on its own facet
-by the functions there, on the master by those of the material that is at this place, so that sum and moment vanish. The
-depth is the master's material coordinate times a stretch that is held in an attempt: its derivative by the slots is
-what these functions give, and the force is that of a potential of the iterate.
+The law is that of contact with obstacles. Depth is the distance from the closest place on the master's facet: the
+normal force, its derivative, acts there by the functions of the facet, along a line through the point. Friction acts at
+the place of the point itself, by the functions of the master's material there. So sum and moment vanish, and the force
+is that of a potential of the iterate, which hardly jumps where a point passes to the next facet, whatever the strains.
 """
 
 import functools
@@ -139,7 +139,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         f = t.seat[world, point]
         for i in range(mas.conn.shape[0]):
-            t.held_weight[world, point, i] = t.weight[world, point, i]
+            t.held_weight[world, point, i] = T(weigh(mas, f, i, t.spot[world, point]))
         hold_functions(mas, facets, t, u, world, q, item, point, f)
 
     @wp.func
@@ -199,10 +199,9 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 m = s.m
                 at.plane[world, point] = m
             for i in range(mas.conn.shape[0]):
-                w = weigh(mas, f, i, t.spot[world, point])
-                t.weight[world, point, i] = T(w)
+                t.weight[world, point, i] = T(weigh(mas, f, i, t.foot[world, point]))
                 if fresh != 0 or held[0] <= f64(0.0):
-                    t.held_weight[world, point, i] = T(w)
+                    t.held_weight[world, point, i] = T(weigh(mas, f, i, t.spot[world, point]))
             if fresh != 0:
                 hold_functions(mas, facets, t, u, world, q, item, point, f)
             if held[0] > f64(0.0):  # by functions that are held, it has a potential
