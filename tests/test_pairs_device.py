@@ -45,7 +45,7 @@ def test_linear_solves_do_not_grow_with_the_stack(rows):
 def test_throughput_grows_with_worlds(rows, scene):
     found = [rows[f"worlds-{scene}-{B}"] for B in (1, 16, 256, 1024, 4096)]
     rate = [row["worlds"] * 1e3 / row["ms_per_step"] for row in found]
-    assert all(new > old for old, new in zip(rate, rate[1:], strict=False))
+    assert rate == sorted(rate)
     counts = {(row["newton_per_step"], row["pcg_per_step"]) for row in found}
     assert len(counts) == 1
 

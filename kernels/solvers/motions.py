@@ -13,7 +13,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.motions import MOTIONS, bodies_struct, motion_functions
+from ..common.rigid import MOTIONS, bodies_struct, motion_functions
 from ..common.structs import pattern_struct
 from ..common.types import SMALL, kernel_module, precision
 

@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.motions import MOTIONS, bodies_struct, motion_functions
+from ..common.rigid import MOTIONS, bodies_struct, motion_functions
 from ..common.types import SMALL, kernel_module, precision
 from .contact_data import facet_struct
 from .pair_data import master_struct

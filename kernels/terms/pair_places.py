@@ -7,7 +7,7 @@ import warp as wp
 
 from .pair_data import master_struct
 
-__all__ = ["INNER", "OUTER", "place_functions"]
+__all__ = ["HOLD", "INNER", "OUTER", "place_functions"]
 
 TURNS = 16
 FEET = 12
@@ -18,9 +18,12 @@ OUTER = 0.05
 INNER = 1e-9
 QUADRATIC = 1e-8
 """A step so small is the last: what it leaves is its square."""
+HOLD = 0.5
+"""In an attempt a point stays on the surface so far beyond its border: it slides off between steps, for a force that
+ends at an iterate has no potential."""
 STAY = 0.05
-"""By so much of a side a point may pass the border of the facet that it was on as the attempt began: one that lies on a
-border does not change facets from iterate to iterate."""
+"""By so much of a side a point may pass the border of the facet that it was on as the attempt began: one that lies on
+a border does not change facets from iterate to iterate."""
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from .contact_data import attempt_struct, clock_struct, contact_struct, facet_st
 from .contact_laws import PAPER
 from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
-from .pair_places import OUTER, STAY, place_functions
+from .pair_places import HOLD, OUTER, STAY, place_functions
 
 __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
@@ -169,6 +169,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             if not live:
                 return
             spot = start
+        if outside(mas.corners[mas.kind[f]], spot) > f64(OUTER):
+            return  # it has slid off the surface
         foot = foot_of(mas, t.C0, t.D0, world, f, spot)
         t.first[world, point] = f + 1
         t.spot0[world, point] = spot
@@ -365,13 +367,11 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         x0 = t.x0[world, point]
         best = wp.int32(-1)
         place = vec3d()
-        off = f64(OUTER)
+        off = wp.where(settling == 0, f64(OUTER), f64(0.0))  # what lies before one face of a body is beside another
         height = f64(1.0e300)
         pad = wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)
         anchored = t.first[world, point] > 0
-        if settling != 0:  # what lies before one face of a body is beside another
-            off = f64(0.0)
         motion = vec3d()
         from0 = t.spot0[world, point]
         if anchored:
@@ -382,7 +382,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 found = locate(mas, t.C, t.D, world, f, x, middle(mas.corners[mas.kind[f]]))
             spot = vec3d(found[0], found[1], found[2])
             o = outside(mas.corners[mas.kind[f]], spot)
-            if found[3] != f64(0.0) and o <= off:
+            if found[3] != f64(0.0) and (o <= off or (o <= f64(HOLD) and his.speed[world, point] > f64(0.0))):
                 best = f
                 place = spot
                 off = o
@@ -407,7 +407,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 found = locate(mas, t.C, t.D, world, f, x, middle(corners))
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
-                fits = found[3] != f64(0.0) and o <= off
+                fits = found[3] != f64(0.0) and o <= wp.min(off, f64(OUTER))
                 if fits:
                     fits = admits(mas, t, world, f, spot, x0, pad, left, anchored, facing, settling)
                     closer = wp.abs(spot[2]) < height or (wp.abs(spot[2]) == height and f < best)
@@ -420,7 +420,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     through = True
         if best >= 0:
             sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, settling)
-            if t.depth[world, point] > mas.limit[best]:
+            most = mas.limit[best] * wp.where(off > f64(OUTER), f64(LOST), f64(1.0))
+            if t.depth[world, point] > most:
                 t.seat[world, point] = THROUGH
         elif through:
             t.seat[world, point] = THROUGH

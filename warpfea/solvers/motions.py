@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.common.motions import MOTIONS, bodies_struct
+from ..kernels.common.rigid import MOTIONS, bodies_struct
 from ..kernels.solvers.motions import motion_kernels
 from .dense import DenseInverse
 from .levels import BOTTOM_SLOTS

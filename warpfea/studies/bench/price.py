@@ -139,14 +139,18 @@ def force_in(b: ModelBuilder, missing: list[str]) -> None:
             b.add_contact(body, far, mu=0.5, restitution=0.5, name=f"price {body.name}")
     for body in bodies if "damping incremental" in missing else ():
         body.materials = [(g, law if law.damping else _damped(law, "incremental")) for g, law in body.materials]
-    _add_bodies(b, 0.5 * (low + high), SMALL * size)
+    _add_bodies(b, 0.5 * (low + high), SMALL * size, pair="contact between bodies" in missing)
 
 
-def _add_bodies(b: ModelBuilder, place: np.ndarray, edge: float) -> None:
+def _add_bodies(b: ModelBuilder, place: np.ndarray, edge: float, *, pair: bool) -> None:
     """Those that touch nothing: they bring what the scene's own bodies can't have."""
     law, side, origin = SVK(E=1e7, nu=0.3, density=1000.0), (edge, edge, edge), tuple(place)
     free = meshes.box(side, cells=(1, 1, 2), element="T4", origin=origin)
-    b.add_solid(free, material=_damped(law, "rate"), name="price free")
+    body = b.add_solid(free, material=_damped(law, "rate"), name="price free")
+    if pair:
+        beside = meshes.box(side, cells=(1, 1, 2), element="T4", origin=tuple(place + FAR * edge))
+        other = b.add_solid(beside, material=_damped(law, "rate"), name="price other")
+        b.add_contact(other, body, mu=0.5, restitution=0.5, name="price pair")
     brick = meshes.box(side, cells=(1, 1, 1), element="H3843", origin=origin)
     held = b.add_solid(brick, material=_damped(law, "explicit"), element="H3843", name="price held")
     b.drive(held.nodes("x-"), displacement=([0.0, 1e3], [(0, 0, 0), (0, 0, 0)]))
