@@ -11,7 +11,8 @@ from warpfea.studies.bench.price import cases, measure
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "price_cpu.json"
 TRACES = {
-    "contact": "contact", "contact between bodies": "pair", "constraints": "constraints", "follower pressure": "pressure", "moments": "moment",
+    "contact": "contact", "contact between bodies": "pair", "constraints": "constraints",
+    "follower pressure": "pressure", "moments": "moment",
     "body forces": "field", "controls": "controls", "driven nodes": "drive", "damping explicit": "explicit",
     "damping rate": "rate", "damping incremental": "incremental", "table elements": "table",
     "straight elements": "affine",
