@@ -42,6 +42,8 @@ LEFT = ("materials per world",)
 """What no version has."""
 NEXT_TO_NONE = 1e-30
 """Of viscosities, Pa s, and gravity, m/s^2: with 0 they are left out."""
+STILL = 1e-3
+"""Probes that travel less than this part of the model's size are judged by that."""
 FAR = 1e3
 """Of the plane, over the model's size."""
 SMALL = 0.05
@@ -86,7 +88,7 @@ class PriceRow:
         forced: features that it leaves out and that were forced in. left: those that were not.
         ratio: ms with all over ms as shipped; ratio_per_newton: the same of an iteration of Newton's method, None where
             the scene as shipped takes none in these steps (its bodies fall).
-        moved: largest distance of a probe from its place as shipped, over the travel of all.
+        moved: largest distance of a probe from its place as shipped, over the travel of all, or STILL of the size.
     """
 
     scene: str
@@ -219,7 +221,7 @@ def measure(case: PriceCase, *, device: Any, steps: int, repeat: int) -> PriceRo
         left,
         ratio,
         ratio * own.newton_per_step / everything.newton_per_step if own.newton_per_step else None,
-        float(np.abs(other - path).max() / np.abs(path).max()),
+        float(np.abs(other - path).max() / max(np.abs(path).max(), STILL * shipped.model.size)),
     )
 
 
