@@ -28,6 +28,8 @@ def assert_priced(row):
     for what in ("kernels", "modules"):
         assert len(own[what]) < 0.85 * len(full[what]), what
     for feature in set(TRACES) & set(row["forced"]):
+        if feature == "contact" and "contact between bodies" not in row["forced"]:
+            continue  # it has kernels of contact with obstacles too
         assert not [name for name in own["modules"] if TRACES[feature] in name], feature
         assert [name for name in full["modules"] if TRACES[feature] in name], feature
     for what in ("bytes", "launches", "unknowns"):
