@@ -22,8 +22,8 @@ def rows():
         pytest.param("pile-4-loose", marks=pytest.mark.xfail(strict=True, reason="as fast (0.996), not faster")),
         pytest.param("pile-10-tight", marks=pytest.mark.xfail(strict=True, reason="1.17 times faster, 3 are asked")),
         pytest.param("pile-10-loose", marks=pytest.mark.xfail(strict=True, reason="0.6 times as fast")),
-        pytest.param("pile-20-tight", marks=pytest.mark.xfail(strict=True, reason="refused as the cubes land, before points slid off in time")),
-        pytest.param("pile-20-loose", marks=pytest.mark.xfail(strict=True, reason="refused as the cubes land, before points slid off in time")),
+        pytest.param("pile-20-tight", marks=pytest.mark.xfail(strict=True, reason="refused as the cubes land")),
+        pytest.param("pile-20-loose", marks=pytest.mark.xfail(strict=True, reason="refused as the cubes land")),
     ],
 )
 def test_piles_beside_the_peer(rows, label):
