@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -44,14 +45,14 @@ def arch(
     b = wf.ModelBuilder(gravity=([0.0, ramp], [(0.0, 0.0, 0.0), (0.0, 0.0, -9.81)]))
     material = wf.SVK(E=E, nu=nu, density=density)
     ground = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)), name="ground")
-    options = {"mu": mu, "restitution": 0.1, "stiffness": stiffness}
+    options: dict[str, Any] = {"mu": mu, "restitution": 0.1, "stiffness": stiffness}
     part = math.pi / blocks
 
     def bend(X: np.ndarray) -> np.ndarray:
         """From (angle, depth, radius), angles from the left foot; sides stay planes."""
         return np.column_stack([-X[:, 2] * np.cos(X[:, 0]), X[:, 1], X[:, 2] * np.sin(X[:, 0])])
 
-    before = None
+    before: wf.Body | None = None
     for k in range(blocks):
         origin = (k * part, -0.5 * depth, radius - 0.5 * thickness)
         mesh = wf.mesh.box((part, depth, thickness), cells=(2, 1, 1), origin=origin, map=bend)
@@ -61,7 +62,7 @@ def arch(
         else:
             b.add_contact(before.surface("x+"), block.surface("x-"), name=f"joint {k}", **options)
         before = block
-    b.add_contact(before.surface("x+"), ground, name="right foot", **options)
+    b.add_contact(block.surface("x+"), ground, name="right foot", **options)
     middle = b.bodies[blocks // 2]
     angle = 0.5 * math.pi if blocks % 2 else 0.5 * math.pi + 0.5 * part
     b.add_probe("crown", middle.at(bend(np.array([(angle, 0.0, radius)]))[0]))

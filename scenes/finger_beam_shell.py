@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import warpfea as wf
 from warpfea.builder.scene import scene
 
@@ -47,7 +49,7 @@ def finger_beam_shell(
         finger.nodes("z+"),
         displacement=([0.0, 0.1, duration, 2.0], [(0, 0, 0), (0, 0, 0), (travel, 0, 0), (travel, 0, 0)]),
     )
-    options = {"mu": mu, "restitution": 0.3, "stiffness": stiffness}
+    options: dict[str, Any] = {"mu": mu, "restitution": 0.3, "stiffness": stiffness}
     b.add_contact(beam, shell.surface("top"), name="table", **options)
     b.add_contact(finger.surface("x+"), beam, name="push", **options)
     b.add_probe("beam", beam.at((0.02, 0.0, 0.5 * height)))

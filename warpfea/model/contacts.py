@@ -11,7 +11,7 @@ from .discretisation import Discretisation
 from .handles import SurfaceSet
 from .shapes import Shape
 
-__all__ = ["Collider", "ColliderRotation", "Contact"]
+__all__ = ["Collider", "ColliderRotation", "Contact", "ContactOptions"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +56,11 @@ class Collider:
         return f"Collider({self.name!r}, {type(self.shape).__name__}{', moves' if self.moves else ''})"
 
 
-@dataclass(eq=False)
-class Contact:
-    """Contact of a surface with a collider; made by ModelBuilder.add_contact, which says what each value means.
+@dataclass(eq=False, kw_only=True)
+class ContactOptions:
+    """What a contact of either kind is made with.
 
     Attributes:
-        surface: faces of the body.
-        collider: the obstacle.
         mu, mu_static: coefficients of friction in slip and in stick, 0 <= mu <= mu_static.
         restitution: in (0, 1].
         law: "default", "paper" or "smooth".
@@ -75,13 +73,9 @@ class Contact:
         smoothing: None; with the paper's law a depth, m; with the smooth law (eps in N, v_eps in m/s).
         overlap: "refuse" or "offset".
         overlap_time: time in which a stored overlap decays, s.
-        name: unique among the contacts of its builder.
         index: number in its builder.
     """
 
-    surface: SurfaceSet
-    collider: Collider
-    name: str
     mu: float = 0.0
     mu_static: float = 0.0
     restitution: float = 1.0
@@ -96,6 +90,21 @@ class Contact:
     overlap: str = "refuse"
     overlap_time: float = 0.1
     index: int = -1
+
+
+@dataclass(eq=False)
+class Contact(ContactOptions):
+    """Contact of a surface with a collider; made by ModelBuilder.add_contact, which says what each value means.
+
+    Attributes:
+        surface: faces of the body.
+        collider: the obstacle.
+        name: unique among the contacts of its builder.
+    """
+
+    surface: SurfaceSet
+    collider: Collider
+    name: str
 
     @property
     def body(self) -> Discretisation:

@@ -11,6 +11,7 @@ from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
 from .contact_points import ContactPoints, body_mass_total, effective_modulus, points_by_rules
+from .contacts import ContactOptions
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
 
@@ -30,13 +31,12 @@ STEEP = 0.1
 
 
 @dataclass(eq=False)
-class PairContact:
+class PairContact(ContactOptions):
     """Contact of two surfaces; made by ModelBuilder.add_contact, which says what each value means.
 
     Attributes:
         first, second: faces of two bodies; forces of reports are those on the first.
         slave, master: the same two: contact acts at points of the slave, against facets of the master.
-        others: as of contacts.Contact.
     """
 
     first: SurfaceSet
@@ -44,20 +44,6 @@ class PairContact:
     name: str
     slave: SurfaceSet
     master: SurfaceSet
-    mu: float = 0.0
-    mu_static: float = 0.0
-    restitution: float = 1.0
-    law: str = "default"
-    treatment: str = "implicit"
-    stiffness: float = 1.0
-    model: str = "patch"
-    radius: float | None = None
-    offset: float = 0.0
-    points: int | None = None
-    smoothing: float | tuple[float, float] | None = None
-    overlap: str = "refuse"
-    overlap_time: float = 0.1
-    index: int = -1
 
     @property
     def body(self) -> Discretisation:
