@@ -13,11 +13,12 @@ SMALL = 4
 
 @functools.cache
 def precision(dtype: str) -> _types.SimpleNamespace:
-    """Types of one precision, `"float64"` or `"float32"`: scalar T, vec3, sym (Voigt xx yy zz yz xz xy), mat33."""
+    """Types of one precision, `"float64"` or `"float32"`: scalar T, vec2, vec3, sym (Voigt xx yy zz yz xz xy), mat33."""
     scalar = {"float64": wp.float64, "float32": wp.float32}[dtype]
     return _types.SimpleNamespace(
         name=dtype,
         T=scalar,
+        vec2=wp.types.vector(length=2, dtype=scalar),
         vec3=wp.types.vector(length=3, dtype=scalar),
         sym=wp.types.vector(length=6, dtype=scalar),
         mat33=wp.types.matrix(shape=(3, 3), dtype=scalar),

@@ -115,6 +115,8 @@ def control_struct():
         unsettled: wp.array(dtype=wp.int32)  # they have taken but a part of it: the residual is not that of the iterate
         touching: wp.array(dtype=wp.int32)  # they act at the iterate
         excursions: wp.array(dtype=wp.int32)  # leaps into obstacles of this attempt
+        lower: wp.array(dtype=wp.vec2d)  # a length of the search where Phi falls, and its slope there
+        upper: wp.array(dtype=wp.vec2d)  # one beyond which Phi rises; with walls
         new_walls: wp.array(dtype=wp.int32)  # what they hold now may set in suddenly again
         # where rounding stops the residual
         strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left; 2: it has been done

@@ -43,6 +43,7 @@ SWIFT, FINE = 1.0e4, 1.0e-10  # roundings of its speed below which an error of a
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1  # of the first solve of a step that begins far from its end: what it is solved to is lost
+KINK, MAX_KINK = 0.5, 8
 EXCURSIONS = 1  # full steps deep into an obstacle in an attempt: the way back may end where it began
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
@@ -256,6 +257,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
         ctl.rounds[world] = ctl.rounds[world] + 1
         ctl.searches[world] = 0
+        if wp.static(walls):
+            ctl.lower[world] = wp.vec2d(f64(0.0), ctl.slope_sum[0, world])
+            ctl.upper[world] = wp.vec2d()
         ctl.wish[world] = 0
         ctl.turn[world] = f64(0.0)
         ctl.searching[world] = 1
@@ -371,6 +375,25 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 why = FAIL_JACOBIAN
             fail(ctl, world, why)
 
+    @wp.func
+    def between(ctl: Control, world: int, slope: f64) -> f64:
+        """The next length of a search whose trial is on the far side of a kink of Phi, or still steep before it: by
+        the Illinois method on slopes (Dowell and Jarratt 1971)."""
+        alpha = ctl.alpha[world]
+        low = wp.vec2d(ctl.lower[world])
+        high = wp.vec2d(ctl.upper[world])
+        if slope > f64(0.0):
+            if high[0] > f64(0.0) and ctl.searches[world] > 1:
+                low[1] = f64(0.5) * low[1]
+            high = wp.vec2d(alpha, slope)
+        else:
+            high[1] = f64(0.5) * high[1]
+            low = wp.vec2d(alpha, slope)
+        ctl.lower[world] = low
+        ctl.upper[world] = high
+        part = wp.clamp(low[1] / (low[1] - high[1]), f64(0.05), f64(0.95))
+        return low[0] + part * (high[0] - low[0])
+
     @wp.kernel(module=module)
     def judge_trial(ctl: Control):
         """Armijo on Phi while it is not blind, else the sign of the slope; then convergence."""
@@ -411,6 +434,16 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             wishes = False
         if wp.static(walls):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
             wishes = wishes and ctl.refreshed[world] == 0 and ctl.excursions[world] < EXCURSIONS
+        kinked = bool(False)
+        if wp.static(walls and not midpoint):  # sticking sets in where Phi rises again
+            slope = ctl.slot_sums[6, world] - alpha * bend
+            steep = f64(KINK) * wp.abs(ctl.slope[world])
+            kinked = finite and not (stands or wishes or reused) and ctl.searches[world] < MAX_KINK and ctl.domain_J[world] > f64(0.0)
+            kinked = kinked and ctl.wish[world] == 0 and (slope > steep or (ctl.upper[world][0] > f64(0.0) and slope < -steep))
+            if kinked:
+                ctl.searches[world] = ctl.searches[world] + 1
+                ctl.alpha[world] = between(ctl, world, slope)
+                return
         leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or leap:
             take(ctl, world, stands, leap)

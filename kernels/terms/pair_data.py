@@ -60,7 +60,8 @@ def seat_struct():
 @functools.cache
 def touching_struct(dtype: str):
     """What an attempt makes; [world, control]: monomial m of facet f is control `most f + m`."""
-    T, vec3 = precision(dtype).T, precision(dtype).vec3
+    p = precision(dtype)
+    T, vec3, vec2, sym = p.T, p.vec3, p.vec2, p.sym
 
     @wp.struct
     class Touching:
@@ -92,6 +93,10 @@ def touching_struct(dtype: str):
         motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material
         whole: wp.array2d(dtype=wp.vec3d)  # that and the friction spring
         weight: wp.array3d(dtype=T)  # [world, point, local] functions of the master's slots at the foot
+        slope: wp.array3d(dtype=vec2)  # their derivatives by the coordinates of the foot
+        lean: wp.array3d(dtype=vec3)  # [world, point, 2] what a turn of the facet does to the force, see `lean_on`
+        bend: wp.array2d(dtype=sym)  # and its own turn and curvature
+        turned: wp.array2d(dtype=vec2)  # [world, point] of a product, what turns the facet
         held_weight: wp.array3d(dtype=T)  # functions that friction acts by, held with its cap
         held_motion: wp.array2d(dtype=wp.vec3d)
         held_whole: wp.array2d(dtype=wp.vec3d)  # that and the spring, as they were taken

@@ -234,6 +234,40 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         return out
 
     @wp.func
+    def curved(
+        mas: Masters, C: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d, n: vec3d
+    ) -> vec3d:  # fmt: skip
+        """Second derivatives of a facet along n: by the first coordinate, by the second, by both."""
+        out = vec3d()
+        kind = mas.kind[f]
+        for m in range(mas.terms[kind]):
+            i = mas.power[kind, m][0]
+            j = mas.power[kind, m][1]
+            h = wp.dot(n, mas.X[m, f] + C[world, mas.most * f + m])
+            if i > 1:
+                out[0] = out[0] + f64(i * (i - 1)) * power(spot[0], i - 2) * power(spot[1], j) * h
+            if j > 1:
+                out[1] = out[1] + f64(j * (j - 1)) * power(spot[0], i) * power(spot[1], j - 2) * h
+            if i > 0 and j > 0:
+                out[2] = out[2] + f64(i * j) * power(spot[0], i - 1) * power(spot[1], j - 1) * h
+        return out
+
+    @wp.func
+    def slopes(mas: Masters, f: int, i: int, spot: vec3d) -> wp.vec2d:
+        """Derivatives of the function of slot i by the coordinates of a place on a facet."""
+        out = wp.vec2d()
+        kind = mas.kind[f]
+        for m in range(mas.terms[kind]):
+            a = mas.power[kind, m][0]
+            b = mas.power[kind, m][1]
+            s = f64(mas.shape[m, i, f])
+            if a > 0:
+                out[0] = out[0] + s * f64(a) * power(spot[0], a - 1) * power(spot[1], b)
+            if b > 0:
+                out[1] = out[1] + s * f64(b) * power(spot[0], a) * power(spot[1], b - 1)
+        return out
+
+    @wp.func
     def weigh(mas: Masters, f: int, i: int, spot: vec3d) -> f64:
         """Function of slot i of a facet at a place."""
         out = f64(0.0)
@@ -246,4 +280,5 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
     return _types.SimpleNamespace(
         Jet=Jet, power=power, jet=jet, moved=moved, carried=carried, way=way, coordinates=coordinates,
         outside=outside, middle=middle, locate=locate, follow=follow, outward=outward, foot_of=foot_of, weigh=weigh,
+        curved=curved, slopes=slopes,
     )  # fmt: skip

@@ -53,7 +53,7 @@ def pair_functions(dtype: str) -> _types.SimpleNamespace:
 def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in one precision of the displacements."""
     p = precision(dtype)
-    T, vec3, sym = p.T, p.vec3, p.sym
+    T, vec2, vec3, sym = p.T, p.vec2, p.vec3, p.sym
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
     Attempt, Clock = attempt_struct(dtype), clock_struct()
@@ -143,6 +143,35 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         hold_functions(mas, facets, t, u, world, q, item, point, f)
 
     @wp.func
+    def lean_on(mas: Masters, t: Touching, world: int, point: int, f: int, gap: f64, force: f64):
+        """What the second derivative of the depth needs in products: the facet turns under a force, and its foot moves.
+
+        With the relative displacement d at the foot, e_a = n.(change of the tangent a_a), t_a = a_a.d, b the curvature,
+        M = a - gap b and m its inverse, it is 2 t m e + gap e m e + t a^-1 b m t (Wriggers, Computational Contact
+        Mechanics, 2006, 4.1, with the facet's curvature). `lean`: force m a; `bend`: force gap m, and M a^-1 b / force.
+        """
+        spot = t.foot[world, point]
+        n = t.normal[world, point]
+        s = jet(mas, t.C, t.D, world, f, spot)
+        b = places.curved(mas, t.C, world, f, spot, n)
+        aa, bb, ab = wp.dot(s.a, s.a), wp.dot(s.b, s.b), wp.dot(s.a, s.b)
+        A = wp.mat22d(aa, ab, ab, bb)
+        B = wp.mat22d(b[0], b[2], b[2], b[1])
+        M = A - gap * B
+        det = wp.determinant(M)
+        t.lean[world, point, 0] = vec3()
+        t.lean[world, point, 1] = vec3()
+        t.bend[world, point] = sym()
+        if force <= f64(0.0) or det <= f64(0.1) * wp.determinant(A):
+            return  # beyond the centre of curvature the foot is none
+        m = force * wp.inverse(M)
+        t.lean[world, point, 0] = vec3(m[0, 0] * s.a + m[0, 1] * s.b)
+        t.lean[world, point, 1] = vec3(m[1, 0] * s.a + m[1, 1] * s.b)
+        N = (M @ wp.inverse(A) @ B) / force
+        t.bend[world, point] = sym(T(gap * m[0, 0]), T(gap * m[1, 1]), T(gap * m[0, 1]), T(N[0, 0]), T(N[1, 1]),
+                                   T(N[0, 1]))  # fmt: skip
+
+    @wp.func
     def put_dead(mas: Masters, at: Attempt, t: Touching, world: int, point: int, f: int, share: f64):
         """The explicit force of a point, where it was as the attempt began."""
         work = -share * wp.dot(at.dead[world, point], t.motion[world, point])
@@ -200,6 +229,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 at.plane[world, point] = m
             for i in range(mas.conn.shape[0]):
                 t.weight[world, point, i] = T(weigh(mas, f, i, t.foot[world, point]))
+                t.slope[world, point, i] = vec2(places.slopes(mas, f, i, t.foot[world, point]))
                 if fresh != 0 or held[0] <= f64(0.0):
                     t.held_weight[world, point, i] = T(weigh(mas, f, i, t.spot[world, point]))
             if fresh != 0:
@@ -215,6 +245,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 pulled = share * friction_force(con, world, c, s, held, inv_h)
                 at.state[world, point] = STIFF
                 t.friction[world, point] = pulled
+                lean_on(mas, t, world, point, f, at.reach[world, point] - s.depth, share * s.law[0])
                 at.force[world, point] = pulled - (share * s.law[0]) * s.n
                 at.energy[world, point] = wp.vec2d(share * (s.law[2] + rub), share * (s.law[3] + wp.abs(rub)))
                 at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),
@@ -272,12 +303,25 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         if at.state[world, point] != STIFF:
             return
         f = t.listed[world, point] - 1
+        n = vec3(t.normal[world, point])
         d = vec3()
+        e = vec2()
         for i in range(facets.conn.shape[0]):
             d += facets.shape[q, i, item] * p[world, facets.conn[i, item]]
         for i in range(mas.conn.shape[0]):
-            d -= t.weight[world, point, i] * p[world, mas.conn[i, f]]
-        t.flux[world, point] = times(at.stiffness[world, point], d)
+            own = p[world, mas.conn[i, f]]
+            d -= t.weight[world, point, i] * own
+            e += wp.dot(n, own) * t.slope[world, point, i]
+        a = t.lean[world, point, 0]
+        b = t.lean[world, point, 1]
+        g = t.bend[world, point]
+        tau = vec2(wp.dot(a, d), wp.dot(b, d))
+        t.flux[world, point] = (
+            times(at.stiffness[world, point], d)
+            + (e[0] + g[3] * tau[0] + g[5] * tau[1]) * a
+            + (e[1] + g[5] * tau[0] + g[4] * tau[1]) * b
+        )
+        t.turned[world, point] = tau + vec2(g[0] * e[0] + g[2] * e[1], g[2] * e[0] + g[1] * e[1])
 
     @wp.kernel(module=module)
     def product_sides(
@@ -307,6 +351,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             point = t.entry[world, t.start[world, f] + k]
             if at.state[world, point] == STIFF:
                 out -= t.weight[world, point, i] * t.flux[world, point]
+                out += wp.dot(t.slope[world, point, i], t.turned[world, point]) * vec3(t.normal[world, point])
         pool[world, mas.pool + index] = out
 
     @wp.kernel(module=module)

@@ -111,7 +111,8 @@ class Pairs(PairSolves):
         shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
         shapes |= dict.fromkeys(("points", "start", "loaded"), (B, F))
         shapes |= {"chunk": (B, -(-F // CHUNK))}
-        shapes |= dict.fromkeys(("weight", "held_weight"), (B, P, t.master_conn.shape[1]))
+        shapes |= dict.fromkeys(("weight", "held_weight", "slope"), (B, P, t.master_conn.shape[1]))
+        shapes |= {"lean": (B, P, 2)}
         out = touching_struct(self.model.dtype)()
         for name, var in touching_struct(self.model.dtype).vars.items():
             setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))

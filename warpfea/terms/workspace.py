@@ -101,7 +101,9 @@ class Workspace:
         skip += () if traits.gated else ("outer", "open")
         skip += () if traits.stored else ("term_sums", "stepped")
         skip += () if traits.limited else ("limit",)
-        skip += () if traits.walls else ("refreshed", "new_walls", "excursions", "unsettled", "touching")
+        skip += () if traits.walls else (
+            "refreshed", "new_walls", "excursions", "unsettled", "touching", "lower", "upper",
+        )
         self.newton = self.struct(
             control_struct(), B, skip=skip,
             history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
