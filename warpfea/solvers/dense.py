@@ -1,21 +1,63 @@
-"""Inverses of dense matrices, one per world, by block Gauss-Jordan with blocks of the size of a tile."""
+"""Inverses of dense matrices, one per world or, where nothing couples parts of it, one per part, by block Gauss-Jordan
+with blocks of the size of a tile."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import scipy.sparse as sp
 import warp as wp
 
 from ..kernels.common.types import precision
 from ..kernels.solvers.levels import LANES, TILE, level_kernels
 from ..kernels.solvers.levels_build import build_kernels
+from ..kernels.solvers.parts import part_kernels
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
+    from .assembled import Pattern
 
-__all__ = ["DenseInverse", "gauss_jordan"]
+__all__ = ["DenseInverse", "Parts", "gauss_jordan"]
+
+
+@dataclass(eq=False)
+class Parts:
+    """Parts of a pattern that no entry couples.
+
+    Attributes:
+        count: their number; most: slots of the largest.
+        slot: device table [part, place], -1 where there is none; place_of: [slot].
+    """
+
+    count: int
+    most: int
+    slot: wp.array
+    place_of: wp.array
+
+    @classmethod
+    def of(cls, model: Model, pattern: Pattern) -> Parts | None:
+        """None where their matrices are not smaller together than that of the whole."""
+        count, label = sp.csgraph.connected_components(pattern.graph, directed=False)
+        slots = len(label)
+        most = int(np.bincount(label).max())
+        if count * filled(3 * most) ** 2 >= filled(3 * slots) ** 2:
+            return None
+        order = np.argsort(label, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(label))])
+        place = np.empty(slots, dtype=np.int64)
+        place[order] = np.arange(slots) - start[label[order]]
+        table = np.full((count, most), -1)
+        table[label, place] = np.arange(slots)
+        return cls(count, most, model.array("levels", table, wp.int32), model.array("levels", place, wp.int32))
+
+
+def filled(unknowns: int) -> int:
+    """Unknowns in whole tiles."""
+    return TILE * -(-unknowns // TILE)
 
 
 def gauss_jordan(
@@ -36,14 +78,22 @@ class DenseInverse:
     """
 
     def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, name: str, unknowns: int, storage: str | None = None
+        self, model: Model, work: Workspace, launch: Launcher, name: str, unknowns: int, storage: str | None = None,
+        parts: Parts | None = None,
     ) -> None:  # fmt: skip
         B, T = model.worlds, model.types.T
         storage = storage or model.dtype
         S, other = precision(storage).T, storage != model.dtype
-        N = TILE * -(-unknowns // TILE)
-        self.worlds, self.launch, self.unknowns, self.size = B, launch, unknowns, N
+        assert not (other and parts)
+        self.worlds, self.launch, self.unknowns, self.parts = B, launch, unknowns, parts
         self.kernels, self.making = level_kernels(model.dtype, storage), build_kernels(model.dtype, storage)
+        if parts:
+            self.by_part = part_kernels(model.dtype)
+            B *= parts.count
+            unknowns = 3 * parts.most
+            self.flags = work.array(f"{name} flags", (B,), wp.int32)
+        self.blocks, self.size = B, filled(unknowns)
+        N = self.size
         self.matrix = work.array(f"{name} inverse", (B, N, N), T)
         self.stored = work.array(f"{name} stored", (B, N, N), S) if other else self.matrix
         self.root = work.array(f"{name} root", (B, N if other else 1), T)
@@ -56,9 +106,26 @@ class DenseInverse:
         self.diagonal = work.array(f"{name} pivots", (B, 1, TILE), T)
         self.column = work.array(f"{name} column", (B, 1, TILE), T)
 
+    def modules(self) -> set[wp.Module]:
+        """Modules that it launches."""
+        more = {self.by_part.module} if self.parts else set()
+        return {self.making.module, self.kernels.module} | more
+
+    def fill(self, pattern: Pattern, value: wp.array, flags: wp.array) -> None:
+        """Take over a matrix of 3x3 blocks in the flagged worlds."""
+        if self.parts:
+            self.launch(self.by_part.spread, self.blocks, [flags, self.flags])
+            args = [pattern.data, value, self.parts.slot, self.parts.place_of, self.flags, self.scale, self.matrix]
+            self.launch(self.by_part.fill_parts, (self.blocks, self.size), args)
+            return
+        args = [pattern.data, value, self.unknowns // 3, flags, self.scale, self.matrix]
+        self.launch(self.making.fill_dense, (self.worlds, self.size // 3), args)
+
     def invert(self, flags: wp.array, *, keep: bool, reduce: Any) -> None:
         """The inverse in the flagged worlds; `reduce` sums rows (residual.Reducer)."""
-        B, N, k, launch = self.worlds, self.size, self.making, self.launch
+        B, N, k, launch = self.blocks, self.size, self.making, self.launch
+        if self.parts:  # `fill` has spread them
+            flags = self.flags
         for first in range(0, N, TILE):
             args = [self.matrix, self.scale, first, flags, self.diagonal, self.pivot]
             launch(k.take_pivot, (B, TILE, TILE), args)
@@ -75,6 +142,12 @@ class DenseInverse:
 
     def apply(self, r: wp.array, x: wp.array, active: wp.array) -> None:
         """x = A^-1 r, [world, unknown]."""
+        if self.parts:
+            n = self.parts.count * 3 * self.parts.most
+            lanes = self.launch.lanes(3 * self.parts.most)
+            args = [self.matrix, self.parts.slot, lanes, r, active, x]
+            self.launch(self.by_part.apply_parts, (self.worlds, self.launch.padded(n * lanes)), args)
+            return
         n = self.unknowns
         lanes = self.launch.lanes(n)
         dim = (self.worlds, self.launch.padded(n * lanes))

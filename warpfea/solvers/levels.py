@@ -13,6 +13,7 @@ from ..kernels.solvers.levels import TILE_SLOTS, level_struct
 from ..model.partition import bisect, connected_groups
 from .assembled import Pattern, make_pattern
 from .band import WHOLE_SLOTS, Band
+from .dense import Parts
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -39,6 +40,7 @@ class Level:
         pattern: pattern of its matrix.
         slots: their number.
         dense: the level is the bottom and inverted as a whole; it has no tiles and no groups.
+        parts: of a dense level, where its matrix falls into parts.
         band: the level is the only one and factored as a whole; it has no tiles and no groups either.
         data: device struct of tiles and groups.
         tiles, groups: their numbers; with 0 groups there is no level below.
@@ -53,6 +55,7 @@ class Level:
     groups: int = 0
     galerkin: tuple[wp.array, wp.array, wp.array] | None = None
     band: Band | None = None
+    parts: Parts | None = None
 
     @property
     def whole(self) -> bool:
@@ -77,8 +80,9 @@ class Points:
     label: np.ndarray
 
 
-def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[Level]:
-    """The levels of a model, finest first; `pattern` is that of H. Without `coarse`, only the tiles of the first."""
+def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, parted: bool = True) -> list[Level]:
+    """The levels of a model, finest first; `pattern` is that of H. Without `coarse`, only the tiles of the first; without
+    `parted` a dense matrix is one, whatever couples its unknowns."""
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
     place = model.reference + origin * position[:, None]
@@ -89,8 +93,13 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True) -> list[
     bottom = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     for depth in range(MAX_LEVELS):
         n = pattern.graph.shape[0]
-        if n <= (bottom if depth else WHOLE_SLOTS):
-            levels.append(Level(pattern, n, True, level_struct(model.dtype)()))
+        parts = Parts.of(model, pattern) if parted else None
+        small = n <= (bottom if depth else WHOLE_SLOTS)
+        if parts and not small:  # a matrix for each
+            fits = parts.most <= WHOLE_SLOTS or depth > 0
+            small = fits and parts.count * parts.most**2 <= bottom**2
+        if small:
+            levels.append(Level(pattern, n, True, level_struct(model.dtype)(), parts=parts))
             return levels
         # larger groups where that makes the next level the bottom: one dense product costs less than more levels
         large = 2 * GROUP_SLOTS

@@ -107,7 +107,7 @@ class Motions:
 
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
-        return {self.kernels.module, self.dense.making.module, self.dense.kernels.module}
+        return {self.kernels.module} | self.dense.modules()
 
     def begin(self, u: wp.array, value: wp.array, flags: wp.array) -> None:
         """The matrix of the bodies by themselves at displacements u; `value`: H without what couples them."""

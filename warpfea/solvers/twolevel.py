@@ -37,7 +37,7 @@ from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
 from ..terms.term import Kept
-from .band import BandFactor, find_band
+from .band import WHOLE_SLOTS, BandFactor, find_band
 from .dense import DenseInverse, gauss_jordan
 from .levels import GROUP_SLOTS, Level, make_levels
 from .motions import Motions, motion_bodies
@@ -65,7 +65,7 @@ class LevelArrays:
     """Matrices and vectors of one level, [world, ...]."""
 
     def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, level: Level, depth: int, storage: str
+        self, model: Model, work: Workspace, launch: Launcher, level: Level, depth: int, storage: str, parted: bool
     ) -> None:  # fmt: skip
         B, n, T = model.worlds, level.slots, model.types.T
         S = precision(storage).T
@@ -74,7 +74,8 @@ class LevelArrays:
         self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
         if level.band is not None:
             return
-        self.dense = DenseInverse(model, work, launch, name, 3 * n, storage) if level.dense else None
+        parts = level.parts if parted else None
+        self.dense = DenseInverse(model, work, launch, name, 3 * n, storage, parts) if level.dense else None
         if not level.dense:
             shape = (B, level.tiles, TILE, TILE)
             self.matrix = work.array(f"{name} inverse", shape, T)
@@ -111,21 +112,25 @@ class TwoLevel:
         self.jacobi = pcg_kernels(model.dtype, model.terms.traits.gated).block_jacobi
         self.dim = (model.worlds, model.slots)
         self.levels = self._levels(kind)
-        self.arrays = [LevelArrays(model, work, launch, level, k, self.storage) for k, level in enumerate(self.levels)]
         self.at, self.terms = residual.at, model.terms
         for term in self.terms:
             term.reserve(self.at, self.assembled, projected=True)
         self.adding = model.terms.traits.pooled or model.terms.traits.ties  # terms add to the matrix
-        band, pattern = self.levels[0].band, self.assembled.pattern
+        first, pattern = self.levels[0], self.assembled.pattern
+        band = first.band
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         # the factors of the operator's own matrix where they cost little, or where equilibria of beams are sought (the
         # matrix made here serves for D alone then); wider ones are kept for longer than that
-        dense = self.levels[0].dense and self.storage == model.dtype and not residual.at.inertia
-        order = find_band(model) if dense else band
+        one = self.storage == model.dtype and not residual.at.inertia and first.slots <= WHOLE_SLOTS
+        order = find_band(model) if first.dense and one else band
         self.follows = order is not None and order.quick and residual.by_matrix and not self.adding
+        parted = not self.follows
+        self.arrays = [
+            LevelArrays(model, work, launch, level, k, self.storage, parted) for k, level in enumerate(self.levels)
+        ]
         if self.follows:
             residual.on_matrix = self._factor
-            self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if dense else 0), model.types.T)
+            self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if first.dense else 0), model.types.T)
         self.value = self.assembled.values("preconditioner matrix")
         self.motions, self.coupling = self._motions()
         self.by_row = 0 if model.device.is_cuda else 1
@@ -151,9 +156,11 @@ class TwoLevel:
         if kind == "banded":
             band = find_band(model) or find_band(model, any_width=True)
             return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=band)]
-        if kind not in model.cache:
-            model.cache[kind] = make_levels(model, pattern, coarse=kind != "tiles")
-        return model.cache[kind]
+        parted = self.storage == model.dtype
+        key = kind if parted else f"{kind} whole"
+        if key not in model.cache:
+            model.cache[key] = make_levels(model, pattern, coarse=kind != "tiles", parted=parted)
+        return model.cache[key]
 
     def register(self, state: State) -> None:
         """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
@@ -184,7 +191,8 @@ class TwoLevel:
         """Modules that it launches."""
         k = self.kernels
         out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules() | self.coupling
-        return out | {self.band.kernels.module if self.band else self.making.module}
+        out |= {self.band.kernels.module if self.band else self.making.module}
+        return out.union(*(arrays.dense.modules() for arrays in self.arrays if not self.band and arrays.dense))
 
     # the seam
 
@@ -340,7 +348,7 @@ class TwoLevel:
         for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
             value = arrays.value if depth else self.value
             if arrays.dense is not None:
-                self._fill_dense(level, arrays.dense, value, flags)
+                arrays.dense.fill(level.pattern, value, flags)
                 arrays.dense.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
                 return
             self._invert_tiles(level, arrays, value, flags, keep=depth == 0)
@@ -376,7 +384,7 @@ class TwoLevel:
         dense = self.arrays[0].dense
         assert dense is not None
         lanes = FACTOR_LANES if self.model.device.is_cuda else 1
-        self._fill_dense(self.levels[0], dense, value, flags)
+        dense.fill(self.levels[0].pattern, value, flags)
         args = [lanes, dense.scale, flags, dense.left, dense.top, dense.matrix]
         self.launch(self.making.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
 
@@ -388,10 +396,6 @@ class TwoLevel:
         if arrays.stored is not arrays.matrix:
             args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]
             self.launch(k.store_tiles, (B, level.tiles, TILE), args)
-
-    def _fill_dense(self, level: Level, dense: DenseInverse, value: Any, flags: wp.array) -> None:
-        args = [level.pattern.data, value, level.slots, flags, dense.scale, dense.matrix]
-        self.launch(self.making.fill_dense, (self.model.worlds, dense.size // 3), args)
 
 
 def _flat(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:
