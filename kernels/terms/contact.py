@@ -261,15 +261,23 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64), touching: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """Forces of facets, and rows of the potential."""
-        world, item = wp.tid()
+        """Forces of facets on their slots and, once per facet, rows of the potential."""
+        world, item, i = wp.tid()
         if active[world] == 0:
             return
-        row = facets.row + item
         first = facets.point + item * facets.points
         touched = wp.int32(IDLE)
         for q in range(facets.points):
             touched = wp.max(touched, at.state[world, first + q])
+        f = vec3()
+        if touched != IDLE:
+            for q in range(facets.points):
+                if at.state[world, first + q] != IDLE:
+                    f += shape_of(facets, at, world, q, i, item) * vec3(at.force[world, first + q])
+        pool[world, facets.pool + i * facets.count + item] = f
+        if i > 0:
+            return
+        row = facets.row + item
         before = at.touched[world, row]
         at.touched[world, row] = touched
         if wp.max(before, touched) == IDLE:
@@ -281,13 +289,6 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                 energy += at.energy[world, first + q]
             if state != STIFF:
                 at.stiffness[world, first + q] = sym()
-        for i in range(facets.conn.shape[0]):
-            f = vec3()
-            if touched != IDLE:
-                for q in range(facets.points):
-                    if at.state[world, first + q] != IDLE:
-                        f += shape_of(facets, at, world, q, i, item) * vec3(at.force[world, first + q])
-            pool[world, facets.pool + i * facets.count + item] = f
         if touched != IDLE:
             wp.atomic_max(touching, world, 1)
         rows[0, world, row] = energy[0]
@@ -347,29 +348,33 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                     k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
 
     @wp.kernel(module=module)
-    def product(
-        facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), at: Attempt,
-        pool: wp.array2d(dtype=vec3),
+    def product_points(
+        facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), at: Attempt
     ):  # fmt: skip
-        """K p of the facets."""
-        world, item = wp.tid()
+        """K times the displacement of each point."""
+        world, item, q = wp.tid()
+        if active[world] == 0 or at.touched[world, facets.row + item] != STIFF:
+            return
+        d = vec3()
+        for i in range(facets.conn.shape[0]):
+            d += shape_of(facets, at, world, q, i, item) * p[world, facets.conn[i, item]]
+        point = facets.point + item * facets.points + q
+        at.flux[world, point] = times(at.stiffness[world, point], d)
+
+    @wp.kernel(module=module)
+    def product_facets(
+        facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=vec3)
+    ):  # fmt: skip
+        """Their sums on the slots of the facets."""
+        world, item, i = wp.tid()
         if active[world] == 0:
             return
-        for i in range(facets.conn.shape[0]):
-            pool[world, facets.pool + i * facets.count + item] = vec3()
-        if at.touched[world, facets.row + item] != STIFF:
-            return
-        for q in range(facets.points):
-            point = facets.point + item * facets.points + q
-            if at.state[world, point] == STIFF:
-                stiff = at.stiffness[world, point]
-                d = vec3()
-                for i in range(facets.conn.shape[0]):
-                    d += shape_of(facets, at, world, q, i, item) * p[world, facets.conn[i, item]]
-                f = times(stiff, d)
-                for i in range(facets.conn.shape[0]):
-                    e = facets.pool + i * facets.count + item
-                    pool[world, e] = pool[world, e] + shape_of(facets, at, world, q, i, item) * f
+        out = vec3()
+        if at.touched[world, facets.row + item] == STIFF:
+            for q in range(facets.points):
+                flux = at.flux[world, facets.point + item * facets.points + q]
+                out += shape_of(facets, at, world, q, i, item) * flux
+        pool[world, facets.pool + i * facets.count + item] = out
 
     @wp.kernel(module=module)
     def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=sym)):
@@ -387,5 +392,6 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     return _types.SimpleNamespace(
         module=module, poses=poses, begin_points=begin_points, settle=settle, explicit_forces=explicit_forces,
         forces=forces, gather_points=gather_points,
-        partial_asked=partial_asked, relax=relax, refresh=refresh, product=product, diagonal=diagonal,
+        partial_asked=partial_asked, relax=relax, refresh=refresh,
+        product_points=product_points, product_facets=product_facets, diagonal=diagonal,
     )  # fmt: skip

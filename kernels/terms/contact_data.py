@@ -106,7 +106,8 @@ def history_struct():
 @functools.cache
 def attempt_struct(dtype: str):
     """What an attempt at a step makes."""
-    T, sym = precision(dtype).T, precision(dtype).sym
+    p = precision(dtype)
+    T, vec3, sym = p.T, p.vec3, p.sym
 
     @wp.struct
     class Attempt:
@@ -133,6 +134,7 @@ def attempt_struct(dtype: str):
         force: wp.array2d(dtype=wp.vec3d)  # that the point adds to the residual, N, where it has one
         energy: wp.array2d(dtype=wp.vec2d)  # its potential, and the size of what that is made of, J
         stiffness: wp.array2d(dtype=sym)  # derivative of the force, N/m; 0 without
+        flux: wp.array2d(dtype=vec3)  # of a product
         touched: wp.array2d(dtype=wp.int32)  # [world, facet row] largest state of its points
         dead: wp.array2d(dtype=wp.vec3d)  # [world, point] explicit force
         dead_spring: wp.array2d(dtype=wp.vec3d)

@@ -110,7 +110,5 @@ def touching_struct(dtype: str):
         points: wp.array2d(dtype=wp.int32)  # [world, facet] points of its list, which begins at `start`
         start: wp.array2d(dtype=wp.int32)
         entry: wp.array2d(dtype=wp.int32)  # [world, point]
-        flux: wp.array2d(dtype=vec3)  # [world, point] of a product
-        loaded: wp.array2d(dtype=wp.int32)  # [world, facet] a point of the list has a force
 
     return Touching

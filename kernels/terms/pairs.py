@@ -268,21 +268,17 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=vec3)
     ):  # fmt: skip
         """Forces of points on the slots of their master facets."""
-        world, f = wp.tid()
+        world, f, i = wp.tid()
         if active[world] == 0:
             return
-        count = t.points[world, f]
-        if count == 0 and t.loaded[world, f] == 0:
-            return
-        t.loaded[world, f] = count
-        for i in range(mas.conn.shape[0]):
-            total = vec3()
-            for k in range(count):
-                point = t.entry[world, t.start[world, f] + k]
-                pulled = t.friction[world, point]
-                total -= t.weight[world, point, i] * vec3(at.force[world, point] - pulled)
-                total -= t.held_weight[world, point, i] * vec3(pulled)
-            pool[world, mas.pool + i * mas.count + f] = total
+        total = vec3()
+        first = t.start[world, f]
+        for k in range(t.points[world, f]):
+            point = t.entry[world, first + k]
+            pulled = t.friction[world, point]
+            total -= t.weight[world, point, i] * vec3(at.force[world, point] - pulled)
+            total -= t.held_weight[world, point, i] * vec3(pulled)
+        pool[world, mas.pool + i * mas.count + f] = total
 
     @wp.func
     def times(k: sym, p: vec3) -> vec3:
@@ -297,10 +293,12 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """K times the relative displacement of each point."""
         world, item, q = wp.tid()
-        if active[world] == 0:
+        if active[world] == 0 or at.touched[world, facets.row + item] != STIFF:
             return
         point = facets.point + item * facets.points + q
         if at.state[world, point] != STIFF:
+            at.flux[world, point] = vec3()
+            t.turned[world, point] = vec2()
             return
         f = t.listed[world, point] - 1
         n = vec3(t.normal[world, point])
@@ -316,7 +314,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         b = t.lean[world, point, 1]
         g = t.bend[world, point]
         tau = vec2(wp.dot(a, d), wp.dot(b, d))
-        t.flux[world, point] = (
+        at.flux[world, point] = (
             times(at.stiffness[world, point], d)
             + (e[0] + g[3] * tau[0] + g[5] * tau[1]) * a
             + (e[1] + g[5] * tau[0] + g[4] * tau[1]) * b
@@ -339,19 +337,17 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             i = index / facets.count
             if at.touched[world, facets.row + item] == STIFF:
                 for q in range(facets.points):
-                    point = facets.point + item * facets.points + q
-                    if at.state[world, point] == STIFF:
-                        out += facets.shape[q, i, item] * t.flux[world, point]
+                    out += facets.shape[q, i, item] * at.flux[world, facets.point + item * facets.points + q]
             pool[world, facets.pool + index] = out
             return
         index -= own
         f = index % mas.count
         i = index / mas.count
+        first = t.start[world, f]
         for k in range(t.points[world, f]):
-            point = t.entry[world, t.start[world, f] + k]
-            if at.state[world, point] == STIFF:
-                out -= t.weight[world, point, i] * t.flux[world, point]
-                out += wp.dot(t.slope[world, point, i], t.turned[world, point]) * vec3(t.normal[world, point])
+            point = t.entry[world, first + k]
+            out -= t.weight[world, point, i] * at.flux[world, point]
+            out += wp.dot(t.slope[world, point, i], t.turned[world, point]) * vec3(t.normal[world, point])
         pool[world, mas.pool + index] = out
 
     @wp.kernel(module=module)

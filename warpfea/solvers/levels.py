@@ -29,6 +29,8 @@ few groups of 64 slots to bend (a cantilever of 180 slots takes half the iterati
 BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """A coarse level of up to this many slots is inverted as one dense matrix, by device; on CUDA that costs less than the
 launches of further levels."""
+PART_ENTRIES = 1344**2
+"""Most pairs of slots in parts of up to WHOLE_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
 
 
@@ -96,8 +98,8 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, parted: 
         parts = Parts.of(model, pattern) if parted else None
         small = n <= (bottom if depth else WHOLE_SLOTS)
         if parts and not small:  # a matrix for each
-            fits = parts.most <= WHOLE_SLOTS or depth > 0
-            small = fits and parts.count * parts.most**2 <= bottom**2
+            entries = parts.count * parts.most**2
+            small = entries <= (bottom**2 if depth else PART_ENTRIES if parts.most <= WHOLE_SLOTS else 0)
         if small:
             levels.append(Level(pattern, n, True, level_struct(model.dtype)(), parts=parts))
             return levels

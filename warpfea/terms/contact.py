@@ -221,7 +221,7 @@ class Contact(Term):
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
             at.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
             args = [group.data, active, s["attempt"], w.pool_force, rows, s["touching"]]
-            at.launch(k.gather_points, (m.worlds, group.count), args)
+            at.launch(k.gather_points, (m.worlds, group.count, group.conn.shape[1]), args)
 
     def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
         """Choose the point of each lumped contact, at work.u."""
@@ -242,10 +242,12 @@ class Contact(Term):
 
     @part("contact")
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        m, w = self.model, at.work
+        m, k, attempt = self.model, self.kernels, at.scratch[self.name]["attempt"]
         for group in self.tables.groups:
-            args = [group.data, active, p, at.scratch[self.name]["attempt"], w.pool_product]
-            at.launch(self.kernels.product, (m.worlds, group.count), args)
+            dim = (m.worlds, group.count)
+            at.launch(k.product_points, (*dim, group.data.points), [group.data, active, p, attempt])
+            args = [group.data, active, attempt, at.work.pool_product]
+            at.launch(k.product_facets, (*dim, group.conn.shape[1]), args)
 
     @part("contact")
     def diagonal(self, at: At, active: wp.array) -> None:

@@ -89,7 +89,7 @@ class Pairs(PairSolves):
         point = (B, P)
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
             ("origin", "reach", "depth", "speed", "held", "next", "plane", "next_plane", "asked", "state", "force",
-             "energy", "stiffness"), point)  # fmt: skip
+             "energy", "stiffness", "flux"), point)  # fmt: skip
         shapes |= dict.fromkeys(("dead", "dead_spring"), point if t.explicit else (1, 1))
         shapes |= dict.fromkeys(("through", "elapsed", "omega", "changes", "asked_size"), (B,))
         shapes |= {"asked_sums": (B, RELAX_LANES), "total": (B, C, len(RECORD)), "touched": (B, t.rows)}
@@ -109,7 +109,7 @@ class Pairs(PairSolves):
         shapes |= dict.fromkeys(("lower", "upper", "wanted_lower", "wanted_upper", "count"), (B * F,))
         shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
         shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
-        shapes |= dict.fromkeys(("points", "start", "loaded"), (B, F))
+        shapes |= dict.fromkeys(("points", "start"), (B, F))
         shapes |= {"chunk": (B, -(-F // CHUNK))}
         shapes |= dict.fromkeys(("weight", "held_weight", "slope"), (B, P, t.master_conn.shape[1]))
         shapes |= {"lean": (B, P, 2)}
@@ -264,9 +264,9 @@ class Pairs(PairSolves):
         wp.capture_if(touching.changed, self._list, at=at)
         for group in t.groups:
             args = [group.data, active, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
-            at.launch(self.shared.gather_points, (m.worlds, group.count), args)
+            at.launch(self.shared.gather_points, (m.worlds, group.count, group.conn.shape[1]), args)
         args = [masters, active, s["attempt"], touching, w.pool_force]
-        at.launch(self.kernels.gather_masters, (m.worlds, t.facets), args)
+        at.launch(self.kernels.gather_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
 
     def _list(self, at: At) -> None:
         """Lists of the points of each master facet."""
