@@ -43,15 +43,23 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def power(x: f64, n: int) -> f64:
-        """x^n."""
-        out = f64(1.0)
-        for _ in range(n):
+        """x^n; mostly n <= 2, which takes no loop."""
+        if n == 0:
+            return f64(1.0)
+        out = x
+        if n > 1:
+            out = x * x
+        for _ in range(2, n):
             out *= x
         return out
 
     @wp.func
     def power_change(x0: f64, x: f64, n: int) -> f64:
         """(x^n - x0^n)/(x - x0)."""
+        if n < 2:
+            return f64(n)
+        if n == 2:
+            return x0 + x
         out = f64(0.0)
         for k in range(n):
             out += power(x, k) * power(x0, n - 1 - k)

@@ -331,7 +331,7 @@ class NewtonLoop:
     def _judge_anew(self) -> None:
         w, flags = self.work, self.work.newton.stepped
         self._each("refresh", flags)
-        self.residual.evaluate(flags, hold=True)
+        self.residual.reconsider(flags)
         self.launch(self.kernels.end_refresh, self.model.worlds, [w.newton, flags])
         self._rarely(self._look_for_inversion)
 

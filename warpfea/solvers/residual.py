@@ -211,6 +211,13 @@ class Residual:
             self.launch(self.stage.take_stage, self.dim, args)
 
     @labelled("residual")
+    def reconsider(self, active: wp.array) -> None:
+        """Forces, g and all sums where only what terms hold has changed since they were taken at this iterate."""
+        self.at.moved = False
+        self.balance(active, hold=True)
+        self.at.moved = True
+
+    @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
         """q, forces, g and all sums at the iterate v; `hold`: Phi holds the non-potential forces of this iterate."""
         w, launch = self.work, self.launch

@@ -212,7 +212,7 @@ class Contact(Term):
     @part("contact")
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        if self.exact:
+        if self.exact and at.moved:
             self.exact.follow(at, s["u"], active)
         if fresh:
             self._pick(at, active, fresh=1)

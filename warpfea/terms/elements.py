@@ -45,6 +45,8 @@ class Elements(Term):
         return {kernels.module for kernels in self.kernels(at)}
 
     def force(self, at: At, active: wp.array) -> None:
+        if not at.moved:
+            return
         m, w, launch = self.model, at.work, at.launch
         for block, kernels in zip(m.blocks, self.kernels(at)):
             lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1

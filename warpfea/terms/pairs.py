@@ -254,9 +254,10 @@ class Pairs(PairSolves):
     def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
         s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
         touching, masters = s["touching"], s["masters"]
-        if self.exact:
-            self.exact.follow(at, s["u"], active)
-        self._seek(at, s["u"], active, settling=0)
+        if at.moved:
+            if self.exact:
+                self.exact.follow(at, s["u"], active)
+            self._seek(at, s["u"], active, settling=0)
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], s["u"], active, fresh]
             dim = (m.worlds, group.count, group.data.points)

@@ -54,6 +54,7 @@ class At:
         inertia: the step is dynamic; in statics there are no rates.
         midpoint: forces are those of the middle of a step, at work.u_stage and work.stage_time.
         accelerated: the scheme keeps accelerations.
+        moved: forces are taken at another place than those before; where not, only what terms hold has changed.
         options: of the solver.
         scratch: what terms allocated, by their names.
     """
@@ -66,6 +67,7 @@ class At:
     inertia: bool
     midpoint: bool = False
     accelerated: bool = False
+    moved: bool = True
     options: Any = None
     scratch: dict[str, Any] = field(default_factory=dict)
 
