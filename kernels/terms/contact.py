@@ -9,6 +9,7 @@ import types as _types
 
 import warp as wp
 
+from ..common.lanes import lane_functions
 from ..common.types import SMALL, kernel_module, precision
 from .contact_colliders import MESHES, collider_functions
 from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
@@ -35,6 +36,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     T, vec3, sym = p.T, p.vec3, p.sym
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
+    lane_sum = lane_functions(dtype).lane_sum
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
     f = touch_functions(dtype, meshes)
     along, plane, record_of, reach, acts = f.along, f.plane, f.record_of, f.reach, f.acts
@@ -258,23 +260,30 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def gather_points(
-        facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=vec3),
+        facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, at: Attempt, pool: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64), touching: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """Forces of facets on their slots and, once per facet, rows of the potential."""
-        world, item, i = wp.tid()
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        entry = wp.min(index / lanes, facets.count * facets.conn.shape[0] - 1)
+        item = entry % facets.count
+        i = entry / facets.count
+        lane = index % lanes
         first = facets.point + item * facets.points
         touched = wp.int32(IDLE)
         for q in range(facets.points):
             touched = wp.max(touched, at.state[world, first + q])
         f = vec3()
         if touched != IDLE:
-            for q in range(facets.points):
+            for q in range(lane, facets.points, lanes):
                 if at.state[world, first + q] != IDLE:
                     f += shape_of(facets, at, world, q, i, item) * vec3(at.force[world, first + q])
-        pool[world, facets.pool + i * facets.count + item] = f
+        f = lane_sum(f, lanes)
+        if lane > 0:
+            return
+        pool[world, facets.pool + entry] = f
         if i > 0:
             return
         row = facets.row + item
@@ -363,18 +372,22 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def product_facets(
-        facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=vec3)
+        facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, at: Attempt, pool: wp.array2d(dtype=vec3)
     ):  # fmt: skip
         """Their sums on the slots of the facets."""
-        world, item, i = wp.tid()
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        entry = wp.min(index / lanes, facets.count * facets.conn.shape[0] - 1)
+        item = entry % facets.count
         out = vec3()
         if at.touched[world, facets.row + item] == STIFF:
-            for q in range(facets.points):
+            for q in range(index % lanes, facets.points, lanes):
                 flux = at.flux[world, facets.point + item * facets.points + q]
-                out += shape_of(facets, at, world, q, i, item) * flux
-        pool[world, facets.pool + i * facets.count + item] = out
+                out += shape_of(facets, at, world, q, entry / facets.count, item) * flux
+        out = lane_sum(out, lanes)
+        if index % lanes == 0:
+            pool[world, facets.pool + entry] = out
 
     @wp.kernel(module=module)
     def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=sym)):

@@ -62,6 +62,7 @@ def touching_struct(dtype: str):
     """What an attempt makes; [world, control]: monomial m of facet f is control `most f + m`."""
     p = precision(dtype)
     T, vec3, vec2, sym = p.T, p.vec3, p.vec2, p.sym
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
 
     @wp.struct
     class Touching:
@@ -70,6 +71,8 @@ def touching_struct(dtype: str):
         C0: wp.array2d(dtype=wp.vec3d)  # as the attempt began
         D0: wp.array2d(dtype=wp.vec3d)
         V0: wp.array2d(dtype=wp.vec3d)  # of velocities then
+        middle: wp.array2d(dtype=mat43)  # [world, facet] place in its middle and derivatives there, rows as of a Jet
+        middle0: wp.array2d(dtype=mat43)  # as the attempt began
         lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
         upper: wp.array(dtype=wp.vec3)
         wanted_lower: wp.array(dtype=wp.vec3)

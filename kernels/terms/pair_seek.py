@@ -48,6 +48,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         f.jet, f.moved, f.carried, f.coordinates, f.outside, f.middle, f.locate, f.follow, f.outward, f.foot_of
     )  # fmt: skip
     Jet = f.Jet
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
 
     @wp.func
@@ -109,9 +110,19 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 inside = False
         return inside
 
+    @wp.func
+    def rows_of(s: Jet) -> mat43:
+        """A jet as it is kept."""
+        return mat43(s.x[0], s.x[1], s.x[2], s.a[0], s.a[1], s.a[2], s.b[0], s.b[1], s.b[2], s.c[0], s.c[1], s.c[2])
+
+    @wp.func
+    def jet_of(m: mat43) -> Jet:
+        """A jet that was kept."""
+        return Jet(m[0], m[1], m[2], m[3])
+
     @wp.kernel(module=module)
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), t: Touching):
-        """Whether facets, as the attempt began and now, are within their boxes; and new boxes."""
+        """Whether facets, as the attempt began and now, are within their boxes; new boxes; and their middles."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -132,6 +143,9 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         index = world * mas.count + item
         if not contains(t.lower[index], t.upper[index], down(low), up(high)):
             t.stale[0] = 1
+        spot = middle(mas.corners[kind])
+        t.middle[world, item] = rows_of(jet(mas, t.C, t.D, world, item, spot))
+        t.middle0[world, item] = rows_of(jet(mas, t.C0, t.D0, world, item, spot))
         room = f64(MARGIN) * mas.size[item]
         pad = vec3d(room, room, room)
         t.wanted_lower[index] = down(low - pad)
@@ -257,8 +271,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         """Whether a point went in through a facet on its way, and deep."""
         kind = mas.kind[f]
         m = middle(mas.corners[kind])
-        old = jet(mas, t.C0, t.D0, world, f, m)
-        new = jet(mas, t.C, t.D, world, f, m)
+        old = jet_of(t.middle0[world, f])
+        new = jet_of(t.middle[world, f])
         way = x - x0 - (new.x - old.x)
         deep = f64(LOST) * mas.limit[f]
         if wp.length(way) <= deep:
@@ -320,11 +334,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     def beside(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d) -> bool:
         """Whether a point that did not move far is beside a facet, as the tangent plane in the middle tells."""
         corners = mas.corners[mas.kind[f]]
-        center = middle(corners)
-        s = jet(mas, t.C, t.D, world, f, center)
-        if outside(corners, center + coordinates(s, x - s.x)) <= f64(GLANCE):
+        s = jet_of(t.middle[world, f])
+        if outside(corners, middle(corners) + coordinates(s, x - s.x)) <= f64(GLANCE):
             return False
-        path = x - x0 - carried(mas, t.C, t.D, t.C0, t.D0, world, f, center)
+        path = x - x0 - (s.x - t.middle0[world, f][0])
         return wp.length(path) <= f64(0.5) * mas.limit[f]
 
     @wp.func

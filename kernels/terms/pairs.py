@@ -11,6 +11,7 @@ import types as _types
 
 import warp as wp
 
+from ..common.lanes import lane_functions
 from ..common.types import SMALL, kernel_module, precision
 from .contact import IDLE, LOADED, STIFF
 from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
@@ -64,6 +65,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     friction_potential, friction_force, point_stiffness = k.friction_potential, k.friction_force, k.point_stiffness
     coefficient, tangent_damping, elastic = k.coefficient, k.tangent_damping, law_functions().elastic
     jet, weigh = places.jet, places.weigh
+    lane_sum = lane_functions(dtype).lane_sum
     module = kernel_module(f"pairs_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
@@ -265,20 +267,26 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def gather_masters(
-        mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=vec3)
+        mas: Masters, active: wp.array(dtype=wp.int32), lanes: int, at: Attempt, t: Touching,
+        pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Forces of points on the slots of their master facets."""
-        world, f, i = wp.tid()
+        world, index = wp.tid()
         if active[world] == 0:
             return
+        entry = wp.min(index / lanes, mas.count * mas.conn.shape[0] - 1)
+        f = entry % mas.count
+        i = entry / mas.count
         total = vec3()
         first = t.start[world, f]
-        for k in range(t.points[world, f]):
+        for k in range(index % lanes, t.points[world, f], lanes):
             point = t.entry[world, first + k]
             pulled = t.friction[world, point]
             total -= t.weight[world, point, i] * vec3(at.force[world, point] - pulled)
             total -= t.held_weight[world, point, i] * vec3(pulled)
-        pool[world, mas.pool + i * mas.count + f] = total
+        total = lane_sum(total, lanes)
+        if index % lanes == 0:
+            pool[world, mas.pool + entry] = total
 
     @wp.func
     def times(k: sym, p: vec3) -> vec3:
@@ -323,8 +331,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def product_sides(
-        mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching,
-        pool: wp.array2d(dtype=vec3),
+        mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, last: int, at: Attempt,
+        t: Touching, pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Their sums on the slots of the points' own facets, and of master facets where the launch goes on to these."""
         world, index = wp.tid()
@@ -332,23 +340,28 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         out = vec3()
         own = facets.count * facets.conn.shape[0]
-        if index < own:
-            item = index % facets.count
-            i = index / facets.count
+        entry = wp.min(index / lanes, last)
+        lane = index % lanes
+        place = facets.pool + entry
+        if entry < own:
+            item = entry % facets.count
+            i = entry / facets.count
             if at.touched[world, facets.row + item] == STIFF:
-                for q in range(facets.points):
+                for q in range(lane, facets.points, lanes):
                     out += facets.shape[q, i, item] * at.flux[world, facets.point + item * facets.points + q]
-            pool[world, facets.pool + index] = out
-            return
-        index -= own
-        f = index % mas.count
-        i = index / mas.count
-        first = t.start[world, f]
-        for k in range(t.points[world, f]):
-            point = t.entry[world, first + k]
-            out -= t.weight[world, point, i] * at.flux[world, point]
-            out += wp.dot(t.slope[world, point, i], t.turned[world, point]) * vec3(t.normal[world, point])
-        pool[world, mas.pool + index] = out
+        else:
+            entry -= own
+            place = mas.pool + entry
+            f = entry % mas.count
+            i = entry / mas.count
+            first = t.start[world, f]
+            for k in range(lane, t.points[world, f], lanes):
+                point = t.entry[world, first + k]
+                out -= t.weight[world, point, i] * at.flux[world, point]
+                out += wp.dot(t.slope[world, point, i], t.turned[world, point]) * vec3(t.normal[world, point])
+        out = lane_sum(out, lanes)
+        if lane == 0:
+            pool[world, place] = out
 
     @wp.kernel(module=module)
     def diagonal_masters(

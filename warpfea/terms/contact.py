@@ -220,8 +220,9 @@ class Contact(Term):
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
             at.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
-            args = [group.data, active, s["attempt"], w.pool_force, rows, s["touching"]]
-            at.launch(k.gather_points, (m.worlds, group.count, group.conn.shape[1]), args)
+            dim, lanes = group.sides(at.launch, m.worlds)
+            args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["touching"]]
+            at.launch(k.gather_points, dim, args)
 
     def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
         """Choose the point of each lumped contact, at work.u."""
@@ -244,10 +245,11 @@ class Contact(Term):
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
         m, k, attempt = self.model, self.kernels, at.scratch[self.name]["attempt"]
         for group in self.tables.groups:
-            dim = (m.worlds, group.count)
-            at.launch(k.product_points, (*dim, group.data.points), [group.data, active, p, attempt])
-            args = [group.data, active, attempt, at.work.pool_product]
-            at.launch(k.product_facets, (*dim, group.conn.shape[1]), args)
+            dim = (m.worlds, group.count, group.data.points)
+            at.launch(k.product_points, dim, [group.data, active, p, attempt])
+            dim, lanes = group.sides(at.launch, m.worlds)
+            args = [group.data, active, lanes, attempt, at.work.pool_product]
+            at.launch(k.product_facets, dim, args)
 
     @part("contact")
     def diagonal(self, at: At, active: wp.array) -> None:

@@ -27,6 +27,7 @@ from .collider_meshes import mesh_tables, sizes
 from .time_laws import TimeLaws
 
 if TYPE_CHECKING:
+    from ..base.launch import Launcher
     from ..model.model import Model
 
 __all__ = ["PER_WORLD", "ContactTables", "FacetGroup", "beta_of", "block_entries", "hunt_crossley_damping"]
@@ -79,6 +80,10 @@ def clamped_slots(model: Model) -> np.ndarray:
     return np.asarray((held > 0).all(axis=1))
 
 
+LISTED = 8
+"""Threads that share a sum over the points of a facet on CUDA."""
+
+
 @dataclass(eq=False)
 class FacetGroup:
     """Facets with as many slots and points each, those of a contact next to each other.
@@ -98,6 +103,11 @@ class FacetGroup:
     def count(self) -> int:
         """Facets."""
         return len(self.conn)
+
+    def sides(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
+        """Threads that sum over the points of a facet for each of its slots, and how many share a slot."""
+        lanes = launch.lanes(LISTED)
+        return (worlds, launch.padded(lanes * self.conn.size)), lanes
 
 
 class ContactTables:

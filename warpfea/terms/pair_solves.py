@@ -11,7 +11,7 @@ from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import contact_block_kernels
 from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pairs import pair_kernels
-from .contact_tables import block_entries
+from .contact_tables import LISTED, block_entries
 from .pair_motions import PairMotions
 from .pair_tables import PairTables
 from .term import At, Term, part
@@ -45,9 +45,10 @@ class PairSolves(Term):
             dim = (m.worlds, group.count, group.data.points)
             at.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
         for group in t.groups:  # the last one takes the master facets along
-            masters_too = t.master_conn.size if group is t.groups[-1] else 0
-            args = [masters, group.data, active, attempt, touching, w.pool_product]
-            at.launch(k.product_sides, (m.worlds, group.conn.size + masters_too), args)
+            entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
+            lanes = at.launch.lanes(LISTED)
+            args = [masters, group.data, active, lanes, entries - 1, attempt, touching, w.pool_product]
+            at.launch(k.product_sides, (m.worlds, at.launch.padded(lanes * entries)), args)
 
     @part("pairs")
     def diagonal(self, at: At, active: wp.array) -> None:

@@ -22,6 +22,7 @@ from ..model.state import State
 from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
+from .contact_tables import LISTED
 from .contact_starts import reference_place, store_overlaps, touching_depth
 from .pair_solves import PairSolves
 from .pair_survey import survey
@@ -109,7 +110,7 @@ class Pairs(PairSolves):
         shapes |= dict.fromkeys(("lower", "upper", "wanted_lower", "wanted_upper", "count"), (B * F,))
         shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
         shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
-        shapes |= dict.fromkeys(("points", "start"), (B, F))
+        shapes |= dict.fromkeys(("points", "start", "middle", "middle0"), (B, F))
         shapes |= {"chunk": (B, -(-F // CHUNK))}
         shapes |= dict.fromkeys(("weight", "held_weight", "slope"), (B, P, t.master_conn.shape[1]))
         shapes |= {"lean": (B, P, 2)}
@@ -264,10 +265,12 @@ class Pairs(PairSolves):
             at.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
         wp.capture_if(touching.changed, self._list, at=at)
         for group in t.groups:
-            args = [group.data, active, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
-            at.launch(self.shared.gather_points, (m.worlds, group.count, group.conn.shape[1]), args)
-        args = [masters, active, s["attempt"], touching, w.pool_force]
-        at.launch(self.kernels.gather_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
+            dim, lanes = group.sides(at.launch, m.worlds)
+            args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
+            at.launch(self.shared.gather_points, dim, args)
+        lanes = at.launch.lanes(LISTED)
+        args = [masters, active, lanes, s["attempt"], touching, w.pool_force]
+        at.launch(self.kernels.gather_masters, (m.worlds, at.launch.padded(lanes * t.master_conn.size)), args)
 
     def _list(self, at: At) -> None:
         """Lists of the points of each master facet."""
