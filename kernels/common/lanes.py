@@ -7,7 +7,7 @@ import warp as wp
 
 from .types import precision
 
-__all__ = ["WARP", "lane_functions"]
+__all__ = ["WARP", "block_memory", "lane_functions"]
 
 WARP = 32
 """Threads of a warp."""
@@ -48,6 +48,38 @@ def lane_sum_float64(x: wp.float64, lanes: int) -> wp.float64:
 def lane_sum_float32(x: wp.float32, lanes: int) -> wp.float32:
     """Sum of x over a run of `lanes` threads, in its first thread; x itself on the CPU."""
     ...
+
+
+_SHARED = """
+    #if defined(__CUDA_ARCH__)
+    __shared__ {number} memory[{size}];
+    return (uint64_t)memory;
+    #else
+    return outside;
+    #endif
+"""
+_NUMBER = {"float64": "double", "float32": "float"}
+
+
+@functools.cache
+def block_memory(dtype: str, size: int) -> _types.SimpleNamespace:
+    """Device functions for `size` numbers that the threads of a block share.
+
+    `open(outside)` is where they are: memory of the block or, on the CPU, that at `outside`. `load(at, i)`,
+    `store(at, i, x)`.
+    """
+    T, number = precision(dtype).T, _NUMBER[dtype]
+
+    @wp.func_native(snippet=_SHARED.format(number=number, size=size))
+    def open_memory(outside: wp.uint64) -> wp.uint64: ...
+
+    @wp.func_native(snippet=f"return (({number}*)at)[i];")
+    def load(at: wp.uint64, i: int) -> T: ...
+
+    @wp.func_native(snippet=f"(({number}*)at)[i] = x;")
+    def store(at: wp.uint64, i: int, x: T): ...
+
+    return _types.SimpleNamespace(open=open_memory, load=load, store=store)
 
 
 @functools.cache

@@ -8,7 +8,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.lanes import lane_functions
+from ..common.lanes import block_memory, lane_functions
 from ..common.structs import pattern_struct
 from ..common.types import SMALL, kernel_module, precision
 from .levels import TILE, level_struct
@@ -38,6 +38,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     sync = lane_functions(dtype).sync
+    memory, line = block_memory(dtype, TILE * TILE), block_memory(dtype, TILE)
     # a pivot below this share of its diagonal entry is rounding: the functions are linearly dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
     # the same of a factorisation, which also takes what is almost a mechanism
@@ -85,7 +86,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         column: wp.array3d(dtype=T),
         matrix: wp.array4d(dtype=T),
     ):
-        """Inverse of each tile in place, by Gauss-Jordan.
+        """Inverse of each tile in place, by Gauss-Jordan; a block of threads has the tile in memory of its own.
 
         A row whose pivot is not safely positive against the diagonal of A is dropped: zeros, or with `keep` the inverse
         of that diagonal. The result is therefore always positive semi-definite, with `keep` definite.
@@ -97,37 +98,53 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         world = index / tiles
         if active[world] == 0:
             return
+        size_of = wp.uint64(wp.static(wp.types.type_size_in_bytes(T)))
+        own = matrix.ptr + size_of * wp.uint64((world * tiles + tile) * TILE * TILE)
+        at = memory.open(own)
+        c = line.open(column.ptr + size_of * wp.uint64((world * tiles + tile) * TILE))
+        if lanes > 1:
+            for i in range(lane, TILE * TILE, lanes):
+                memory.store(at, i, memory.load(own, i))
         for k in range(TILE):
-            for i in range(lane, TILE, lanes):
-                column[world, tile, i] = matrix[world, tile, i, k]
             sync()
-            pivot = column[world, tile, k]
+            for i in range(lane, TILE, lanes):
+                line.store(c, i, memory.load(at, TILE * i + k))
+            sync()
+            pivot = line.load(c, k)
             size = diagonal[world, tile, k]
             if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
                 scale = T(1.0) / pivot
                 for j in range(lane, TILE, lanes):
                     if j == k:
                         for i in range(TILE):
-                            matrix[world, tile, i, k] = -scale * column[world, tile, i]
-                        matrix[world, tile, k, k] = scale
+                            memory.store(at, TILE * i + k, -scale * line.load(c, i))
+                        memory.store(at, TILE * k + k, scale)
                     else:
-                        d = scale * matrix[world, tile, k, j]
-                        for i in range(TILE):
-                            matrix[world, tile, i, j] = matrix[world, tile, i, j] - d * column[world, tile, i]
-                        matrix[world, tile, k, j] = d
+                        d = scale * memory.load(at, TILE * k + j)
+                        for i in range(0, TILE, 4):  # four rows load at once
+                            s = vec4()
+                            for a in range(4):
+                                s[a] = memory.load(at, TILE * (i + a) + j) - d * line.load(c, i + a)
+                            for a in range(4):
+                                memory.store(at, TILE * (i + a) + j, s[a])
+                        memory.store(at, TILE * k + j, d)
             else:
                 for j in range(lane, TILE, lanes):
-                    matrix[world, tile, k, j] = T(0.0)
-                    matrix[world, tile, j, k] = T(0.0)
+                    memory.store(at, TILE * k + j, T(0.0))
+                    memory.store(at, TILE * j + k, T(0.0))
                 sync()
                 if lane == 0 and keep != 0 and wp.abs(size) > T(0.0):
                     # the sign marks the row, which stays zero for the pivots to come and is filled in at the end
                     diagonal[world, tile, k] = -wp.abs(size)
-            sync()
+        sync()
         for j in range(lane, TILE, lanes):
             size = diagonal[world, tile, j]
             if size < T(0.0) and keep != 0:
-                matrix[world, tile, j, j] = -T(1.0) / size
+                memory.store(at, TILE * j + j, -T(1.0) / size)
+        sync()
+        if lanes > 1:
+            for i in range(lane, TILE * TILE, lanes):
+                memory.store(own, i, memory.load(at, i))
 
     @wp.kernel(module=module)
     def fill_dense(

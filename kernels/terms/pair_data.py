@@ -72,6 +72,7 @@ def touching_struct(dtype: str):
         D0: wp.array2d(dtype=wp.vec3d)
         V0: wp.array2d(dtype=wp.vec3d)  # of velocities then
         middle: wp.array2d(dtype=mat43)  # [world, facet] place in its middle and derivatives there, rows as of a Jet
+        swell: wp.array2d(dtype=wp.float64)  # [world, facet] most that it rises above the plane in its middle, m
         middle0: wp.array2d(dtype=mat43)  # as the attempt began
         lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
         upper: wp.array(dtype=wp.vec3)

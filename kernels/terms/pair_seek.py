@@ -144,7 +144,16 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         if not contains(t.lower[index], t.upper[index], down(low), up(high)):
             t.stale[0] = 1
         spot = middle(mas.corners[kind])
-        t.middle[world, item] = rows_of(jet(mas, t.C, t.D, world, item, spot))
+        s = jet(mas, t.C, t.D, world, item, spot)
+        n = outward(s)
+        swell = f64(0.0)
+        for q in range(count):
+            x = vec3d()
+            for m in range(count):
+                x += mas.hull[kind, q, m] * (mas.X[m, item] + t.C[world, mas.most * item + m])
+            swell = wp.max(swell, wp.dot(x - s.x, n))
+        t.swell[world, item] = swell
+        t.middle[world, item] = rows_of(s)
         t.middle0[world, item] = rows_of(jet(mas, t.C0, t.D0, world, item, spot))
         room = f64(MARGIN) * mas.size[item]
         pad = vec3d(room, room, room)
@@ -331,10 +340,13 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         t.whole[world, point] = spring + motion
 
     @wp.func
-    def beside(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d) -> bool:
-        """Whether a point that did not move far is beside a facet, as the tangent plane in the middle tells."""
+    def apart(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d, pad: f64) -> bool:
+        """Whether a point is above a facet by more than `pad`, or did not move far and is beside it, as the tangent plane
+        in the middle tells."""
         corners = mas.corners[mas.kind[f]]
         s = jet_of(t.middle[world, f])
+        if wp.dot(x - s.x, outward(s)) > f64(2.0) * pad + t.swell[world, f]:
+            return True
         if outside(corners, middle(corners) + coordinates(s, x - s.x)) <= f64(GLANCE):
             return False
         path = x - x0 - (s.x - t.middle0[world, f][0])
@@ -415,7 +427,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]
-                if beside(mas, t, world, f, x, x0):
+                if apart(mas, t, world, f, x, x0, pad):
                     continue
                 found = locate(mas, t.C, t.D, world, f, x, middle(corners))
                 spot = vec3d(found[0], found[1], found[2])

@@ -110,7 +110,7 @@ class Pairs(PairSolves):
         shapes |= dict.fromkeys(("lower", "upper", "wanted_lower", "wanted_upper", "count"), (B * F,))
         shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
         shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
-        shapes |= dict.fromkeys(("points", "start", "middle", "middle0"), (B, F))
+        shapes |= dict.fromkeys(("points", "start", "middle", "middle0", "swell"), (B, F))
         shapes |= {"chunk": (B, -(-F // CHUNK))}
         shapes |= dict.fromkeys(("weight", "held_weight", "slope"), (B, P, t.master_conn.shape[1]))
         shapes |= {"lean": (B, P, 2)}
