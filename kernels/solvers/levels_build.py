@@ -99,9 +99,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         if active[world] == 0:
             return
         size_of = wp.uint64(wp.static(wp.types.type_size_in_bytes(T)))
-        own = matrix.ptr + size_of * wp.uint64((world * tiles + tile) * TILE * TILE)
+        own = matrix.ptr + size_of * wp.uint64(world * tiles + tile) * wp.uint64(TILE * TILE)
         at = memory.open(own)
-        c = line.open(column.ptr + size_of * wp.uint64((world * tiles + tile) * TILE))
+        c = line.open(column.ptr + size_of * wp.uint64(world * tiles + tile) * wp.uint64(TILE))
         if lanes > 1:
             for i in range(lane, TILE * TILE, lanes):
                 memory.store(at, i, memory.load(own, i))
