@@ -38,6 +38,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     sync = lane_functions(dtype).sync
+    ROW_BYTES = TILE * wp.types.type_size_in_bytes(T)
     memory, line = block_memory(dtype, TILE * TILE), block_memory(dtype, TILE)
     # a pivot below this share of its diagonal entry is rounding: the functions are linearly dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
@@ -98,10 +99,10 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         world = index / tiles
         if active[world] == 0:
             return
-        size_of = wp.uint64(wp.static(wp.types.type_size_in_bytes(T)))
-        own = matrix.ptr + size_of * wp.uint64(world * tiles + tile) * wp.uint64(TILE * TILE)
+        place = wp.uint64(world * tiles + tile)
+        own = matrix.ptr + place * wp.uint64(wp.static(ROW_BYTES * TILE))
         at = memory.open(own)
-        c = line.open(column.ptr + size_of * wp.uint64(world * tiles + tile) * wp.uint64(TILE))
+        c = line.open(column.ptr + place * wp.uint64(wp.static(ROW_BYTES)))
         if lanes > 1:
             for i in range(lane, TILE * TILE, lanes):
                 memory.store(at, i, memory.load(own, i))
