@@ -13,7 +13,8 @@ import warpfea as wf
 from warpfea.model.contact_points import contact_points
 from warpfea.model.handles import SurfaceSet
 from warpfea.terms.contact import Contact
-from warpfea.terms.contact_tables import beta_of, law_numbers
+from warpfea.terms.contact_tables import law_numbers
+from warpfea.terms.facet_tables import beta_of
 
 G = 9.81
 STIFF = wf.SVK(E=1e9, nu=0.3, density=1000.0)
