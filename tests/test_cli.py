@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import pathlib
@@ -11,6 +10,7 @@ import signal
 import subprocess
 import sys
 
+import mesh_writers as writers
 import numpy as np
 import pytest
 
@@ -62,17 +62,9 @@ def later() -> wf.ModelBuilder:
 """
 
 
-def load_writers():
-    spec = importlib.util.spec_from_file_location("mesh_writers", HERE / "mesh_writers.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A working folder with a mesh, a file of scenes, and things that are neither."""
-    writers = load_writers()
     mesh = wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1))
     writers.write(writers.Parts.of(mesh), tmp_path / "part.msh", "msh22")
     (tmp_path / "mine.py").write_text(SCENES)
@@ -402,7 +394,6 @@ def test_info_shows_the_groups_of_a_mesh_without_a_material(folder, capfd):
 
 
 def test_info_of_surface_groups_only_and_of_a_shell(folder, capfd):
-    writers = load_writers()
     box = wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1))
     parts = writers.Parts.of(box)
     writers.write(parts, folder / "part.msh", "msh22")
