@@ -6,6 +6,7 @@ import pathlib
 
 import numpy as np
 import pytest
+from scene_runs import scene_simulation
 
 import warpfea as wf
 from warpfea.builder.scene import find
@@ -23,10 +24,7 @@ COARSE = {
 
 def simulate(name, t_end=None, steps=None, dt=None, **parameters):
     """A scene at its own settings, run to t_end or for some steps."""
-    scene = find(name)
-    model = scene(**parameters).finalize(device="cpu")
-    dt = dt or scene.dt
-    sim = wf.Simulation(model, dt=dt, integrator=scene.integrator, solver=wf.NewtonPCG(tol=scene.tol))
+    sim = scene_simulation(name, dt, **parameters)
     if steps:
         for _ in range(steps):
             assert sim.step().converged.all()

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from warpfea.kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
 
-from warpfea.terms.contact_tables import beta_of, hunt_crossley_damping
+from warpfea.terms.facet_tables import beta_of, hunt_crossley_damping
 
 COUNT = 4000
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]

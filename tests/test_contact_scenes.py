@@ -6,25 +6,18 @@ import math
 
 import numpy as np
 import pytest
+from scene_runs import run_contact_scene
 from scipy.integrate import solve_ivp
 
 import warpfea as wf
-from warpfea.builder.scene import find
 
 G = 9.81
 
 
 def simulate(name, t_end=None, **parameters):
-    """A scene at its own settings until t_end, and times (steps,) and path (steps, 3) of its first probe."""
-    scene = find(name)
-    model = scene(**parameters).finalize(device="cpu")
-    sim = wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, solver=wf.NewtonPCG(tol=scene.tol))
-    for _ in range(round((t_end or scene.t_end) / scene.dt)):
-        assert sim.step().converged.all()
-    e = sim.energies()
-    scale = max(abs(e[name][0]) for name in ("kinetic", "potential", "contact_loss", "collider_work"))
-    assert abs(e["ledger_residual"][0]) < 10.0 * scene.tol * scale
-    probe = sim.probe(model.description.probes[0].name)
+    """A scene that was run, and times (steps,) and path (steps, 3) of its first probe."""
+    sim = run_contact_scene(name, t_end, work="collider_work", **parameters)
+    probe = sim.probe(sim.model.description.probes[0].name)
     return sim, np.asarray(probe.time), probe.position[0]
 
 

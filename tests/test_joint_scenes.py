@@ -9,6 +9,7 @@ import re
 
 import numpy as np
 import pytest
+from scene_runs import scene_simulation
 
 import warpfea as wf
 from warpfea.builder.scene import find
@@ -28,14 +29,12 @@ STEEL = {"E": 2e11, "density": 7870.0, "slider_mass": 0.0755}
 
 def simulate(name, steps=0, **parameters):
     """A scene at its own settings after some steps, each within the tolerance of its constraints."""
-    scene = find(name)
-    model = scene(**parameters).finalize(device="cpu")
-    sim = wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, solver=wf.NewtonPCG(tol=scene.tol))
+    sim = scene_simulation(name, **parameters)
     for _ in range(steps):
         report = sim.step()
         assert report.converged.all()
         assert report.halvings[0] == 0
-        assert report.violation[0] <= 1e-8 * model.size
+        assert report.violation[0] <= 1e-8 * sim.model.size
     return sim
 
 

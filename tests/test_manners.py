@@ -9,6 +9,7 @@ import sys
 import warnings
 from dataclasses import replace
 
+import mesh_writers as writers
 import numpy as np
 import pytest
 import warp as wp
@@ -177,19 +178,14 @@ def test_a_body_force_needs_a_density():
 
 def written(tmp_path, mesh=BOX, drop=(), kind="msh22"):
     """A Gmsh file of a mesh, without the groups of some dimensions."""
-    import importlib.util
-
-    spec = importlib.util.spec_from_file_location("mesh_writers", ROOT / "tests" / "mesh_writers.py")
-    writers = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(writers)
     parts = writers.Parts.of(mesh)
     path = tmp_path / "part.msh"
     writers.write(parts, path, kind)
-    return path, parts, writers
+    return path, parts
 
 
 def test_a_part_in_mm_read_as_m_warns_with_the_scale(tmp_path):
-    path, _, _ = written(tmp_path, BOX.transformed(scale=50.0))  # 50 m x 10 m x 10 m of steel
+    path, _ = written(tmp_path, BOX.transformed(scale=50.0))  # 50 m x 10 m x 10 m of steel
     steel = wf.SVK(E=2e11, nu=0.3, density=7850.0)
     with pytest.warns(wf.MeshWarning, match=r"'bar' is 50 m long and weighs 3.9\de\+07 kg: is .*part.msh.*scale=1e-3"):
         bar(steel, mesh=str(path), clamp=False)[0].finalize(device="cpu")
@@ -243,7 +239,7 @@ def test_a_meshio_mesh_is_taken_as_it_is():
 def test_groups_of_gmsh_survive_meshio(tmp_path):
     import meshio
 
-    path, _, _ = written(tmp_path)
+    path, _ = written(tmp_path)
     taken, read = wf.mesh.from_meshio(meshio.read(path)), wf.mesh.read(path)
     assert sorted(read.surface_sets) == sorted(taken.surface_sets)
     assert sorted(read.element_sets) == sorted(taken.element_sets)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 
+import mesh_writers as writers
 import numpy as np
 import pytest
+from mesh_writers import FORMATS, Parts, write
 
 import warpfea
 from warpfea.base.errors import MeshError
@@ -24,18 +25,6 @@ from warpfea.mesh import (
 
 HERE = Path(__file__).parent
 SCENES = Path(warpfea.__file__).parent.parent / "scenes"
-
-
-def _load(name):
-    """Another file of this folder, which is no package."""
-    spec = importlib.util.spec_from_file_location(f"_{name}", HERE / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-writers = _load("mesh_writers")
-Parts, write, FORMATS = writers.Parts, writers.write, writers.FORMATS
 
 
 def same_sets(a: dict, b: dict):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
+from mesh_writers import FORMATS, Parts, write
 
 from warpfea.base.errors import MeshError, MeshWarning
 from warpfea.mesh import (
@@ -18,18 +17,6 @@ from warpfea.mesh import (
     read,
     sphere,
 )
-
-
-def _load(name):
-    """Another file of this folder, which is no package."""
-    spec = importlib.util.spec_from_file_location(f"_{name}", Path(__file__).parent / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-writers = _load("mesh_writers")
-Parts, write, FORMATS = writers.Parts, writers.write, writers.FORMATS
 
 # the defects: each takes the parts of a 6-element T10 box and returns a pattern for the message
 

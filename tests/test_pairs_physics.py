@@ -229,3 +229,63 @@ def test_a_fast_impact_within_the_law_comes_back(how):
     sim.step(20)
     assert sim.positions(upper)[0][:, 2].mean() > 0.05
     assert sim.velocities(upper)[0][:, 2].mean() > 1.0
+
+
+# explicit law, all nodes driven
+
+
+@pytest.mark.parametrize("first", ["upper", "lower"])
+def test_explicit_paper_law_on_a_random_sequence(first):
+    """Eqs. (73) to (83) written anew for the face of a cube on a slab that both move without strain."""
+    rng = np.random.default_rng(3)
+    h, count, E, nu, e, mu, side = 0.01, 60, 2e6, 0.3, 0.4, 0.35, 0.1
+    times = h * np.arange(count + 1)
+    u, w = (rng.uniform(-1, 1, (count + 1, 3)) * (0.0004, 0.0004, 0.001) for _ in range(2))
+    u[0] = w[0] = 0.0
+    low = 2e-4
+    b = wf.ModelBuilder()
+    bodies = []
+    for name, size, place, path in (
+        ("upper", (side,) * 3, (0.05, 0.05, low), u), ("lower", (0.2, 0.2, side), (0.0, 0.0, -side), w),
+        ("free", (side,) * 3, (5.0, 0.0, 5.0), None),
+    ):  # fmt: skip
+        mesh = wf.mesh.box(size, cells=(2, 2, 1), origin=place, element="T4")
+        body = b.add_solid(mesh, material=wf.SVK(E=E, nu=nu, density=1000.0), name=name)
+        if path is not None:
+            b.drive(body.nodes(lambda X: np.ones(len(X), dtype=bool)), displacement=(times, path))
+        bodies.append(body)
+    faces = [bodies[0].surface("z-"), bodies[1].surface("z+")]
+    sign = 1.0 if first == "upper" else -1.0
+    pair = b.add_contact(
+        *faces[:: int(sign)], law="paper", treatment="explicit", mu=mu, restitution=e, stiffness=2.0, name="pair"
+    )
+    assert pair.slave.body is bodies[0]
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=h)
+    sim.step(count)
+    got = sign * sim.contact_record("pair").force[0]
+
+    a, mass = math.sqrt(side**2 / math.pi), 1.0 / (1.0 / 1.0 + 1.0 / 4.0)
+    modulus, shear = E / (1.0 - nu**2) / 2.0, E / (2.0 * (1.0 + nu)) / (2.0 - nu) / 2.0
+    k_n, k_t = 2.0 * 4.0 / 3.0 * modulus * a, 2.0 * 8.0 * shear * a
+    c = 2.0 * math.sqrt(5.0 / 6.0) * math.log(e) / math.hypot(math.log(e), math.pi)
+    gamma_n, gamma_t = -c * math.sqrt(2.0 * 2.0 * modulus * a * mass), -c * math.sqrt(mass * k_t)
+    spring, want, slid = np.zeros(2), np.zeros((count, 3)), 0
+    for i in range(count):
+        before = max(i - 1, 0)
+        v = (u[i] - u[before] - w[i] + w[before]) / h
+        d = w[i, 2] - u[i, 2] - low
+        if d <= 0.0:
+            spring = np.zeros(2)
+            continue
+        normal = max(0.0, k_n * d - gamma_n * v[2])
+        spring = spring + h * v[:2]
+        pull = -k_t * spring - gamma_t * v[:2]
+        if np.linalg.norm(pull) > mu * normal:
+            pull *= mu * normal / np.linalg.norm(pull)
+            spring = -(pull + gamma_t * v[:2]) / k_t
+            slid += 1
+        want[i] = *pull, normal
+    acts = np.abs(want[:, 2]) > 0.0
+    assert 0.2 < acts.mean() < 0.8
+    assert 0 < slid < acts.sum()
+    assert np.abs(got - want).max() <= 1e-11 * np.abs(want).max()

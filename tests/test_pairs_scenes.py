@@ -6,28 +6,13 @@ import math
 
 import numpy as np
 import pytest
-
-import warpfea as wf
-from warpfea.builder.scene import find
+from scene_runs import run_contact_scene
 
 G = 9.81
 
 
-def simulate(name, t_end=None, **parameters):
-    """A scene at its own settings until t_end, with every step converged and its ledger closed; and its model."""
-    scene = find(name)
-    model = scene(**parameters).finalize(device="cpu")
-    sim = wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, solver=wf.NewtonPCG(tol=scene.tol))
-    for _ in range(round((t_end or scene.t_end) / scene.dt)):
-        assert sim.step().converged.all()
-    e = sim.energies()
-    scale = max(abs(e[name][0]) for name in ("kinetic", "potential", "contact_loss", "work"))
-    assert abs(e["ledger_residual"][0]) < 10.0 * scene.tol * scale
-    return sim, model
-
-
 def test_every_joint_of_a_stack_carries_what_is_above_it():
-    sim, model = simulate("block_stack")
+    sim = run_contact_scene("block_stack")
     blocks, weight = 4, 1000.0 * 0.1**3 * G
     for k in range(blocks):
         force = sim.contact_record(f"joint {k + 1}").force[0]
@@ -39,7 +24,7 @@ def test_every_joint_of_a_stack_carries_what_is_above_it():
 
 
 def test_ball_bends_the_plate_and_comes_up_again():
-    sim, model = simulate("ball_on_plate", t_end=0.24)
+    sim = run_contact_scene("ball_on_plate", t_end=0.24)
     ball, plate = (sim.probe(name).displacement[0] for name in ("ball", "plate"))
     drop = 0.03
     low = int(np.argmin(ball[:, 2]))
@@ -50,14 +35,15 @@ def test_ball_bends_the_plate_and_comes_up_again():
     assert (record.normal_force[0] >= 0.0).all()
     # the impulse of the plate turns the ball round
     impulse = 2e-3 * (record.force[0] @ np.array((0, 0, 1))).cumsum()
-    mass = model.lumped_host[model.bodies[1].slots].sum()
-    momentum = model.lumped_host[model.bodies[1].slots] @ sim.state.velocity.numpy()[0, model.bodies[1].slots]
+    slots = sim.model.bodies[1].slots
+    mass = sim.model.lumped_host[slots].sum()
+    momentum = sim.model.lumped_host[slots] @ sim.state.velocity.numpy()[0, slots]
     assert momentum[2] == pytest.approx(impulse[-1] - mass * G * 0.24, abs=1e-4)
 
 
 def test_arch_stands_with_enough_friction():
-    sim, model = simulate("arch")
-    weight = 0.5 * model.mass * G
+    sim = run_contact_scene("arch")
+    weight = 0.5 * sim.model.mass * G
     feet = [sim.contact_record(name).force[0, -1] for name in ("left foot", "right foot")]
     for foot in feet:
         assert foot[2] == pytest.approx(weight, rel=2e-3)
@@ -69,13 +55,13 @@ def test_arch_stands_with_enough_friction():
 
 @pytest.mark.slow
 def test_arch_falls_with_too_little_friction():
-    sim, _ = simulate("arch", t_end=0.8, mu=0.25)
+    sim = run_contact_scene("arch", t_end=0.8, mu=0.25)
     assert sim.probe("crown").displacement[0, -1, 2] < -0.2
 
 
 @pytest.mark.slow
 def test_driver_turns_the_wheel_the_other_way():
-    sim, _ = simulate("gears")
+    sim = run_contact_scene("gears")
     turned = [sim.joint_value(f"{name} axle")[0] for name in ("driver", "wheel")]
     assert turned[0] == pytest.approx(8.0 * (0.3 - 0.05), rel=1e-3)
     # the wheel may run ahead or lag by the play of its teeth, less than half of their pitch
@@ -84,7 +70,7 @@ def test_driver_turns_the_wheel_the_other_way():
 
 
 def test_finger_pushes_the_beam_off_the_shell():
-    sim, _ = simulate("finger_beam_shell")
+    sim = run_contact_scene("finger_beam_shell")
     probe, table, push = sim.probe("beam"), sim.contact_record("table"), sim.contact_record("push")
     beam, weight = probe.displacement[0], 1000.0 * 0.02**2 * 0.12 * G
     resting = (probe.time > 0.05) & (probe.time < 0.13)

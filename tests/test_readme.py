@@ -9,6 +9,7 @@ import runpy
 import shlex
 import subprocess
 
+import numpy as np
 import pytest
 import warp as wp
 from warpfea.kernels.elements import materials
@@ -83,12 +84,21 @@ def _registries():
 
 @pytest.mark.parametrize("code", PYTHON)
 @pytest.mark.usefixtures("_registries")
-def test_code_runs(code, tmp_path, monkeypatch):
+def test_code_runs(code, tmp_path, monkeypatch, capsys):
+    """Files are written, simulations have gone on without a failure, and all that is printed is a number."""
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "example.py"
     file.write_text(code)
     monkeypatch.setattr(wp, "get_preferred_device", lambda: wp.get_device("cpu"))
-    runpy.run_path(str(file))
+    names = runpy.run_path(str(file))
+    written = [path.name for path in tmp_path.rglob("*") if path.is_file() and path.stat().st_size > 0]
+    for name in re.findall(r'Writer\("([^"]+)"', code):
+        assert any(path.startswith(name) for path in written), name
+    for sim in (value for value in names.values() if isinstance(value, wf.Simulation)):
+        assert (np.asarray(sim.time) > 0.0).all()
+        assert not np.asarray(sim.status).any()
+        assert np.isfinite(sim.state.displacement.numpy()).all()
+    assert not re.search(r"\b(nan|inf)\b", capsys.readouterr().out)
 
 
 def test_there_is_code_for_newcomers():

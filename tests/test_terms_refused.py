@@ -1,34 +1,19 @@
-"""What a term of one's own may get wrong, and that it is told by name: the half-space of test_terms.py, spoilt."""
+"""What a term of one's own may get wrong, and that it is told by name: the half-space of floor_term.py, spoilt."""
 
 import functools
-import importlib.util
-import pathlib
-import sys
 import types
 from typing import ClassVar
 
 import numpy as np
 import pytest
 import warp as wp
+from floor_term import Floor
 from warpfea.kernels.common.traits import Traits
 from warpfea.kernels.common.types import kernel_module, precision
 
 import warpfea as wf
 from warpfea.simulation.checkpoint import load_checkpoint, save_checkpoint
 from warpfea.terms.term import LOSS, STORED, WORK, Column, FieldSpec, Term
-
-
-def toy():
-    """The module test_terms.py, as pytest names it: one copy, so that its kernels are made once."""
-    name = f"{__name__.rpartition('.')[0]}.test_terms".lstrip(".")
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, pathlib.Path(__file__).with_name("test_terms.py"))
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-Floor = toy().Floor
 
 
 def model_with(*makers, gravity=(0, 0, -9.81), velocity=(1.0, 0.0, -1.0), worlds=1, height=2e-3, **material):

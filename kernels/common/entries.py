@@ -7,7 +7,7 @@ import warp as wp
 from .structs import topology_struct
 from .types import precision
 
-__all__ = ["add_block_function"]
+__all__ = ["add_block_function", "add_symmetric_function"]
 
 
 @functools.cache
@@ -31,3 +31,20 @@ def add_block_function(dtype: str) -> wp.Function:
             value[world, at[1]] = wp.transpose(B)
 
     return add_block
+
+
+@functools.cache
+def add_symmetric_function(dtype: str) -> wp.Function:
+    """The function add_symmetric(topo, at, k6, world, value), like add_block."""
+    p = precision(dtype)
+    mat33, sym = p.mat33, p.sym
+    Topology = topology_struct(dtype)
+    add_block = add_block_function(dtype)
+
+    @wp.func
+    def add_symmetric(topo: Topology, at: wp.vec4i, k6: sym, world: int, value: wp.array2d(dtype=mat33)):
+        """Add a symmetric block xx yy zz yz xz xy to an entry."""
+        A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
+        add_block(topo, at, A, world, value)
+
+    return add_symmetric

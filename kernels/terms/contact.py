@@ -13,7 +13,7 @@ from ..common.lanes import lane_functions
 from ..common.types import SMALL, kernel_module, precision
 from .contact_colliders import MESHES, collider_functions
 from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
-from .contact_laws import SMOOTH, law_functions
+from .contact_laws import SMOOTH
 from .contact_touch import touch_functions
 
 __all__ = ["MOST_TURN", "RELAX_LANES", "SPEED_FLOOR", "contact_kernels"]
@@ -39,12 +39,10 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     lane_sum = lane_functions(dtype).lane_sum
     History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
     f = touch_functions(dtype, meshes)
-    along, plane, record_of, reach, acts = f.along, f.plane, f.record_of, f.reach, f.acts
-    tangent_damping, touch, in_plane, hold = f.tangent_damping, f.touch, f.in_plane, f.hold
-    coefficient, shape_of = f.coefficient, f.shape_of
+    along, record_of, reach, acts, shape_of = f.along, f.record_of, f.reach, f.acts, f.shape_of
+    put_explicit, touch, in_plane, hold = f.put_explicit, f.touch, f.in_plane, f.hold
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
-    elastic = law_functions().elastic
     g = collider_functions(meshes)
     distance, known_side, beside = g.distance, g.known_side, g.beside
     module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SMALL)
@@ -140,7 +138,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, v_n: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32), at: Attempt,
     ):  # fmt: skip
-        """Eqs. (77)-(83) literally, at the state that the attempt begins from; of contacts that are treated so."""
+        """Forces at the state that the attempt begins from, of contacts that are treated so."""
         world, item, q = wp.tid()
         if active[world] == 0 or facets.share[q, item] == f64(0.0):
             return
@@ -163,28 +161,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         x = turn * y + his.place[world, k]
         h = clock.h[world]
         moved = (at.turn[world, k] * y + at.place[world, k] - x) / h
-        v = along(facets, v_n, world, q, item) - moved
-        v_n_rel = wp.dot(v, n)
-        v_t = v - v_n_rel * n
-        beta = con.beta[world, c]
-        scale = con.scale[world, c]
-        spring = elastic(con.lumped[c], scale * con.normal[c], delta)[0]
-        gamma = beta * wp.sqrt(scale) * con.normal_damping[c]
-        k_t = scale * con.tangent[c]
-        if con.lumped[c] != 0:
-            gamma *= wp.sqrt(wp.sqrt(delta))
-            k_t *= wp.sqrt(delta)
-        force = wp.max(spring - gamma * v_n_rel, f64(0.0))
-        s = plane(n, his.spring[world, rec] + h * v_t)
-        gamma_t = tangent_damping(con, world, c, k_t)
-        pulled = -k_t * s - gamma_t * v_t
-        cap = coefficient(con, his, world, c, rec) * force
-        size = wp.length(pulled)
-        if size > cap:
-            pulled = (cap / size) * pulled
-            s = (f64(-1.0) / k_t) * (pulled + gamma_t * v_t)
-        at.dead_spring[world, point] = s
-        at.dead[world, point] = force * n + pulled
+        put_explicit(con, his, at, world, c, point, delta, n, along(facets, v_n, world, q, item) - moved, h)
 
     @wp.func
     def dead_work(

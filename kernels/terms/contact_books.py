@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.entries import add_block_function
+from ..common.entries import add_symmetric_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SMALL, kernel_module, precision
 from .contact import IDLE
@@ -336,7 +336,7 @@ def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
     f64 = wp.float64
     Facets = facet_struct(dtype)
     Topology, Pattern = topology_struct(dtype), pattern_struct()
-    add_block = add_block_function(dtype)
+    add_symmetric = add_symmetric_function(dtype)
     module = kernel_module(f"contact_blocks_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
@@ -359,8 +359,6 @@ def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
                     c = facets.contact[at[0]]
                     s = weight[world, c, at[1]] * weight[world, c, at[2]]
                 k6 += s * stiffness[world, facets.point + at[0] * facets.points + q]
-        k6 = T(dq_dv[world]) * k6
-        A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
-        add_block(topo, pattern.upper[entry[index]], A, world, value)
+        add_symmetric(topo, pattern.upper[entry[index]], T(dq_dv[world]) * k6, world, value)
 
     return _types.SimpleNamespace(module=module, add_contact=add_contact)

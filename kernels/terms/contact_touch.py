@@ -30,7 +30,8 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         colliders.known_side,
     )
     SLIPS = colliders.SLIPS
-    normal_law, friction, smooth_friction = laws.normal_law, laws.friction, laws.smooth_friction
+    normal_law, elastic = laws.normal_law, laws.elastic
+    friction, smooth_friction = laws.friction, laws.smooth_friction
 
     @wp.struct
     class Touch:
@@ -211,6 +212,35 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return con.mu_static[world, c]
 
     @wp.func
+    def put_explicit(
+        con: Contacts, his: History, at: Attempt, world: int, c: int, point: int, delta: f64, n: vec3d, v: vec3d, h: f64
+    ):  # fmt: skip
+        """Force and spring, Eqs. (77)-(83) literally, of a point at depth delta that moves with v relative to what it
+        touches, for a step h."""
+        rec = record_of(con, c, point)
+        v_n_rel = wp.dot(v, n)
+        v_t = v - v_n_rel * n
+        beta = con.beta[world, c]
+        scale = con.scale[world, c]
+        spring = elastic(con.lumped[c], scale * con.normal[c], delta)[0]
+        gamma = beta * wp.sqrt(scale) * con.normal_damping[c]
+        k_t = scale * con.tangent[c]
+        if con.lumped[c] != 0:
+            gamma *= wp.sqrt(wp.sqrt(delta))
+            k_t *= wp.sqrt(delta)
+        force = wp.max(spring - gamma * v_n_rel, f64(0.0))
+        s = plane(n, his.spring[world, rec] + h * v_t)
+        gamma_t = tangent_damping(con, world, c, k_t)
+        pulled = -k_t * s - gamma_t * v_t
+        cap = coefficient(con, his, world, c, rec) * force
+        size = wp.length(pulled)
+        if size > cap:
+            pulled = (cap / size) * pulled
+            s = (f64(-1.0) / k_t) * (pulled + gamma_t * v_t)
+        at.dead_spring[world, point] = s
+        at.dead[world, point] = force * n + pulled
+
+    @wp.func
     def hold(con: Contacts, his: History, at: Attempt, world: int, c: int, point: int, t: Touch) -> vec3d:
         """Cap, k_t and shrinkage of the spring at an iterate."""
         rec = record_of(con, c, point)
@@ -288,8 +318,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, allowance=allowance, rate_of=rate_of,
-        tangent_damping=tangent_damping,
-        depth_before=depth_before, touch=touch, in_plane=in_plane, coefficient=coefficient, hold=hold, pull=pull,
-        friction_potential=friction_potential, friction_force=friction_force, point_stiffness=point_stiffness,
-        acts=acts, shape_of=shape_of, lagrange=lagrange, monomial=monomial,
+        depth_before=depth_before, touch=touch, in_plane=in_plane, coefficient=coefficient, put_explicit=put_explicit,
+        hold=hold, pull=pull, friction_potential=friction_potential, friction_force=friction_force,
+        point_stiffness=point_stiffness, acts=acts, shape_of=shape_of, lagrange=lagrange, monomial=monomial,
     )  # fmt: skip

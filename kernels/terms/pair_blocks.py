@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.entries import add_block_function
+from ..common.entries import add_symmetric_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SMALL, kernel_module, precision
 
@@ -19,7 +19,7 @@ def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
     T, mat33, sym = p.T, p.mat33, p.sym
     f64 = wp.float64
     Topology, Pattern = topology_struct(dtype), pattern_struct()
-    add_block = add_block_function(dtype)
+    add_symmetric = add_symmetric_function(dtype)
     module = kernel_module(f"pair_blocks_{dtype}", max_unroll=SMALL)
 
     @wp.kernel(module=module)
@@ -40,8 +40,6 @@ def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
             for k in range(points[world, at[0]]):
                 point = listed[world, begin + k]
                 k6 += (weight[world, point, at[1]] * weight[world, point, at[2]]) * stiffness[world, point]
-        k6 = T(dq_dv[world]) * k6
-        A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
-        add_block(topo, pattern.upper[entry[index]], A, world, value)
+        add_symmetric(topo, pattern.upper[entry[index]], T(dq_dv[world]) * k6, world, value)
 
     return _types.SimpleNamespace(module=module, add_masters=add_masters)

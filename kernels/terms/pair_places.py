@@ -10,20 +10,18 @@ from .pair_data import master_struct
 __all__ = ["HOLD", "INNER", "OUTER", "place_functions"]
 
 TURNS = 16
+"""Newton's steps of a place, at most."""
 FEET = 12
 """Most steps to the foot of a perpendicular: each gains a factor of gap times curvature."""
-"""Newton's steps of a place."""
 OUTER = 0.05
-"""Part of a side by which a place may lie beyond a facet: the outward vectors of two elements differ."""
+"""Part of a side by which a place may lie beyond a facet: the outward vectors of two elements differ, and a point on a
+border does not change facets from iterate to iterate."""
 INNER = 1e-9
 QUADRATIC = 1e-8
 """A step so small is the last: what it leaves is its square."""
 HOLD = 0.5
 """In an attempt a point stays on the surface so far beyond its border: it slides off between steps, for a force that
 ends at an iterate has no potential."""
-STAY = 0.05
-"""By so much of a side a point may pass the border of the facet that it was on as the attempt began: one that lies on
-a border does not change facets from iterate to iterate."""
 
 
 @functools.cache
@@ -52,6 +50,11 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         for _ in range(2, n):
             out *= x
         return out
+
+    @wp.func
+    def monomial(mas: Masters, kind: int, m: int, spot: vec3d) -> f64:
+        """Monomial m of a kind of facet at a place."""
+        return power(spot[0], mas.power[kind, m][0]) * power(spot[1], mas.power[kind, m][1])
 
     @wp.func
     def power_change(x0: f64, x: f64, n: int) -> f64:
@@ -95,7 +98,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         out = vec3d()
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):
-            p = power(spot[0], mas.power[kind, m][0]) * power(spot[1], mas.power[kind, m][1])
+            p = monomial(mas, kind, m, spot)
             out += p * (C[world, mas.most * f + m] + spot[2] * D[world, mas.most * f + m])
         return out
 
@@ -108,7 +111,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         out = vec3d()
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):
-            p = power(spot[0], mas.power[kind, m][0]) * power(spot[1], mas.power[kind, m][1])
+            p = monomial(mas, kind, m, spot)
             i = mas.most * f + m
             out += p * ((C[world, i] - C0[world, i]) + spot[2] * (D[world, i] - D0[world, i]))
         return out
@@ -281,7 +284,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         out = f64(0.0)
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):
-            p = power(spot[0], mas.power[kind, m][0]) * power(spot[1], mas.power[kind, m][1])
+            p = monomial(mas, kind, m, spot)
             out += p * (f64(mas.shape[m, i, f]) + spot[2] * f64(mas.rise[m, i, f]))
         return out
 

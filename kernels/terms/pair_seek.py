@@ -16,7 +16,7 @@ from .contact_data import attempt_struct, clock_struct, contact_struct, facet_st
 from .contact_laws import PAPER
 from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
-from .pair_places import HOLD, OUTER, STAY, place_functions
+from .pair_places import HOLD, OUTER, place_functions
 
 __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
@@ -413,7 +413,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 off = o
                 height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
-        if best < 0 or off > f64(STAY):
+        if best < 0 or off > f64(OUTER):
             facing = vec3d()
             if anchored:
                 f = t.first[world, point] - 1

@@ -13,7 +13,23 @@ from .pair_data import master_struct, seat_struct, touching_struct
 from .pair_places import OUTER, place_functions
 from .pair_seek import seek_kernels
 
-__all__ = ["survey_kernels"]
+__all__ = ["found_struct", "survey_kernels"]
+
+
+@functools.cache
+def found_struct():
+    """What a survey finds, [world, point]."""
+
+    @wp.struct
+    class Found:
+        gap: wp.array2d(dtype=wp.float64)  # m, 1e30: no facet is near
+        normal: wp.array2d(dtype=wp.float64)  # force, N
+        force: wp.array2d(dtype=wp.vec3d)  # on the slave, N
+        facet: wp.array2d(dtype=wp.int32)  # -1: none
+        spot: wp.array2d(dtype=wp.vec3d)  # coordinates on it
+        reaction: wp.array3d(dtype=wp.vec3d)  # [world, point, local] forces on its slots, N
+
+    return Found
 
 
 @functools.cache
@@ -21,13 +37,13 @@ def survey_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in one precision of the model."""
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
-    Attempt = attempt_struct(dtype)
+    Attempt, Found = attempt_struct(dtype), found_struct()
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
     k, places, seek = touch_functions(dtype, False), place_functions(dtype), seek_kernels(dtype)
     Touch, along, reach, hold, in_plane = k.Touch, k.along, k.reach, k.hold, k.in_plane
     friction_force, normal_law = k.friction_force, law_functions().normal_law
-    jet, locate, outside, outward, weigh = places.jet, places.locate, places.outside, places.outward, places.weigh
-    middle, frame, down, up = places.middle, seek.frame, seek.down, seek.up
+    jet, locate, outside, outward, middle = places.jet, places.locate, places.outside, places.outward, places.middle
+    foot_of, weigh, frame, down, up = places.foot_of, places.weigh, seek.frame, seek.down, seek.up
     module = kernel_module(f"pair_survey_{dtype}", max_unroll=SMALL)
 
     @wp.func
@@ -59,17 +75,15 @@ def survey_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def survey(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, time: wp.array(dtype=f64),
-        u: wp.array2d(dtype=vec3d), far: f64, at: Attempt, t: Touching, gap: wp.array2d(dtype=f64),
-        normal: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d), facet: wp.array2d(dtype=wp.int32),
-        spot: wp.array2d(dtype=vec3d), weight: wp.array3d(dtype=f64),
+        u: wp.array2d(dtype=vec3d), far: f64, at: Attempt, t: Touching, out: Found,
     ):  # fmt: skip
         """Points in contact at their seats, others on the closest facet: gaps; forces are elastic, without motion."""
         world, item, q = wp.tid()
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
         share = facets.share[q, item]
-        gap[world, point] = f64(1.0e30)
-        facet[world, point] = -1
+        out.gap[world, point] = f64(1.0e30)
+        out.facet[world, point] = -1
         if share == f64(0.0):
             return
         x = facets.X[q, item] + along(facets, u, world, q, item)
@@ -88,25 +102,28 @@ def survey_kernels(dtype: str) -> _types.SimpleNamespace:
             f = wp.int32(found[3])
         if f < 0:
             return
-        s = jet(mas, t.C, t.D, world, f, place)
-        out = Touch()
-        out.n = outward(s)
-        out.depth = reach(con, his, world, c, point, time[world], f64(0.0)) - place[2] * wp.dot(out.n, s.c)
+        foot = foot_of(mas, t.C, t.D, world, f, place)
+        s = Touch()
+        s.n = foot.n
+        begins = reach(con, his, world, c, point, time[world], f64(0.0))
+        s.depth = begins - (place[2] * foot.rise + foot.rest)
         k_n = con.scale[world, c] * con.normal[c]
-        out.law = normal_law(con.law[c], 0, k_n, f64(0.0), con.ramp[c], con.force_eps[c], out.depth, out.depth)
+        s.law = normal_law(con.law[c], 0, k_n, f64(0.0), con.ramp[c], con.force_eps[c], s.depth, s.depth)
         if live:
-            out.whole = his.spring[world, point]
+            s.whole = his.spring[world, point]
             if con.law[c] != PAPER:
-                out.whole = frame(s) * out.whole
-        out = in_plane(out, out.n)
-        held = hold(con, his, at, world, c, point, out)
+                s.whole = frame(jet(mas, t.C, t.D, world, f, place)) * s.whole
+        s = in_plane(s, s.n)
+        held = hold(con, his, at, world, c, point, s)
         held[2] = f64(1.0)
-        gap[world, point] = -out.depth
-        normal[world, point] = share * out.law[0]
-        force[world, point] = share * (out.law[0] * out.n - friction_force(con, world, c, out, held, f64(0.0)))
-        facet[world, point] = f
-        spot[world, point] = place
+        pressed = share * s.law[0] * s.n
+        pulled = share * friction_force(con, world, c, s, held, f64(0.0))
+        out.gap[world, point] = -s.depth
+        out.normal[world, point] = share * s.law[0]
+        out.force[world, point] = pressed - pulled
+        out.facet[world, point] = f
+        out.spot[world, point] = place
         for i in range(mas.conn.shape[0]):
-            weight[world, point, i] = weigh(mas, f, i, place)
+            out.reaction[world, point, i] = weigh(mas, f, i, place) * pulled - weigh(mas, f, i, foot.spot) * pressed
 
     return _types.SimpleNamespace(module=module, survey=survey)

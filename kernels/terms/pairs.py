@@ -61,9 +61,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
     k, places = touch_functions(dtype, False), place_functions(dtype)
     touch_of = pair_functions(dtype).touch_of
-    in_plane, hold, plane = k.in_plane, k.hold, k.plane
+    in_plane, hold, put_explicit = k.in_plane, k.hold, k.put_explicit
     friction_potential, friction_force, point_stiffness = k.friction_potential, k.friction_force, k.point_stiffness
-    coefficient, tangent_damping, elastic = k.coefficient, k.tangent_damping, law_functions().elastic
     jet, weigh = places.jet, places.weigh
     lane_sum = lane_functions(dtype).lane_sum
     module = kernel_module(f"pairs_{dtype}", max_unroll=SMALL)
@@ -73,7 +72,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt, t: Touching,
     ):  # fmt: skip
-        """Eqs. (77)-(83) literally, at the state that the attempt begins from; of contacts that are treated so."""
+        """Forces at the state that the attempt begins from, of contacts that are treated so."""
         world, item, q = wp.tid()
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
@@ -90,22 +89,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         n = wp.normalize(wp.cross(s.a, s.b))
         foot = vec3d(spot[0], spot[1], f64(0.0))
         v = k.along(facets, v_n, world, q, item) - places.moved(mas, t.V0, t.V0, world, f, foot)
-        v_n_rel = wp.dot(v, n)
-        v_t = v - v_n_rel * n
-        scale = con.scale[world, c]
-        gamma = con.beta[world, c] * wp.sqrt(scale) * con.normal_damping[c]
-        k_t = scale * con.tangent[c]
-        force = wp.max(elastic(0, scale * con.normal[c], delta)[0] - gamma * v_n_rel, f64(0.0))
-        stretch = plane(n, his.spring[world, point] + clock.h[world] * v_t)
-        gamma_t = tangent_damping(con, world, c, k_t)
-        pulled = -k_t * stretch - gamma_t * v_t
-        cap = coefficient(con, his, world, c, point) * force
-        size = wp.length(pulled)
-        if size > cap:
-            pulled = (cap / size) * pulled
-            stretch = (f64(-1.0) / k_t) * (pulled + gamma_t * v_t)
-        at.dead_spring[world, point] = stretch
-        at.dead[world, point] = force * n + pulled
+        put_explicit(con, his, at, world, c, point, delta, n, v, clock.h[world])
 
     @wp.func
     def relative(

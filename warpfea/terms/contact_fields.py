@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from ..kernels.terms.contact_laws import SMOOTH
 from ..model.discretisation import Discretisation, element_functions
-from .contact_tables import LAWS, ContactTables
+from .contact_tables import ContactTables
+from .facet_tables import LAWS
 from .term import FieldSpec
 
 if TYPE_CHECKING:

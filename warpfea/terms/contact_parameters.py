@@ -13,7 +13,7 @@ from ..base.errors import ModelError
 from ..model.contacts import Collider, Contact
 from ..model.pairs import PairContact
 from ..model.shapes import HalfSpace
-from .contact_tables import PER_WORLD, beta_of, hunt_crossley_damping
+from .facet_tables import PER_WORLD, beta_of, hunt_crossley_damping
 
 if TYPE_CHECKING:
     from .contact_tables import ContactTables

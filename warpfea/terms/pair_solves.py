@@ -11,7 +11,8 @@ from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import contact_block_kernels
 from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pairs import pair_kernels
-from .contact_tables import LISTED, block_entries
+from .contact_tables import block_entries
+from .facet_tables import LISTED
 from .pair_motions import PairMotions
 from .pair_tables import PairTables
 from .term import At, Term, part

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import warp as wp
 from ..base.launch import Launcher
 from ..kernels.terms.contact_data import attempt_struct
 from ..kernels.terms.pair_data import touching_struct
-from ..kernels.terms.pair_survey import survey_kernels
+from ..kernels.terms.pair_survey import found_struct, survey_kernels
 from ..model.pairs import exponents
 from ..model.state import State
 from .contact_fields import Patch, nearest_samples, nodal_force
@@ -28,7 +28,7 @@ class Survey:
 
     Attributes:
         gap: m, 1e30 of points with no facet near. normal: elastic normal force, N. force: on the slave, N, (..., 3).
-        facet: of the master surfaces, -1: none. spot: coordinates there. weight: (..., L) of the facet's slots.
+        facet: of the master surfaces, -1: none. spot: coordinates there. reaction: on its slots, N, (..., L, 3).
     """
 
     tables: PairTables
@@ -37,7 +37,7 @@ class Survey:
     force: np.ndarray
     facet: np.ndarray
     spot: np.ndarray
-    weight: np.ndarray
+    reaction: np.ndarray
 
     def nodal_force(self) -> np.ndarray:
         """Forces on slots of both bodies (worlds, slots, 3), N."""
@@ -45,7 +45,7 @@ class Survey:
         out = nodal_force(t, self.force)
         for world, point in zip(*np.nonzero(self.force.any(axis=2))):
             slots = t.master_conn[self.facet[world, point]]
-            np.add.at(out[world], slots, -np.outer(self.weight[world, point], self.force[world, point]))
+            np.add.at(out[world], slots, self.reaction[world, point])
         return out
 
     def patches(self, body: Any) -> list[Patch]:
@@ -98,25 +98,27 @@ def survey(term: Any, state: State) -> Survey:
     if term.exact:
         u = zeros(u.shape, wp.vec3d)
         term.exact.widen(launch, state.displacement, every, u)
-    touching = touching_struct(m.dtype)()
+
+    def fill(struct: Any, arrays: dict[str, tuple[tuple[int, ...], Any]]) -> Any:
+        for name, (shape, dtype) in arrays.items():
+            setattr(struct, name, zeros(shape, dtype))
+        return struct
+
     masters = t.masters_of(wp.uint64(0))
-    for name, shape, dtype in (
-        ("C", (B, t.facets * masters.most), wp.vec3d), ("D", (B, t.facets * masters.most), wp.vec3d),
-        ("lower", (B * t.facets,), wp.vec3), ("upper", (B * t.facets,), wp.vec3),
-        ("wanted_lower", (B * t.facets,), wp.vec3), ("wanted_upper", (B * t.facets,), wp.vec3),
-        ("stale", (1,), wp.int32),
-    ):  # fmt: skip
-        setattr(touching, name, zeros(shape, dtype))
+    arrays: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys("CD", ((B, t.facets * masters.most), wp.vec3d))
+    arrays |= dict.fromkeys(("lower", "upper", "wanted_lower", "wanted_upper"), ((B * t.facets,), wp.vec3))
+    touching = fill(touching_struct(m.dtype)(), arrays | {"stale": ((1,), wp.int32)})
     touching.C0 = touching.C
     launch(term.seek.controls, (B, t.facets, masters.most), [masters, u, every, touching.C, touching.D])
     launch(term.seek.check_boxes, (B, t.facets), [masters, every, touching])
     tree = wp.Bvh(touching.wanted_lower, touching.wanted_upper, groups=t.box_groups)
     P, L = t.points, t.master_conn.shape[1]
-    gap, normal, facet = zeros((B, P), wp.float64), zeros((B, P), wp.float64), zeros((B, P), wp.int32)
-    force, spot, weight = zeros((B, P), wp.vec3d), zeros((B, P), wp.vec3d), zeros((B, P, L), wp.float64)
-    found = [gap, normal, force, facet, spot, weight]
+    arrays = dict.fromkeys(("gap", "normal"), ((B, P), wp.float64)) | dict.fromkeys(
+        ("force", "spot"), ((B, P), wp.vec3d)
+    )
+    found = fill(found_struct()(), arrays | {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)})
     for group in t.groups:
         args = [t.data, t.masters_of(tree.id), group.data, history, seats, state.time, u, t.far]
-        args += [attempt_struct(m.dtype)(), touching, *found]
+        args += [attempt_struct(m.dtype)(), touching, found]
         launch(survey_kernels(m.dtype).survey, (B, group.count, group.data.points), args)
-    return Survey(t, *(array.numpy() for array in (gap, normal, force, facet, spot, weight)))
+    return Survey(t, *(getattr(found, field.name).numpy() for field in fields(Survey)[1:]))

@@ -9,9 +9,8 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.terms.contact_data import contact_struct, facet_struct
+from ..kernels.terms.contact_data import contact_struct
 from ..kernels.terms.pair_data import master_struct
-from ..model.contact_points import ContactPoints
 from ..model.handles import SurfaceSet
 from ..model.pairs import (
     MasterFacets,
@@ -22,7 +21,7 @@ from ..model.pairs import (
     pair_numbers,
     pair_points,
 )
-from .contact_tables import CONSTANT, LAWS, SMOOTHING, FacetGroup, beta_of, clamped_slots, hunt_crossley_damping
+from .facet_tables import PER_WORLD, FacetTables, clamped_slots, normal_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -33,28 +32,19 @@ TOUCH = 1e-9
 """Depth over the size of a model that counts as touch where a step begins."""
 
 
-class PairTables:
-    """Contacts between bodies, in the order of the device: by the kind of their slave facets.
+class PairTables(FacetTables[PairContact]):
+    """Contacts between bodies of a model; the points are those of the slave surfaces.
 
     Attributes:
-        contacts: handles in that order; number: of a handle's index.
-        groups: slave facets. surfaces, masters: master surfaces, each once, and their facets.
-        host: points of each contact. shares: (F, P) area of each point over that of the region.
-        points, rows, facets: points and slave facets in all; master facets.
+        surfaces, masters: master surfaces, each once, and their facets; of: that of each contact.
+        regions: area of each contact, m^2.
+        facets: master facets in all.
         far: how far off a gap is told, m.
-        first, row_start: first point and row of each contact.
     """
 
     def __init__(self, model: Model) -> None:
-        self.model = model
-        described: list[PairContact] = list(model.description.pairs)
-        found = [pair_points(contact.slave, contact.points) for contact in described]
-        kinds = [(p.conn.shape[1], p.area.shape[1]) for p in found]
-        self.kinds = sorted(set(kinds))
-        order = sorted(range(len(found)), key=lambda k: (self.kinds.index(kinds[k]), k))
-        self.contacts = [described[k] for k in order]
-        self.host: list[ContactPoints] = [found[k] for k in order]
-        self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
+        contacts = list(model.description.pairs)
+        super().__init__(model, contacts, [pair_points(contact.slave, contact.points) for contact in contacts])
         self.surfaces: list[SurfaceSet] = []
         self.of: list[int] = []
         for contact in self.contacts:
@@ -68,8 +58,6 @@ class PairTables:
         self.regions = [self._region(contact) for contact in self.contacts]
         self.shares = [p.area / region for p, region in zip(self.host, self.regions)]
         self.facets = sum(len(m.conn) for m in self.masters)
-        self.points = self.rows = 0
-        self.groups: list[FacetGroup] = []
 
     def _check_clamped(self) -> None:
         """ModelError for a contact of which nothing can move."""
@@ -80,11 +68,6 @@ class PairTables:
                     f"contact {contact.name!r}: all of the surfaces of bodies {contact.first.body.name!r} and "
                     f"{contact.second.body.name!r} is clamped; leave the contact out, or free one of them"
                 )
-
-    @property
-    def explicit(self) -> bool:
-        """Whether a contact has the force of the last state."""
-        return any(contact.treatment == "explicit" for contact in self.contacts)
 
     def _region(self, contact: PairContact) -> float:
         """Area that the stiffness of a contact is spread over, m^2: the smaller of both surfaces'."""
@@ -104,81 +87,20 @@ class PairTables:
 
     def build(self, pool: int) -> None:
         """Upload; `pool`: the first entry of the term in the pool."""
-        m = self.model
-        entries = 0
-        self.first = np.zeros(len(self.contacts) + 1, dtype=np.int64)
-        self.row_start = np.zeros(len(self.contacts) + 1, dtype=np.int64)
-        for kind in self.kinds:
-            chosen = [k for k, p in enumerate(self.host) if (p.conn.shape[1], p.area.shape[1]) == kind]
-            for k in chosen:
-                self.first[k + 1] = self.first[k] + self.host[k].area.size
-                self.row_start[k + 1] = self.row_start[k] + len(self.host[k].conn)
-            group = self._group(chosen, pool + entries)
-            self.groups.append(group)
-            entries += group.conn.size
-            self.rows += group.count
-            self.points += group.count * kind[1]
-        self.pool = pool + entries
-        self.data = self._contacts()
+        self.pool = self._build_facets(pool)
+        self.data = contact_struct(False)()
+        self._put_laws(self.data, [self._numbers(c, region) for c, region in zip(self.contacts, self.regions)])
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
         )
         self.far = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
-        self.size = m.size
+        self.size = self.model.size
 
-    def _group(self, chosen: list[int], pool: int) -> FacetGroup:
-        m = self.model
-        parts = [self.host[k] for k in chosen]
-        offset = [self.contacts[k].slave.body.slot_offset for k in chosen]
-        conn = np.concatenate([p.conn + o for p, o in zip(parts, offset)])
-        data = facet_struct(m.dtype)()
-
-        def put(name: str, values: Any, dtype: Any) -> None:
-            setattr(data, name, m.array("contact", np.ascontiguousarray(values), dtype))
-
-        put("conn", conn.T, wp.int32)
-        put("shape", np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2), m.types.T)
-        put("X", np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1), wp.vec3d)
-        put("share", np.concatenate([self.shares[k] for k in chosen]).T, wp.float64)
-        put("area", np.concatenate([p.area for p in parts]).T, wp.float64)
-        put("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
-        data.pool, data.row, data.point = pool, self.rows, self.points
-        data.count, data.points = len(conn), parts[0].area.shape[1]
-        return FacetGroup(conn, data, False)
-
-    def _contacts(self) -> Any:
-        m, C = self.model, self.contacts
-        out = contact_struct(False)()
-
-        def put(name: str, values: Any, dtype: Any) -> None:
-            setattr(out, name, m.array("contact", np.asarray(values), dtype))
-
-        numbers = [pair_numbers(c, region) for c, region in zip(C, self.regions)]
-        pairs = [c.smoothing if isinstance(c.smoothing, tuple) else SMOOTHING for c in C]
-        put("law", [LAWS[c.law] for c in C], wp.int32)
-        put("lumped", [0 for _ in C], wp.int32)
-        put("dead", [int(c.treatment == "explicit") for c in C], wp.int32)
-        put("first", self.first, wp.int32)
-        put("normal", [row["normal"] for row in numbers], wp.float64)
-        put("tangent", [row["tangent"] for row in numbers], wp.float64)
-        put("normal_damping", [CONSTANT * math.sqrt(row["modulus"] * row["mass"]) for row in numbers], wp.float64)
-        put("mass", [row["mass"] for row in numbers], wp.float64)
-        put("ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C], wp.float64)
-        put("force_eps", [pair[0] for pair in pairs], wp.float64)
-        put("speed_eps", [pair[1] for pair in pairs], wp.float64)
-        put("offset", [c.offset for c in C], wp.float64)
-        put("decay", [c.overlap_time for c in C], wp.float64)
-        per_world = {
-            "mu": [c.mu for c in C],
-            "mu_static": [c.mu_static for c in C],
-            "damping": [hunt_crossley_damping(c.restitution) for c in C],
-            "beta": [beta_of(c.restitution) for c in C],
-            "scale": [c.stiffness for c in C],
-        }
-        for name, values in per_world.items():
-            put(name, np.tile(values, (m.worlds, 1)), wp.float64)
-        return out
+    def _numbers(self, contact: PairContact, region: float) -> dict[str, float]:
+        """Constants of a law, see `_put_laws`."""
+        row = pair_numbers(contact, region)
+        return row | {"normal_damping": normal_damping(row["modulus"], row["mass"])}
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corners (facets, 3) of the facets in the reference."""
@@ -266,7 +188,7 @@ class PairTables:
     def hash(self, h: Any) -> None:
         """Feed what defines the contacts into a hash."""
         for contact, p, k in zip(self.contacts, self.host, self.of):
-            fixed = ("first", "second", "slave", "master", "mu", "mu_static", "restitution", "stiffness")
+            fixed = ("first", "second", "slave", "master", *PER_WORLD)
             values = {name: v for name, v in vars(contact).items() if name not in fixed}
             h.update(f"{contact.first.body.name} {contact.second.body.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())

@@ -93,7 +93,7 @@ class Watched:
 
     Attributes:
         count: iterations.
-        impulse: worst difference of a step's change of momentum and its impulse, over the largest of both, N s.
+        impulse: worst difference of a step's change of a body's momentum and its impulse, over the largest of all.
         pulled: largest friction over mu N, less 1; normal forces that pull count as infinite.
         gained: most energy beyond that at the start, over the most that was kinetic, or what a fall by a side gives.
         through: deepest that the centre of mass came past a floor at z = 0, over the side.
@@ -107,14 +107,17 @@ class Watched:
 
     def answer(self, setting: Setting, error: float | None, bound: float, reference: str, **more: Any) -> Answer:
         """An answer whose error is by default that of the impulse, and whose limits are those of any contact."""
-        limits = {
+        limits = self.limits(setting) | more.pop("limits", {})
+        worst = self.impulse if error is None else error
+        return self.count.answer(worst, bound, reference, limits=limits, **more)
+
+    def limits(self, setting: Setting) -> dict[str, tuple[float, float]]:
+        """Numbers of any contact, and what they may be."""
+        return {
             "impulse": (self.impulse, exact(setting, 1e-6, 1e-2)),
             "friction above mu N": (self.pulled, exact(setting, 1e-9, 1e-3)),
             "energy from nowhere": (self.gained, exact(setting, 1e-6, 1e-2)),
         }
-        limits |= more.pop("limits", {})
-        worst = self.impulse if error is None else error
-        return self.count.answer(worst, bound, reference, limits=limits, **more)
 
 
 def watch(sim: wf.Simulation, s: Scene, steps: int, *, mu: float = 0.0, moves: bool = False) -> Watched:

@@ -1,0 +1,135 @@
+"""Impacts of cubes against closed forms of the laws."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from contact_cubes import G, cube, everywhere, middle, record, tilted
+
+import warpfea as wf
+from warpfea.terms.contact_tables import law_numbers
+from warpfea.terms.facet_tables import beta_of
+
+WANTED = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+
+
+def impact_step(contact, model, v0):
+    """Half a period of the contact, s, with a mass of 1 kg."""
+    k = contact.stiffness * law_numbers(contact)["normal"]
+    return math.pi / math.sqrt(k) if model == "patch" else 2.943 * (1.25 * v0**2 / k) ** 0.4 / v0
+
+
+def rebound(model, law, treatment, wanted, per_contact):
+    """Speed after the impact over that before, for each wanted restitution; one cube for each."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    floor = b.add_collider(wf.HalfSpace((0, 0, 1)))
+    contacts = []
+    for i, e in enumerate(wanted):
+        shift = np.array([0.5 * i, 0.0, 0.0])
+        map = (lambda X, s=shift: tilted(X) + s) if model == "sphere" else (lambda X, s=shift: X + s)
+        body = cube(b, f"cube{i}", map)
+        b.clamp(body.nodes(everywhere), components="xy")
+        b.set_initial(body, velocity=(0, 0, -1.0))
+        options = {"model": model, "radius": 0.3 if model == "sphere" else None, "law": law, "treatment": treatment}
+        surface = body if model == "sphere" else body.surface("z-")
+        contacts.append(b.add_contact(surface, floor, restitution=e, stiffness=1e-5, **options))
+        b.add_probe(f"p{i}", body.at(middle(map)))
+    h = impact_step(contacts[0], model, 1.0) / per_contact
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=h, solver=wf.NewtonPCG(tol=1e-10), record=False)
+    names = [f"p{i}" for i in range(len(wanted))]
+    for _ in range(12):
+        sim.step(max(per_contact // 4, 1))
+        if all(record(sim, c)["penetration"] < 0.0 or record(sim, c)["area"] == 0.0 for c in contacts) and all(
+            sim.probe(p).velocity[0, -1, 2] > 0.0 for p in names
+        ):
+            break
+    return np.array([sim.probe(p).velocity[0, -1, 2] for p in names])
+
+
+PAPER_GIVES = {"sphere": (0.2527, 0.3971, 0.5503, 0.7182, 0.9020), "patch": (0.2242, 0.3635, 0.5174, 0.6926, 0.8914)}
+
+
+@pytest.mark.parametrize("model", PAPER_GIVES)
+def test_explicit_paper_law_rebounds_as_computed(model):
+    assert np.abs(rebound(model, "paper", "explicit", WANTED, 1000) - PAPER_GIVES[model]).max() < 1e-3
+
+
+@pytest.mark.parametrize("model", PAPER_GIVES)
+def test_implicit_paper_law_rebounds_as_computed_when_extrapolated(model):
+    coarse, fine = (rebound(model, "paper", "implicit", WANTED, n) for n in (124, 248))
+    assert np.abs(2.0 * fine - coarse - PAPER_GIVES[model]).max() < 1e-3
+
+
+@pytest.mark.parametrize("model", PAPER_GIVES)
+def test_default_law_rebounds_as_wanted(model):
+    coarse, fine = (rebound(model, "default", "implicit", WANTED, n) for n in (124, 248))
+    assert np.abs((2.0 * fine - coarse) / WANTED - 1.0).max() < 0.01
+
+
+@pytest.mark.parametrize("model", PAPER_GIVES)
+def test_explicit_paper_contact_gains_little_energy_at_20_steps(model):
+    assert rebound(model, "paper", "explicit", [1.0], 20)[0] ** 2 - 1.0 < 2e-3
+
+
+def impacts(count, steps, law, per_contact, e=0.5, smoothing=None):
+    """Worlds with random speeds and gaps, without halvings: the simulation, and those that have no solution.
+
+    Eq. (77) jumps by gamma v at touch: a mass has no solution where its free end lies so little inside that this
+    jump alone would throw it out.
+    """
+    rng = np.random.default_rng(0)
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    floor = b.add_collider(wf.HalfSpace((0, 0, 1)))
+    body = cube(b)
+    b.clamp(body.nodes(everywhere), components="xy")
+    surface = body.surface("z-")
+    contact = b.add_contact(surface, floor, law=law, restitution=e, stiffness=1e-5, smoothing=smoothing)
+    h = impact_step(contact, "patch", 1.0) / per_contact
+    model = b.finalize(device="cpu", worlds=count)
+    speed = 10.0 ** rng.uniform(-2, 1, count)
+    gap = rng.uniform(0.0, 2.0, count) * h * speed
+    state = model.state()
+    u, v = state.displacement.numpy(), state.velocity.numpy()
+    u[:, :, 2], v[:, :, 2] = gap[:, None], -speed[:, None]
+    state.displacement.assign(u)
+    state.velocity.assign(v)
+    solver = wf.NewtonPCG(tol=1e-10, max_halvings=0)
+    sim = wf.Simulation(model, state, dt=h, solver=solver, on_failure="freeze", record=False)
+    sim.step(steps)
+    gamma = math.sqrt(contact.stiffness) * law_numbers(contact)["normal_damping"] * beta_of(e)
+    inside = h * speed + G * h * h - gap
+    return sim, (inside > 0.0) & (inside < gamma * h * gap)
+
+
+@pytest.mark.parametrize("e", [0.1, 0.5])
+@pytest.mark.parametrize("per_contact", [3, 20])
+def test_default_law_always_finds_a_solution(e, per_contact):
+    sim, _ = impacts(750, 8, "default", per_contact, e)
+    assert not sim.status.any()
+
+
+@pytest.mark.parametrize("per_contact", [3, 20])
+def test_paper_patch_ramped_in_always_finds_a_solution(per_contact):
+    sim, without = impacts(300, 3, "paper", per_contact, smoothing=1e-3)
+    assert without.any()
+    assert sim.status.sum() == 0
+
+
+def test_paper_patch_fails_where_it_has_no_solution_and_only_there():
+    sim, without = impacts(3000, 1, "paper", 20)
+    assert 30 < without.sum() < 300
+    assert ((sim.status != 0) == without).all()
+
+
+def test_paper_patch_without_solution_raises():
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = cube(b, origin=(0, 0, 0.00099))
+    b.clamp(body.nodes(everywhere), components="xy")
+    b.set_initial(body, velocity=(0, 0, -1.0))
+    floor = b.add_collider(wf.HalfSpace((0, 0, 1)))
+    b.add_contact(body.surface("z-"), floor, law="paper", restitution=0.1, stiffness=1e-2)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, solver=wf.NewtonPCG(max_halvings=0))
+    with pytest.raises(wf.ConvergenceError, match="was not accepted"):
+        sim.step()

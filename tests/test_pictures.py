@@ -1,0 +1,176 @@
+"""VTU, PNG and GIF against a stub simulation, and the ray caster."""
+
+from __future__ import annotations
+
+import itertools
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from stub_simulation import FAR, StubSim, drive, left_over, tet_box
+
+from warpfea.base.errors import OutputError
+from warpfea.outputs.colormap import map_colors
+from warpfea.outputs.normals import smooth_corners
+from warpfea.outputs.raycaster import Camera, Renderer, nice_number
+from warpfea.outputs.render import GIFWriter, PNGWriter
+from warpfea.outputs.vtk import VTUWriter
+
+# ---------------------------------------------------------------------------------------------------- VTU
+
+
+def test_vtu_series(tmp_path):
+    import meshio
+
+    sim = StubSim(worlds=2, dt=0.1)
+    before = [b.mesh.cells.copy() for b in sim.bodies]
+    writer = VTUWriter(tmp_path / "out", every=2, fields=["von_mises"])
+    states = []
+    drive(sim, writer, 5, lambda s: states.append((s.time[0], [s.positions(b) for b in s.bodies])))
+    entries = [e.attrib for e in ElementTree.parse(writer.series).iter("DataSet")]
+    assert writer.series == tmp_path / "out" / "out.pvd"
+    assert sorted({float(e["timestep"]) for e in entries}) == [states[k][0] for k in (0, 2, 4, 5)]
+    assert len(entries) == 4 * 2 * 2
+    assert {e["part"] for e in entries} == {"0", "1", "2", "3"}
+    assert left_over(tmp_path / "out") == sorted([*(e["file"] for e in entries), "out.pvd"])
+    for entry in entries:
+        time, part = float(entry["timestep"]), int(entry["part"])
+        mesh = meshio.read(tmp_path / "out" / entry["file"])
+        source = sim.bodies[part // 2]
+        state = next(s for t, s in states if t == time)
+        assert (mesh.points == state[part // 2][part % 2]).all()
+        assert mesh.cells[0].type == source.mesh.cell_type
+        assert (mesh.cells[0].data == before[part // 2]).all()
+        assert np.allclose(mesh.points - mesh.point_data["displacement"], source.mesh.points, atol=1e-11)
+        assert mesh.point_data["velocity"].shape == mesh.points.shape
+        assert mesh.point_data["von_mises"].shape == (len(mesh.points),)
+        assert mesh.cell_data["set:half"][0].sum() == len(mesh.cells[0].data) // 2
+    for b, cells in zip(sim.bodies, before):
+        assert (b.mesh.cells == cells).all()
+
+
+def test_vtu_by_time_and_abort(tmp_path):
+    sim = StubSim(worlds=1)
+    writer = VTUWriter(tmp_path / "v", fps=20)
+    drive(sim, writer, 10)
+    assert len(left_over(tmp_path / "v")) == 3 * 2 + 1
+    again = VTUWriter(tmp_path / "w")
+    again.open(sim)
+    again.write(sim)
+    again.abort()
+    assert left_over(tmp_path) == ["v"]
+    with pytest.raises(OutputError, match="not both"):
+        VTUWriter(tmp_path / "v", every=2, fps=20)
+    with pytest.raises(OutputError, match="at least 1"):
+        VTUWriter(tmp_path / "v", every=0)
+
+
+# ----------------------------------------------------------------------------------------------- pictures
+
+
+def test_png_shows_the_scene(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "o.png"
+    drive(StubSim(far=(0, 0.5, 0)), PNGWriter(path, size=(320, 180)), 20)
+    assert left_over(tmp_path) == ["o.png"]
+    image = np.asarray(Image.open(path))
+    assert image.shape == (180, 320, 3)
+    assert np.ptp(image.reshape(-1, 3).astype(int), axis=0).min() > 120
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 1000
+    left = image[:, :250].reshape(-1, 3).astype(int)
+    assert (left[:, 0] > left[:, 2] + 90).mean() > 0.005  # yellow, on bodies, not on the bar
+    assert (left[:, 2] > left[:, 1] + 15).mean() > 0.01  # violet
+    early = tmp_path / "early.png"
+    drive(StubSim(far=(0, 0.5, 0)), PNGWriter(early, size=(320, 180), time=0.0, field=None, ground=False), 20)
+    other = np.asarray(Image.open(early)).astype(int)
+    assert np.abs(other - image).max() > 60
+    assert (np.ptp(other, axis=2) > 60).sum() == 0  # grey body
+
+
+def test_gif_frames_differ(tmp_path):
+    from PIL import Image, ImageSequence
+
+    path = tmp_path / "o.gif"
+    sim = StubSim(worlds=1, dt=0.01, far=(0, 0.5, 0.3))
+    drive(sim, GIFWriter(path, fps=10, size=(200, 120), progress=False), 35)
+    with Image.open(path) as gif:
+        assert gif.n_frames == 5
+        frames = [np.asarray(f.convert("RGB")).astype(int) for f in ImageSequence.Iterator(gif)]
+        durations = [f.info["duration"] for f in ImageSequence.Iterator(gif)]
+    assert durations[:4] == [100, 100, 100, 50]
+    for a, b in itertools.pairwise(frames):
+        assert (np.abs(a - b).max(axis=2) > 40).sum() > 50
+    assert np.abs(frames[0][:10, :50] - frames[-1][:10, :50]).max() == 0  # the background stands still
+    short = GIFWriter(tmp_path / "s.gif", fps=50, speed=0.5, size=(64, 64), max_frames=6, progress=False)
+    drive(StubSim(worlds=1), short, 35)
+    with Image.open(tmp_path / "s.gif") as gif:
+        assert 3 <= gif.n_frames <= 7
+
+
+def test_renderer_far_from_the_origin():
+    """A shift by 1e4 m changes no more than a few pixels at edges; refitting equals building anew."""
+    points, _, triangles = tet_box((1.0, 0.2, 0.2), (8, 2, 2))
+    colors = map_colors(points[:, 0], 0.0, 1.0)
+    images = []
+    for shift in (np.zeros(3), FAR):
+        renderer = Renderer(triangles, ground=float(shift[2]))
+        images.append(renderer.render(points + shift, colors, size=(240, 135)).astype(int))
+    assert (np.abs(images[0] - images[1]).max(axis=2) > 8).mean() < 0.002
+    bent = points + np.array([0, 0, 0.3]) * (points[:, :1] ** 2)
+    camera = Camera.framing(points, aspect=240 / 135)
+    refitted = renderer_pictures(Renderer(triangles, reference=points), [points, bent], colors, camera)[1]
+    anew = renderer_pictures(Renderer(triangles, reference=points), [bent], colors, camera)[0]
+    assert (refitted == anew).all()
+    with pytest.raises(OutputError, match="finite"):
+        Renderer(triangles).render(points * np.nan, colors)
+
+
+def test_renderer_turns_y_up():
+    points, _, triangles = tet_box((1.0, 0.2, 0.2), (8, 2, 2))
+    colors = map_colors(points[:, 0], 0.0, 1.0)
+    turned = np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1)
+    z_up = Renderer(triangles, ground=0.0).render(points, colors, size=(240, 135))
+    y_up = Renderer(triangles, ground=0.0, up_axis="Y").render(turned, colors, size=(240, 135))
+    assert (z_up == y_up).all()
+
+
+def renderer_pictures(renderer, states, colors, camera):
+    return [renderer.render(points, colors, camera, (240, 135)) for points in states]
+
+
+def test_camera_frames_all_points():
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(500, 3)) * [5.0, 0.2, 1.0] + FAR
+    for view in ((-65, 20), (10, 0), (120, 80), (0, 90), (45, -90), (30, 89.9)):
+        camera = Camera.framing(points, view=view, margins=(0.05, 0.2, 0.1, 0.1))
+        forward, right, up = camera.axes()
+        local = points - camera.eye
+        depth = local @ forward
+        tangent = np.tan(np.radians(camera.fov / 2))
+        x = (local @ right / depth / tangent / (16 / 9) + camera.center[0] + 1) / 2
+        y = (local @ up / depth / tangent + camera.center[1] + 1) / 2
+        assert (depth > 0).all()
+        assert x.min() > 0.045
+        assert x.max() < 0.805
+        assert y.min() > 0.095
+        assert y.max() < 0.905
+        assert max(np.ptp(x) / 0.75, np.ptp(y) / 0.8) > 0.97
+    for x, y, z in ((0.1, 0.05, 5.0), (5.0, 0.2, 1.0)):  # looked at along the longest side too
+        box = np.array(list(itertools.product((-x, x), (-y, y), (-z, z))))
+        for view in ((0, 90), (0, 89), (90, 0), (-65, 20)):
+            camera = Camera.framing(box, view=view)
+            forward, right, up = camera.axes()
+            local = box - camera.eye
+            tangent = np.tan(np.radians(camera.fov / 2)) * (local @ forward)
+            assert np.abs(local @ right / tangent / (16 / 9) + camera.center[0]).max() < 0.881
+            assert np.abs(local @ up / tangent + camera.center[1]).max() < 0.841
+    assert [nice_number(x) for x in (1.0, 0.3, 49.0, 50.0)] == pytest.approx([1.0, 0.2, 20.0, 50.0])
+
+
+def test_smooth_corners_keep_edges():
+    points, _, triangles = tet_box((1, 1, 1), (2, 2, 2))
+    group, count = smooth_corners(points, triangles)
+    assert count == 6 * 9  # each of the six sides has its own normals
+    assert len(group) == 3 * len(triangles)
+    assert smooth_corners(points, triangles, angle=120.0)[1] == 26

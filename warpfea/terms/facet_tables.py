@@ -1,0 +1,217 @@
+"""What the tables of contacts of either kind have in common: groups of facets with points, and numbers of laws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import numpy as np
+import warp as wp
+from scipy.optimize import brentq
+
+from ..kernels.terms.contact_data import facet_struct
+from ..kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH
+from ..model.contact_points import RULES, ContactPoints, lagrange_basis
+from ..model.contacts import Contact
+from ..model.pairs import PairContact
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+
+__all__ = ["LAWS", "LISTED", "PER_WORLD", "FacetGroup", "FacetTables", "beta_of", "clamped_slots", "hunt_crossley_damping",
+           "normal_damping"]  # fmt: skip
+
+AnyContact = TypeVar("AnyContact", Contact, PairContact)
+LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
+SMOOTHING = (1e-3, 1e-4)
+"""Of the smooth law where none is given: eps, N, and v_eps, m/s."""
+PER_WORLD = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
+"""What Model.set_parameter sets of a contact, and the arrays with it; the restitution is in `beta` too."""
+LISTED = 8
+"""Threads that share a sum over the points of a facet on CUDA."""
+PATCH, LUMPED, MOVING = range(3)
+"""What acts on a facet: all of its points, at most one of them, at most one place of it."""
+
+
+def beta_of(restitution: float) -> float:
+    """-beta of Eq. (75), positive."""
+    log = math.log(restitution)
+    return -log / math.hypot(log, math.pi)
+
+
+def hunt_crossley_damping(restitution: float) -> float:
+    """chi v_i of the default law: the d of (1 + e) d = ln((1 + d)/(1 - e d)), 0 for e = 1.
+
+    Exact for an impact of a mass on the undamped-at-rest spring, whatever its exponent; DESIGN 8.
+    """
+    e = restitution
+    if e >= 1.0:
+        return 0.0
+
+    def excess(d: float) -> float:
+        return (1.0 + e) * d - math.log1p(d) + math.log1p(-e * d)
+
+    top = 1.0 / e
+    low = 1e-9
+    while excess(low) <= 0.0 and low < 0.5 * top:  # rounding, for e close to 1
+        low *= 2.0
+    high = top * (1.0 - 1e-15)
+    if excess(low) <= 0.0:
+        return 0.0
+    # below e of about 0.02 the root is nearer to 1/e than numbers can be
+    return float(brentq(excess, low, high, xtol=1e-15)) if excess(high) < 0.0 else high
+
+
+def normal_damping(stiffness: float, mass: float) -> float:
+    """gamma_n over -beta of Eq. (76), N s/m, of S_n = 2 E* a in N/m and m_eff in kg."""
+    return 2.0 * math.sqrt(5.0 / 6.0) * math.sqrt(stiffness * mass)
+
+
+def clamped_slots(model: Model) -> np.ndarray:
+    """(slots,) whether a slot is held in all directions by supports that never move."""
+    held = np.zeros((model.slots, 3))
+    for support in model.description.supports:
+        if support.law is None and support.node_laws is None and support.rotation is None:
+            held[support.body.slot_offset + support.slots] += support.components
+    return np.asarray((held > 0).all(axis=1))
+
+
+@dataclass(eq=False)
+class FacetGroup:
+    """Facets with as many slots and points each, those of a contact next to each other.
+
+    Attributes:
+        conn: (F, L) slots of the model.
+        points: (F, P) numbers of the points.
+        data: the device struct.
+        lumped: whether at most one of its places acts.
+    """
+
+    conn: np.ndarray
+    data: Any
+    lumped: bool
+
+    @property
+    def count(self) -> int:
+        """Facets."""
+        return len(self.conn)
+
+    def sides(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
+        """Threads that sum over the points of a facet for each of its slots, and how many share a slot."""
+        lanes = launch.lanes(LISTED)
+        return (worlds, launch.padded(lanes * self.conn.size)), lanes
+
+
+class FacetTables(Generic[AnyContact]):
+    """Contacts and the points of their surfaces, in the order of the device: by the kind of their facets.
+
+    Attributes:
+        contacts: handles in that order; number: of a handle's index.
+        host: shape functions, areas, slots and places of each contact, for fields and checks.
+        kinds: slots and points of facets, and what acts on them.
+        groups: facets.
+        points, rows: how many points and facets there are in all.
+        first, row_start: first point and first facet of each contact.
+        shares: (F, P) of each contact: area of each point over that of the region; 0: no contact.
+    """
+
+    first: np.ndarray
+    row_start: np.ndarray
+    shares: list[np.ndarray]
+
+    def __init__(self, model: Model, contacts: Sequence[AnyContact], points: Sequence[ContactPoints]) -> None:
+        self.model = model
+        kinds = [_kind(*pair) for pair in zip(contacts, points)]
+        order = sorted(range(len(kinds)), key=lambda k: (kinds[k], k))
+        self.kinds = sorted(set(kinds))
+        self.contacts: list[AnyContact] = [contacts[k] for k in order]
+        self.host: list[ContactPoints] = [points[k] for k in order]
+        self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
+        self.groups: list[FacetGroup] = []
+        self.points = self.rows = 0
+
+    @property
+    def explicit(self) -> bool:
+        """Whether a contact has the force of the last state."""
+        return any(contact.treatment == "explicit" for contact in self.contacts)
+
+    def _build_facets(self, pool: int) -> int:
+        """Upload the facets, from an entry of the pool on; the entry that comes after them."""
+        first, row_start = (np.zeros(len(self.contacts) + 1, dtype=np.int64) for _ in range(2))
+        for kind in self.kinds:
+            chosen = [k for k, pair in enumerate(zip(self.contacts, self.host)) if _kind(*pair) == kind]
+            for k in chosen:
+                first[k + 1] = first[k] + self.host[k].area.size
+                row_start[k + 1] = row_start[k] + len(self.host[k].conn)
+            group = self._group(kind, chosen, pool)
+            self.groups.append(group)
+            pool += group.conn.size
+            self.rows += group.count
+            self.points += group.count * kind[1]
+        self.first, self.row_start = first, row_start
+        return pool
+
+    def _group(self, kind: tuple[int, int, int], chosen: list[int], pool: int) -> FacetGroup:
+        """Facets of one kind, of the contacts chosen."""
+        m = self.model
+        parts = [self.host[k] for k in chosen]
+        conn = np.concatenate([self.host[k].conn + self.contacts[k].body.slot_offset for k in chosen])
+        data = facet_struct(m.dtype)()
+
+        def put(name: str, values: Any, dtype: Any) -> None:
+            setattr(data, name, m.array("contact", np.ascontiguousarray(values), dtype))
+
+        put("conn", conn.T, wp.int32)
+        put("shape", np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2), m.types.T)
+        put("X", np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1), wp.vec3d)
+        put("share", np.concatenate([self.shares[k] for k in chosen]).T, wp.float64)
+        put("area", np.concatenate([p.area for p in parts]).T, wp.float64)
+        put("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
+        data.pool, data.row, data.point = pool, self.rows, self.points
+        _, data.points, acts = kind
+        data.count, data.moving, data.corners = len(conn), int(acts == MOVING), 3 if data.points in RULES[3] else 4
+        if acts != PATCH:
+            points = RULES[data.corners][data.points].points
+            basis, power = lagrange_basis(points)
+            put("coords", points, wp.vec2d)
+            put("basis", basis, wp.float64)
+            put("power", power, wp.vec2i)
+        return FacetGroup(conn, data, acts != PATCH)
+
+    def _put_laws(self, out: Any, numbers: list[dict[str, float]]) -> None:
+        """Upload what a law has; `numbers` of each contact: normal, tangent, normal_damping, mass."""
+        m, C = self.model, self.contacts
+
+        def put(name: str, values: Any, dtype: Any = wp.float64) -> None:
+            setattr(out, name, m.array("contact", np.asarray(values), dtype))
+
+        put("law", [LAWS[c.law] for c in C], wp.int32)
+        put("lumped", [int(c.model == "sphere") for c in C], wp.int32)
+        put("dead", [int(c.treatment == "explicit") for c in C], wp.int32)
+        put("first", self.first, wp.int32)
+        for name in ("normal", "tangent", "normal_damping", "mass"):
+            put(name, [row[name] for row in numbers])
+        smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else SMOOTHING for c in C]
+        put("ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
+        put("force_eps", [pair[0] for pair in smoothing])
+        put("speed_eps", [pair[1] for pair in smoothing])
+        put("offset", [c.offset for c in C])
+        put("decay", [c.overlap_time for c in C])
+        per_world = {
+            "mu": [c.mu for c in C],
+            "mu_static": [c.mu_static for c in C],
+            "damping": [hunt_crossley_damping(c.restitution) for c in C],
+            "beta": [beta_of(c.restitution) for c in C],
+            "scale": [c.stiffness for c in C],
+        }
+        for name, values in per_world.items():
+            put(name, np.tile(values, (m.worlds, 1)))
+
+
+def _kind(contact: Contact | PairContact, p: ContactPoints) -> tuple[int, int, int]:
+    """Slots and points of a facet, and what acts: PATCH, LUMPED or MOVING."""
+    lumped = LUMPED if contact.treatment == "explicit" else MOVING
+    return p.conn.shape[1], p.area.shape[1], PATCH if contact.model == "patch" else lumped
