@@ -438,8 +438,17 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if wp.static(walls and not midpoint):  # sticking sets in where Phi rises again
             slope = ctl.slot_sums[6, world] - alpha * bend
             steep = f64(KINK) * wp.abs(ctl.slope[world])
-            kinked = finite and not (stands or wishes or reused) and ctl.searches[world] < MAX_KINK and ctl.domain_J[world] > f64(0.0)
-            kinked = kinked and ctl.wish[world] == 0 and (slope > steep or (ctl.upper[world][0] > f64(0.0) and slope < -steep))
+            kinked = (
+                finite
+                and not (stands or wishes or reused)
+                and ctl.searches[world] < MAX_KINK
+                and ctl.domain_J[world] > f64(0.0)
+            )
+            kinked = (
+                kinked
+                and ctl.wish[world] == 0
+                and (slope > steep or (ctl.upper[world][0] > f64(0.0) and slope < -steep))
+            )
             if kinked:
                 ctl.searches[world] = ctl.searches[world] + 1
                 ctl.alpha[world] = between(ctl, world, slope)

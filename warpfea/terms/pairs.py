@@ -22,8 +22,8 @@ from ..model.state import State
 from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
-from .facet_tables import LISTED
 from .contact_starts import reference_place, store_overlaps, touching_depth
+from .facet_tables import LISTED
 from .pair_solves import PairSolves
 from .pair_survey import survey
 from .term import LOSS, STORED, At, Column, part

@@ -101,8 +101,18 @@ class Workspace:
         skip += () if traits.gated else ("outer", "open")
         skip += () if traits.stored else ("term_sums", "stepped")
         skip += () if traits.limited else ("limit",)
-        skip += () if traits.walls else (
-            "refreshed", "new_walls", "excursions", "unsettled", "touching", "lower", "upper",
+        skip += (
+            ()
+            if traits.walls
+            else (
+                "refreshed",
+                "new_walls",
+                "excursions",
+                "unsettled",
+                "touching",
+                "lower",
+                "upper",
+            )
         )
         self.newton = self.struct(
             control_struct(), B, skip=skip,
