@@ -22,7 +22,7 @@ from ..model.state import State
 from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
-from .contact_starts import reference_place, store_overlaps, touching_depth
+from .contact_starts import reference_place, refuse_sunk, store_overlaps, touching_depth
 from .pair_solves import PairSolves
 from .pair_survey import survey
 from .term import LOSS, STORED, At, Column, part
@@ -195,6 +195,7 @@ class Pairs(PairSolves):
         depth = np.where((seat >= 0) & new[:, None], s["touching"].depth.numpy(), 0.0)
         touching = touching_depth(self.model.size, at.state.displacement.numpy())
         store_overlaps(t, depth, touching, overlap)
+        refuse_sunk(t, at.state.displacement.numpy(), s["touching"].x0.numpy(), seat, new)
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
