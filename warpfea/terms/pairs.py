@@ -339,8 +339,8 @@ class Pairs(PairSolves):
         contact, where = t.contacts[k], reference_place(t, k, found - 1 - int(t.first[k]))
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.slave.body.name!r} (reference place "
-            f"{where}) went through body {contact.master.body.name!r}; take a "
-            "smaller dt, a larger stiffness= of the contact, or a thicker body"
+            f"{where}) went through body {contact.master.body.name!r}; take a larger "
+            "stiffness= of the contact or a thicker body, or a smaller dt where it moves that far in a step"
         )
 
     def remark(self, at: At, world: int) -> str:
