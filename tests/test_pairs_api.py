@@ -286,6 +286,38 @@ def test_overlap_at_the_start_is_refused_or_decays():
     assert heights[-1] > 0.9 * depth
 
 
+@pytest.mark.parametrize("initial", [False, True])
+@pytest.mark.parametrize("named", [False, True])
+def test_a_body_that_begins_within_another_is_refused(named, initial):
+    """Deeper than facets hold: also where the body is there by its initial displacement only."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    far = 1.0 if initial else 0.0
+    big = b.add_solid(wf.mesh.box((0.3, 0.3, 0.3), cells=(2, 2, 2)), material=RUBBER, name="big")
+    small = b.add_solid(wf.mesh.box((0.06,) * 3, cells=(1, 1, 1), origin=(0.12 + far, 0.12, 0.12)), material=RUBBER,
+                        name="small")  # fmt: skip
+    if initial:
+        b.set_initial(small, displacement=(-far, 0, 0))
+    sides = (small.surface("z-"), big.surface("z+")) if named else (small, big)
+    b.add_contact(*sides, name="pad")
+    model = b.finalize(device="cpu", worlds=2)
+    with pytest.raises(wf.ModelError, match="contact 'pad': body 'small' begins within body 'big'"):
+        wf.Simulation(model, dt=1e-3)
+
+
+def test_a_body_in_the_hollow_of_another_is_not_within_it():
+    def bent(X):  # an arc that opens upwards
+        angle = np.pi * X[:, 0] / 0.3
+        r = 0.12 - X[:, 2]
+        return np.column_stack([-r * np.cos(angle), X[:, 1], -r * np.sin(angle)])
+
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    shell = wf.mesh.box((0.3, 0.06, 0.02), cells=(6, 1, 1), map=bent)
+    bowl = b.add_solid(shell, material=RUBBER, name="bowl")
+    ball = b.add_solid(wf.mesh.sphere(0.05, cells=2, center=(0, 0.03, -0.05)), material=RUBBER, name="ball")
+    b.add_contact(ball, bowl)
+    assert wf.Simulation(b.finalize(device="cpu"), dt=1e-3).step(2).converged.all()
+
+
 # commands, and what a scene without it costs
 
 
@@ -295,7 +327,9 @@ def test_commands_tell_of_pairs(tmp_path, capfd):
         main(["run", "block_stack", "--set", "blocks=1", "--t-end", "0.04", "--device", "cpu", "--json", str(target)])
         == 0
     )
-    assert "contact joint 1" in capfd.readouterr().out
+    out = capfd.readouterr().out
+    assert "contact joint 1" in out
+    assert "lost to restitution" in out
     found = json.loads(target.read_text())["contacts"]["joint 1"]
     assert found["normal_force"] > 0.0
     assert found["force"][2] > 0.0

@@ -13,7 +13,7 @@ SMALL = 4
 
 @functools.cache
 def precision(dtype: str) -> _types.SimpleNamespace:
-    """Types of one precision, `"float64"` or `"float32"`: scalar T, vec2, vec3, sym (Voigt xx yy zz yz xz xy), mat33."""
+    """Types of one precision, "float64" or "float32": scalar T, vec2, vec3, sym (Voigt xx yy zz yz xz xy), mat33."""
     scalar = {"float64": wp.float64, "float32": wp.float32}[dtype]
     return _types.SimpleNamespace(
         name=dtype,

@@ -341,8 +341,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def apart(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d, pad: f64) -> bool:
-        """Whether a point is above a facet by more than `pad`, or did not move far and is beside it, as the tangent plane
-        in the middle tells."""
+        """Whether a point is above a facet by more than `pad`, or did not move far and is beside it: by the tangent
+        plane in its middle."""
         corners = mas.corners[mas.kind[f]]
         s = jet_of(t.middle[world, f])
         if wp.dot(x - s.x, outward(s)) > f64(2.0) * pad + t.swell[world, f]:

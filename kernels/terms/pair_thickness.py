@@ -1,4 +1,4 @@
-"""How thick a body is behind the facets of a surface."""
+"""How thick a body is behind the facets of a surface, and how deep places are in it."""
 
 import functools
 
@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.types import kernel_module
 
-__all__ = ["thickness_kernel"]
+__all__ = ["depth_kernel", "thickness_kernel"]
 
 SIDES = 8
 """Sides that a ray may meet."""
@@ -39,3 +39,20 @@ def thickness_kernel() -> wp.Kernel:
                 return
 
     return thickness
+
+
+@functools.cache
+def depth_kernel() -> wp.Kernel:
+    """The kernel; lengths are over the size of the body."""
+    module = kernel_module("pair_depth")
+
+    @wp.kernel(module=module)
+    def depth(mesh: wp.uint64, x: wp.array(dtype=wp.vec3), out: wp.array(dtype=float)):
+        """Distance from x to the nearest place of a closed mesh that x is in, else 0."""
+        i = wp.tid()
+        found = wp.mesh_query_point_sign_winding_number(mesh, x[i], float(10.0))
+        out[i] = float(0.0)
+        if found.result and found.sign < float(0.0):
+            out[i] = wp.length(x[i] - wp.mesh_eval_position(mesh, found.face, found.u, found.v))
+
+    return depth

@@ -55,10 +55,10 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
         ModelError: it is not; the text begins with `what`.
     """
     body = thing if isinstance(thing, Body) else getattr(thing, "body", None)
+    wanted = " or ".join(HANDLES[kind] for kind in kinds)
     if not isinstance(body, Body):
-        raise ModelError(f"{what}: expected a handle of a body (such as body.nodes(...)), got {thing!r}")
+        raise ModelError(f"{what}: expected a handle of a body, {wanted}, got {thing!r}")
     if not isinstance(thing, kinds):
-        wanted = " or ".join(HANDLES[kind] for kind in kinds)
         raise ModelError(f"{what}: expected {wanted} of body {body.name!r}, got {HANDLES[type(thing)]}")
     if body not in bodies:
         raise ModelError(f"{what}: body {body.name!r} belongs to another builder")

@@ -76,7 +76,9 @@ def add_contact(
 ) -> Contact | PairContact:  # fmt: skip
     """Record a contact with a collider or another body; see ModelBuilder.add_contact."""
     if other is None:
-        raise NotImplementedError("add_contact: a body with itself is a later part; give a collider or a body")
+        raise NotImplementedError(
+            "add_contact: a body with itself is not part of this version; give a collider or another body"
+        )
     if isinstance(other, (Body, SurfaceSet)):
         d.pairs.append(make_pair(d, thing, other, name, **options))
         return d.pairs[-1]
@@ -115,12 +117,14 @@ def make_pair(
     """See ModelBuilder.add_contact, with two bodies."""
     a, b = contact_surface(first), contact_surface(second)
     if a.body is b.body:
-        raise NotImplementedError(f"add_contact: body {a.body.name!r} with itself is a later part; give two bodies")
+        raise NotImplementedError(
+            f"add_contact: body {a.body.name!r} with itself is not part of this version; give two bodies"
+        )
     taken = {c.name for c in d.contacts} | {c.name for c in d.pairs}
     name = unused_name(name, f"{a.body.name} on {b.body.name}", taken, "contact")
     what = f"contact {name!r}"
     if options["model"] == "sphere":
-        raise NotImplementedError(f"{what}: model = 'sphere' between bodies is a later part; take 'patch'")
+        raise NotImplementedError(f"{what}: model = 'sphere' between bodies is not part of this version; take 'patch'")
     if options["law"] == "smooth":
         raise NotImplementedError(
             f"{what}: law = 'smooth' acts at any distance, and is for contact with colliders; take 'default' or 'paper'"

@@ -153,6 +153,11 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
     if s["load"] is None:
         lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
         rows.append(["", f"lost by the integrator {lost} J, unbalanced {left} J"])
+        if s["contacts"]:
+            stored = _text((e["contact"] or 0.0) + (e["contact_pairs"] or 0.0))
+            lost = f"lost to restitution {_text(e['contact_loss'])}, to friction {_text(e['friction'])} J"
+            moved = f", done by colliders {_text(e['collider_work'])} J" if sim.model.description.colliders else ""
+            rows.append(["", f"in contact {stored} J, {lost}{moved}"])
     for name, values in s["probes"].items():
         u = ", ".join(_text(x) for x in values["displacement"])
         rows.append([f"probe {name}", f"displaced by ({u}) m"])

@@ -342,8 +342,8 @@ class Contact(Term):
         where = reference_place(t, k, number - int(t.first[k]))
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
-            f"{where}) went through collider {contact.collider.name!r}; take a "
-            "smaller dt, a larger stiffness= of the contact, or a thicker shape"
+            f"{where}) went through collider {contact.collider.name!r}; take a larger "
+            "stiffness= of the contact or a thicker shape, or a smaller dt where it moves that far in a step"
         )
 
     def remark(self, at: At, world: int) -> str:

@@ -9,15 +9,21 @@ import numpy as np
 from ..base.errors import ModelError
 from ..model.contacts import Contact
 from ..model.pairs import PairContact
+from ..model.surfaces import make_skin, reference_points
 
 if TYPE_CHECKING:
+    from ..model.discretisation import Discretisation
     from .contact_tables import ContactTables
     from .pair_tables import PairTables
 
-__all__ = ["reference_place", "store_overlaps", "touching_depth"]
+__all__ = ["reference_place", "refuse_sunk", "store_overlaps", "touching_depth"]
 
 TOUCHING = 1e-9
 """Depth at the start, over the model's size, that counts as touch; roundings of displacements come on top."""
+
+SUNK = 0.1
+"""A place without a seat is in a body if it is deeper than this part of the depth that its thinnest facet allows: the
+skin that tells what is inside has flat triangles."""
 
 
 def touching_depth(size: float, u: np.ndarray) -> np.ndarray:
@@ -59,3 +65,65 @@ def store_overlaps(
             )
         kept = np.maximum(mine[deep], 0.0)
         overlap[deep, points] = kept.max(axis=1, keepdims=True) if contact.model == "sphere" else kept
+
+
+def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, seats: np.ndarray, new: np.ndarray) -> None:
+    """Refuse bodies that begin so deep in another one that none of its facets holds their points.
+
+    Args:
+        u: displacements (worlds, slots, 3), m.
+        places: of the points (worlds, points, 3), m.
+        seats: facets that hold them, -1 for none, (worlds, points).
+        new: (worlds,) that begin.
+
+    Raises:
+        ModelError: a contact whose `overlap` is "refuse" has such a point.
+    """
+    for k, contact in enumerate(tables.contacts):
+        if contact.overlap != "refuse":
+            continue
+        body, points = contact.master.body, slice(tables.first[k], tables.first[k + 1])
+        limit = tables.masters[tables.of[k]].limit
+        least = SUNK * float(limit.min())
+        beyond = (0.0 if body.family.solid else float(limit.max())) - least  # of the box of its nodes
+        nodes = body.slot_kind == 0
+        spans = body.reference[nodes] + body.origin + u[:, body.slots[nodes]]
+        low, high = (end(axis=1)[:, None] for end in (spans.min, spans.max))
+        x = places[:, points]
+        near = ((x > low - beyond) & (x < high + beyond)).all(axis=2) & (seats[:, points] < 0)
+        near &= new[:, None] & (tables.host[k].area.ravel() > 0.0)
+        seen = set()
+        for world in np.flatnonzero(near.any(axis=1)):
+            key = (u[world, body.slots].tobytes(), x[world, near[world]].tobytes())
+            if key in seen:
+                continue
+            seen.add(key)
+            depth = _depths(body, u[world, body.slots], x[world, near[world]])
+            if depth.max() > least:
+                point = int(np.flatnonzero(near[world])[depth.argmax()])
+                raise ModelError(
+                    f"contact {contact.name!r}: body {contact.slave.body.name!r} begins within body {body.name!r} "
+                    f"(world {world}, reference point {reference_place(tables, k, point)}, {depth.max():.3g} m deep), "
+                    "where no facet of the contact reaches; move one of them, or leave these faces out of the contact"
+                )
+
+
+def _depths(body: Discretisation, u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Distance, m, of places to the skin of a body that they are in, at displacements of its slots; 0 outside."""
+    import warp as wp
+
+    from ..kernels.terms.pair_thickness import depth_kernel
+
+    drawn = make_skin(body)
+    skin = reference_points(body, drawn.slot_weights) + drawn.slot_weights @ u.astype(float)
+    center, size = skin.mean(axis=0), float(np.ptp(skin, axis=0).max())
+    with wp.ScopedDevice("cpu"):
+        mesh = wp.Mesh(
+            wp.array((skin - center) / size, dtype=wp.vec3),
+            wp.array(drawn.triangles.ravel(), dtype=wp.int32),
+            support_winding_number=True,
+        )
+        out = wp.zeros(len(x), dtype=float)
+        places: wp.array = wp.array((x - center) / size, dtype=wp.vec3)
+        wp.launch(depth_kernel(), len(x), [mesh.id, places, out], device="cpu")
+        return np.asarray(out.numpy(), dtype=float) * size

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
 
-__all__ = ["LAWS", "LISTED", "PER_WORLD", "FacetGroup", "FacetTables", "beta_of", "clamped_slots", "hunt_crossley_damping",
-           "normal_damping"]  # fmt: skip
+__all__ = ["LAWS", "LISTED", "PER_WORLD", "FacetGroup", "FacetTables", "beta_of", "clamped_slots",
+           "hunt_crossley_damping", "normal_damping"]  # fmt: skip
 
 AnyContact = TypeVar("AnyContact", Contact, PairContact)
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}

@@ -22,7 +22,7 @@ from ..model.state import State
 from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
-from .contact_starts import reference_place, store_overlaps, touching_depth
+from .contact_starts import reference_place, refuse_sunk, store_overlaps, touching_depth
 from .facet_tables import LISTED
 from .pair_solves import PairSolves
 from .pair_survey import survey
@@ -197,6 +197,7 @@ class Pairs(PairSolves):
         depth = np.where((seat >= 0) & new[:, None], s["touching"].depth.numpy(), 0.0)
         touching = touching_depth(self.model.size, at.state.displacement.numpy())
         store_overlaps(t, depth, touching, overlap)
+        refuse_sunk(t, at.state.displacement.numpy(), s["touching"].x0.numpy(), seat, new)
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
@@ -343,8 +344,8 @@ class Pairs(PairSolves):
         contact, where = t.contacts[k], reference_place(t, k, found - 1 - int(t.first[k]))
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.slave.body.name!r} (reference place "
-            f"{where}) went through body {contact.master.body.name!r}; take a "
-            "smaller dt, a larger stiffness= of the contact, or a thicker body"
+            f"{where}) went through body {contact.master.body.name!r}; take a larger "
+            "stiffness= of the contact or a thicker body, or a smaller dt where it moves that far in a step"
         )
 
     def remark(self, at: At, world: int) -> str:
