@@ -6,7 +6,6 @@ it is inside of a facet now and was outside of it as the step began; no candidat
 
 import functools
 import types as _types
-from typing import Any
 
 import warp as wp
 
@@ -15,6 +14,7 @@ from .contact import SPEED_FLOOR
 from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import PAPER
 from .contact_touch import touch_functions
+from .pair_boxes import MARGIN, box_kernels
 from .pair_data import master_struct, seat_struct, touching_struct
 from .pair_places import HOLD, OUTER, place_functions
 
@@ -26,9 +26,6 @@ TURNED = 0.1
 """Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
 LOST = 0.25
 """A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
-MARGIN = 0.25
-"""Boxes of the tree are larger than facets by this part of a side: they fit for several steps."""
-ROUNDING = 2.4e-7
 GLANCE = 0.5
 """A place that the tangent plane in the middle of a facet puts so far beyond its sides is not on it."""
 
@@ -38,7 +35,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in one precision of the displacements."""
     p = precision(dtype)
     vec3 = p.vec3
-    f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
+    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
     Attempt, Clock = attempt_struct(dtype), clock_struct()
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
@@ -47,128 +44,9 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     jet, moved, carried, coordinates, outside, middle, locate, follow, outward, foot_of = (
         f.jet, f.moved, f.carried, f.coordinates, f.outside, f.middle, f.locate, f.follow, f.outward, f.foot_of
     )  # fmt: skip
-    Jet = f.Jet
-    mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
+    Jet, boxes = f.Jet, box_kernels(dtype)
+    down, up, contains, jet_of = boxes.down, boxes.up, boxes.contains, boxes.jet_of
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
-
-    @wp.func
-    def control(
-        mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
-        D: wp.array2d(dtype=vec3d),
-    ):  # fmt: skip
-        """Coefficient m of a field of the slots on a master facet."""
-        c = vec3d()
-        d = vec3d()
-        for i in range(mas.conn.shape[0]):
-            value = vec3d(u[world, mas.conn[i, item]])
-            c += f64(mas.shape[m, i, item]) * value
-            d += f64(mas.rise[m, i, item]) * value
-        C[world, mas.most * item + m] = c
-        D[world, mas.most * item + m] = d
-
-    @wp.kernel(module=module)
-    def controls(
-        mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
-        D: wp.array2d(dtype=vec3d),
-    ):  # fmt: skip
-        """Coefficients of displacements on master facets, in float64, see contact_exact.py."""
-        world, item, m = wp.tid()
-        if active[world] != 0 and m < mas.terms[mas.kind[item]]:
-            control(mas, u, world, item, m, C, D)
-
-    @wp.kernel(module=module)
-    def controls_before(
-        mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
-        t: Touching,
-    ):  # fmt: skip
-        """Those of displacements and velocities as an attempt begins."""
-        world, item, m = wp.tid()
-        if active[world] != 0 and m < mas.terms[mas.kind[item]]:
-            control(mas, v_n, world, item, m, t.V0, t.D0)
-            control(mas, u_n, world, item, m, t.C0, t.D0)
-
-    @wp.func
-    def down(x: vec3d) -> box3:
-        """x in single precision, rounded down by more than it can be rounded up."""
-        return box3(
-            wp.float32(x[0] - wp.abs(x[0]) * f64(ROUNDING)),
-            wp.float32(x[1] - wp.abs(x[1]) * f64(ROUNDING)),
-            wp.float32(x[2] - wp.abs(x[2]) * f64(ROUNDING)),
-        )
-
-    @wp.func
-    def up(x: vec3d) -> box3:
-        """x in single precision, rounded up."""
-        return -down(-x)
-
-    @wp.func
-    def contains(low: box3, high: box3, other_low: box3, other_high: box3) -> bool:
-        """Whether a box holds another one."""
-        inside = bool(True)
-        for j in range(3):
-            if other_low[j] < low[j] or other_high[j] > high[j]:
-                inside = False
-        return inside
-
-    @wp.func
-    def rows_of(s: Jet) -> mat43:
-        """A jet as it is kept."""
-        return mat43(s.x[0], s.x[1], s.x[2], s.a[0], s.a[1], s.a[2], s.b[0], s.b[1], s.b[2], s.c[0], s.c[1], s.c[2])
-
-    @wp.func
-    def jet_of(m: mat43) -> Jet:
-        """A jet that was kept."""
-        return Jet(m[0], m[1], m[2], m[3])
-
-    @wp.kernel(module=module)
-    def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), t: Touching):
-        """Whether facets, as the attempt began and now, are within their boxes; new boxes; and their middles."""
-        world, item = wp.tid()
-        if active[world] == 0:
-            return
-        low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
-        high = -low
-        kind = mas.kind[item]
-        count = mas.terms[kind]
-        for q in range(count):
-            x = vec3d()
-            y = vec3d()
-            for m in range(count):
-                part = mas.hull[kind, q, m]
-                if part != f64(0.0):
-                    x += part * (mas.X[m, item] + t.C[world, mas.most * item + m])
-                    y += part * (mas.X[m, item] + t.C0[world, mas.most * item + m])
-            low = wp.min(low, wp.min(x, y))
-            high = wp.max(high, wp.max(x, y))
-        index = world * mas.count + item
-        if not contains(t.lower[index], t.upper[index], down(low), up(high)):
-            t.stale[0] = 1
-        spot = middle(mas.corners[kind])
-        s = jet(mas, t.C, t.D, world, item, spot)
-        n = outward(s)
-        swell = f64(0.0)
-        for q in range(count):
-            x = vec3d()
-            for m in range(count):
-                x += mas.hull[kind, q, m] * (mas.X[m, item] + t.C[world, mas.most * item + m])
-            swell = wp.max(swell, wp.dot(x - s.x, n))
-        t.swell[world, item] = swell
-        t.middle[world, item] = rows_of(s)
-        t.middle0[world, item] = rows_of(jet(mas, t.C0, t.D0, world, item, spot))
-        room = f64(MARGIN) * mas.size[item]
-        pad = vec3d(room, room, room)
-        t.wanted_lower[index] = down(low - pad)
-        t.wanted_upper[index] = up(high + pad)
-
-    @wp.kernel(module=module)
-    def adopt_boxes(t: Touching):
-        """Take the new boxes."""
-        index = wp.tid()
-        t.lower[index] = t.wanted_lower[index]
-        t.upper[index] = t.wanted_upper[index]
-        if index == 0:
-            t.stale[0] = 0
-            t.fits[0] = t.fits[0] + 1
 
     @wp.func
     def approach(
@@ -452,7 +330,5 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             t.seat[world, point] = THROUGH
 
     return _types.SimpleNamespace(
-        module=module, controls=controls, controls_before=controls_before, check_boxes=check_boxes,
-        adopt_boxes=adopt_boxes, begin_points=begin_points, look_around=look_around, seek=seek, frame=frame, down=down,
-        up=up,
+        **vars(boxes), module=module, begin_points=begin_points, look_around=look_around, seek=seek, frame=frame,
     )  # fmt: skip

@@ -85,7 +85,7 @@ class Points:
 def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, parted: bool = True) -> list[Level]:
     """The levels of a model, finest first; `pattern` is that of H.
 
-    Without `coarse`, only the tiles of the first; without `parted` a dense matrix is one, whatever couples its unknowns.
+    Without `coarse`, only the tiles of the first; without `parted` dense matrices are whole.
     """
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
