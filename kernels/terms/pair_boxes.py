@@ -99,7 +99,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), t: Touching):
-        """Whether facets, as the attempt began and now, are within their boxes; new boxes; and their middles."""
+        """Whether facets, as the attempt began and now, are within their boxes; and new boxes."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -120,6 +120,19 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
         index = world * mas.count + item
         if not contains(t.lower[index], t.upper[index], down(low), up(high)):
             t.stale[0] = 1
+        room = f64(MARGIN) * mas.size[item]
+        pad = vec3d(room, room, room)
+        t.wanted_lower[index] = down(low - pad)
+        t.wanted_upper[index] = up(high + pad)
+
+    @wp.kernel(module=module)
+    def keep_middles(mas: Masters, active: wp.array(dtype=wp.int32), t: Touching):
+        """Middles of facets, as the attempt began and now, and how far they rise above the plane there."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        kind = mas.kind[item]
+        count = mas.terms[kind]
         spot = middle(mas.corners[kind])
         s = jet(mas, t.C, t.D, world, item, spot)
         n = outward(s)
@@ -132,10 +145,6 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
         t.swell[world, item] = swell
         t.middle[world, item] = rows_of(s)
         t.middle0[world, item] = rows_of(jet(mas, t.C0, t.D0, world, item, spot))
-        room = f64(MARGIN) * mas.size[item]
-        pad = vec3d(room, room, room)
-        t.wanted_lower[index] = down(low - pad)
-        t.wanted_upper[index] = up(high + pad)
 
     @wp.kernel(module=module)
     def adopt_boxes(t: Touching):
@@ -148,6 +157,6 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
             t.fits[0] = t.fits[0] + 1
 
     return _types.SimpleNamespace(
-        controls=controls, controls_before=controls_before, check_boxes=check_boxes, adopt_boxes=adopt_boxes, down=down,
+        controls=controls, controls_before=controls_before, check_boxes=check_boxes, keep_middles=keep_middles, adopt_boxes=adopt_boxes, down=down,
         up=up, contains=contains, jet_of=jet_of,
     )  # fmt: skip

@@ -238,6 +238,7 @@ class Pairs(PairSolves):
         dim = (m.worlds, t.facets, masters.most)
         at.launch(k.controls, dim, [masters, u, active, touching.C, touching.D])
         at.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, touching])
+        at.launch(k.keep_middles, (m.worlds, t.facets), [masters, active, touching])
         wp.capture_if(touching.stale, self._refit, at=at)
         for group in t.groups:
             args = [t.data, masters, group.data]
