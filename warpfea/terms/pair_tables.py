@@ -41,7 +41,7 @@ class PairTables:
         groups: slave facets. surfaces, masters: master surfaces, each once, and their facets.
         host: points of each contact. shares: (F, P) area of each point over that of the region.
         points, rows, facets: points and slave facets in all; master facets.
-        far: how far off a gap is told, m.
+        far: how far off a gap is told, m. deepest: overlap that is looked for at the start, m.
         first, row_start: first point and row of each contact.
     """
 
@@ -123,6 +123,7 @@ class PairTables:
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
         )
+        self.deepest = max(float(mas.limit.max()) for mas in self.masters)
         self.far = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
         self.size = m.size
