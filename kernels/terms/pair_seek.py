@@ -214,8 +214,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def look_around(
-        con: Contacts, mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32),
-        reaching: f64, t: Touching,
+        con: Contacts, mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
+        active: wp.array(dtype=wp.int32), reaching: f64, t: Touching,
     ):  # fmt: skip
         """Whether a box of a master facet is near a slave facet; where none is, the box in which that holds."""
         world, item = wp.tid()
@@ -378,6 +378,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         inside = allowance(con, his, world, c, point, clock.time[world])
         pad = settling + inside + wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)
+        before = bool(False)
         anchored = t.first[world, point] > 0
         motion = vec3d()
         from0 = t.spot0[world, point]
@@ -414,6 +415,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 found = locate(mas, t.C, t.D, world, f, x, middle(corners))
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
+                if found[3] != f64(0.0) and o == f64(0.0) and spot[2] > pad:
+                    before = True
                 fits = found[3] != f64(0.0) and o <= wp.min(off, f64(OUTER))
                 if fits:
                     fits = admits(mas, t, world, f, spot, x0, pad, left, anchored, facing, settling)
@@ -425,6 +428,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                         height = wp.abs(spot[2])
                 if not anchored and settling == f64(0.0) and crosses(mas, t, world, f, x, x0):
                     through = True
+            if before and off > f64(0.0) and not anchored:
+                best = -1  # beside a facet, and outside of the body
         if best >= 0:
             sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, settling)
             most = mas.limit[best] * wp.where(off > f64(OUTER), f64(LOST), f64(1.0))
