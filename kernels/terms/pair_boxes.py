@@ -157,6 +157,6 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
             t.fits[0] = t.fits[0] + 1
 
     return _types.SimpleNamespace(
-        controls=controls, controls_before=controls_before, check_boxes=check_boxes, keep_middles=keep_middles, adopt_boxes=adopt_boxes, down=down,
-        up=up, contains=contains, jet_of=jet_of,
+        controls=controls, controls_before=controls_before, check_boxes=check_boxes, keep_middles=keep_middles,
+        adopt_boxes=adopt_boxes, down=down, up=up, contains=contains, jet_of=jet_of,
     )  # fmt: skip

@@ -115,8 +115,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def look_around(
-        con: Contacts, mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32),
-        reaching: f64, t: Touching,
+        con: Contacts, mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
+        active: wp.array(dtype=wp.int32), reaching: f64, t: Touching,
     ):  # fmt: skip
         """Whether a box of a master facet is near a slave facet; where none is, the box in which that holds."""
         world, item = wp.tid()
@@ -125,21 +125,24 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         row = facets.row + item
         low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
         high = -low
+        inside = f64(0.0)
         for q in range(facets.points):
             x = facets.X[q, item] + along(facets, u, world, q, item)
             y = t.x0[world, facets.point + item * facets.points + q]
             if facets.share[q, item] > f64(0.0):
                 low = wp.min(low, wp.min(x, y))
                 high = wp.max(high, wp.max(x, y))
+                inside = wp.max(inside, his.overlap[world, facets.point + item * facets.points + q])
         if low[0] > high[0]:
             t.near[world, row] = 0
             return
-        pad = vec3d(reaching, reaching, reaching)
+        far = reaching + inside
+        pad = vec3d(far, far, far)
         calm = t.calm[world, row] == t.fits[0]
         if calm and contains(t.calm_lower[world, row], t.calm_upper[world, row], down(low - pad), up(high + pad)):
             t.near[world, row] = 0
             return
-        room = f64(2.0) * reaching + f64(MARGIN) * wp.length(high - low)
+        room = f64(2.0) * far + f64(MARGIN) * wp.length(high - low)
         wide = vec3d(room, room, room)
         root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[facets.contact[item]])
         query = wp.bvh_query_aabb(mas.tree, down(low - wide), up(high + wide), root)
@@ -184,7 +187,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     def sit(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock, at: Attempt, t: Touching,
         v_n: wp.array2d(dtype=vec3), world: int, c: int, q: int, item: int, point: int, f: int, spot: vec3d,
-        shift: vec3d, settling: int,
+        shift: vec3d, settling: f64,
     ):  # fmt: skip
         """What a point at a place of a facet has: depth, that as the attempt began, normal, motion."""
         foot = foot_of(mas, t.C, t.D, world, f, spot)
@@ -194,7 +197,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         t.foot[world, point] = foot.spot
         t.normal[world, point] = foot.n
         t.depth[world, point] = now - (spot[2] * foot.rise + foot.rest)
-        if t.first[world, point] == 0 and settling == 0:
+        if t.first[world, point] == 0 and settling == f64(0.0):
             anchor(mas, facets, his, seats, clock, at, t, v_n, world, q, item, point, f, spot)
         motion = shift - at.origin[world, point]
         spring = vec3d()
@@ -218,22 +221,23 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         t.whole[world, point] = spring + motion
 
     @wp.func
-    def apart(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d, pad: f64) -> bool:
-        """Whether a point is above a facet by more than `pad`, or did not move far and is beside it: by the tangent
-        plane in its middle."""
+    def apart(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d, pad: f64) -> int:
+        """By the tangent plane in the middle of a facet: 1 where a point is beside it and has not moved far, 2 where it
+        is above by more than `pad`, 3 where it is so within its sides; else 0."""
         corners = mas.corners[mas.kind[f]]
         s = jet_of(t.middle[world, f])
+        off = outside(corners, middle(corners) + coordinates(s, x - s.x))
         if wp.dot(x - s.x, outward(s)) > f64(2.0) * pad + t.swell[world, f]:
-            return True
-        if outside(corners, middle(corners) + coordinates(s, x - s.x)) <= f64(GLANCE):
-            return False
+            return wp.where(off == f64(0.0), 3, 2)
+        if off <= f64(GLANCE):
+            return 0
         path = x - x0 - (s.x - t.middle0[world, f][0])
-        return wp.length(path) <= f64(0.5) * mas.limit[f]
+        return wp.where(wp.length(path) <= f64(0.5) * mas.limit[f], 1, 0)
 
     @wp.func
     def admits(
         mas: Masters, t: Touching, world: int, f: int, spot: vec3d, x0: vec3d, pad: f64, left: f64, anchored: bool,
-        facing: vec3d, settling: int,
+        facing: vec3d, settling: f64,
     ) -> bool:  # fmt: skip
         """Whether a place on a facet may be the seat of a point: by its depth, by the facet that it was on, or by the
         side that it was on as the attempt began."""
@@ -243,7 +247,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
         if anchored:
             fits = fits and wp.dot(n, facing) > f64(TURNED)
-        elif settling == 0:
+        elif settling == f64(0.0):
             foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
             fits = fits and wp.dot(x0 - foot.x, outward(foot)) >= -left
         return fits
@@ -251,10 +255,11 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def seek(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        u: wp.array2d(dtype=vec3d), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: int,
+        u: wp.array2d(dtype=vec3d), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: f64,
         at: Attempt, t: Touching,
     ):  # fmt: skip
-        """The seat of each point at an iterate. `settling`: there is no step; what is inside is in contact."""
+        """The seat of each point at an iterate. `settling`: above 0 there is no step; what is inside, no deeper than
+        that, m, is in contact."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
@@ -270,10 +275,14 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         x0 = t.x0[world, point]
         best = wp.int32(-1)
         place = vec3d()
-        off = wp.where(settling == 0, f64(OUTER), f64(0.0))  # what lies before one face of a body is beside another
+        off = f64(OUTER)
+        if settling > f64(0.0):
+            off = f64(0.0)  # what lies before one face of a body is beside another
         height = f64(1.0e300)
-        pad = wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
+        inside = allowance(con, his, world, c, point, clock.time[world])
+        pad = settling + inside + wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)
+        before = bool(False)
         anchored = t.first[world, point] > 0
         motion = vec3d()
         from0 = t.spot0[world, point]
@@ -301,15 +310,19 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
             query = wp.bvh_query_aabb(mas.tree, down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide), root)
             index = wp.int32(0)
-            left = allowance(con, his, world, c, point, clock.time[world]) + mas.touch - wp.min(con.offset[c], f64(0.0))
+            left = inside + mas.touch - wp.min(con.offset[c], f64(0.0))
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]
-                if apart(mas, t, world, f, x, x0, pad):
+                clear = apart(mas, t, world, f, x, x0, pad)
+                if clear != 0:
+                    before = before or clear == 3
                     continue
                 found = locate(mas, t.C, t.D, world, f, x, middle(corners))
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
+                if found[3] != f64(0.0) and o == f64(0.0) and spot[2] > pad:
+                    before = True
                 fits = found[3] != f64(0.0) and o <= wp.min(off, f64(OUTER))
                 if fits:
                     fits = admits(mas, t, world, f, spot, x0, pad, left, anchored, facing, settling)
@@ -319,8 +332,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                         place = spot
                         off = o
                         height = wp.abs(spot[2])
-                if not anchored and settling == 0 and crosses(mas, t, world, f, x, x0):
+                if not anchored and settling == f64(0.0) and crosses(mas, t, world, f, x, x0):
                     through = True
+            if before and off > f64(0.0) and not anchored:
+                best = -1  # beside a facet, and outside of the body
         if best >= 0:
             sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, settling)
             most = mas.limit[best] * wp.where(off > f64(OUTER), f64(LOST), f64(1.0))

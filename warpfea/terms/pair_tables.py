@@ -39,7 +39,7 @@ class PairTables(FacetTables[PairContact]):
         surfaces, masters: master surfaces, each once, and their facets; of: that of each contact.
         regions: area of each contact, m^2.
         facets: master facets in all.
-        far: how far off a gap is told, m.
+        far: how far off a gap is told, m. deepest: overlap that is looked for at the start, m.
     """
 
     def __init__(self, model: Model) -> None:
@@ -93,6 +93,7 @@ class PairTables(FacetTables[PairContact]):
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
         )
+        self.deepest = max(float(mas.limit.max()) for mas in self.masters)
         self.far = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
         self.size = self.model.size

@@ -192,9 +192,9 @@ class Pairs(PairSolves):
         if self.exact:
             u = s["u"]
             self.exact.widen(at.launch, at.state.displacement, flags, u)
-        self._seek(at, u, flags, settling=1)
+        self._seek(at, u, flags, settling=t.deepest)
         seat = s["touching"].seat.numpy()
-        depth = np.where((seat >= 0) & new[:, None], s["touching"].depth.numpy(), 0.0)
+        depth = np.where((seat != -1) & new[:, None], s["touching"].depth.numpy(), 0.0)
         touching = touching_depth(self.model.size, at.state.displacement.numpy())
         store_overlaps(t, depth, touching, overlap)
         refuse_sunk(t, at.state.displacement.numpy(), s["touching"].x0.numpy(), seat, new)
@@ -231,7 +231,7 @@ class Pairs(PairSolves):
         at.launch(self.seek.adopt_boxes, self.model.worlds * self.tables.facets, [s["touching"]])
         s["tree"].refit()
 
-    def _seek(self, at: At, u: wp.array, active: wp.array, *, settling: int) -> None:
+    def _seek(self, at: At, u: wp.array, active: wp.array, *, settling: float) -> None:
         """Seats of all points at u."""
         s, m, t, k = at.scratch[self.name], self.model, self.tables, self.seek
         touching, masters = s["touching"], s["masters"]
@@ -241,9 +241,9 @@ class Pairs(PairSolves):
         at.launch(k.keep_middles, (m.worlds, t.facets), [masters, active, touching])
         wp.capture_if(touching.stale, self._refit, at=at)
         for group in t.groups:
-            args = [t.data, masters, group.data]
-            at.launch(k.look_around, (m.worlds, group.count), [*args, u, active, t.reaching, touching])
-            args += [s["history"], s["seats"], s["clock"], u, at.state.velocity, active, settling]
+            args = [t.data, masters, group.data, s["history"]]
+            at.launch(k.look_around, (m.worlds, group.count), [*args, u, active, t.reaching + settling, touching])
+            args += [s["seats"], s["clock"], u, at.state.velocity, active, settling]
             at.launch(k.seek, (m.worlds, group.count, group.data.points), [*args, s["attempt"], touching])
 
     def prepare(self, at: At, active: wp.array) -> None:
@@ -260,7 +260,7 @@ class Pairs(PairSolves):
         if at.moved:
             if self.exact:
                 self.exact.follow(at, s["u"], active)
-            self._seek(at, s["u"], active, settling=0)
+            self._seek(at, s["u"], active, settling=0.0)
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], s["u"], active, fresh]
             dim = (m.worlds, group.count, group.data.points)
@@ -307,7 +307,7 @@ class Pairs(PairSolves):
         """History, books and records of an accepted substep."""
         s, m, t = at.scratch[self.name], self.model, self.tables
         C = len(t.contacts)
-        self._seek(at, s["u"], accepted, settling=0)
+        self._seek(at, s["u"], accepted, settling=0.0)
         for group in t.groups:
             args = [t.data, s["masters"], group.data, s["history"], s["seats"], s["clock"], accepted]
             args += [s["attempt"], s["touching"], s["booked"]]

@@ -73,7 +73,7 @@ def search(label: str, facets: int, device: Any) -> SearchRow:
     times = {
         name: timed(model.device, do)
         for name, do in {
-            "search": lambda: term._seek(at, work.u, active, settling=0),
+            "search": lambda: term._seek(at, work.u, active, settling=0.0),
             "force": lambda: term.force(at, active),
             "refit": lambda: term._refit(at),
         }.items()
