@@ -90,7 +90,6 @@ def test_a_smooth_block_glides_where_the_faces_are_named():
     assert abs(change[0]) < 1e-3
 
 
-@pytest.mark.xfail(strict=True, reason="forces of friction at an offset have a lever that the operator leaves out")
 def test_an_offset_takes_no_more_iterations():
     """With offset 0 the same block takes at most 10 iterations in a step."""
     b = wf.ModelBuilder(gravity=(0, 0, -G))

@@ -221,18 +221,25 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         t.whole[world, point] = spring + motion
 
     @wp.func
-    def apart(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d, pad: f64) -> int:
-        """By the tangent plane in the middle of a facet: 1 where a point is beside it and has not moved far, 2 where it
-        is above by more than `pad`, 3 where it is so within its sides; else 0."""
+    def apart(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d, pad: f64) -> bool:
+        """Whether a point is above a facet by more than `pad`, or did not move far and is beside it: by the tangent
+        plane in its middle."""
         corners = mas.corners[mas.kind[f]]
         s = jet_of(t.middle[world, f])
-        off = outside(corners, middle(corners) + coordinates(s, x - s.x))
         if wp.dot(x - s.x, outward(s)) > f64(2.0) * pad + t.swell[world, f]:
-            return wp.where(off == f64(0.0), 3, 2)
-        if off <= f64(GLANCE):
-            return 0
+            return True
+        if outside(corners, middle(corners) + coordinates(s, x - s.x)) <= f64(GLANCE):
+            return False
         path = x - x0 - (s.x - t.middle0[world, f][0])
-        return wp.where(wp.length(path) <= f64(0.5) * mas.limit[f], 1, 0)
+        return wp.length(path) <= f64(0.5) * mas.limit[f]
+
+    @wp.func
+    def in_front(mas: Masters, t: Touching, world: int, f: int, x: vec3d, pad: f64) -> bool:
+        """Whether a point is above a facet by more than `pad` and within its sides."""
+        corners = mas.corners[mas.kind[f]]
+        found = locate(mas, t.C, t.D, world, f, x, middle(corners))
+        within = outside(corners, vec3d(found[0], found[1], found[2])) == f64(0.0)
+        return found[3] != f64(0.0) and within and found[2] > pad
 
     @wp.func
     def admits(
@@ -282,7 +289,6 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         inside = allowance(con, his, world, c, point, clock.time[world])
         pad = settling + inside + wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)
-        before = bool(False)
         anchored = t.first[world, point] > 0
         motion = vec3d()
         from0 = t.spot0[world, point]
@@ -314,15 +320,11 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
                 corners = mas.corners[mas.kind[f]]
-                clear = apart(mas, t, world, f, x, x0, pad)
-                if clear != 0:
-                    before = before or clear == 3
+                if apart(mas, t, world, f, x, x0, pad):
                     continue
                 found = locate(mas, t.C, t.D, world, f, x, middle(corners))
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
-                if found[3] != f64(0.0) and o == f64(0.0) and spot[2] > pad:
-                    before = True
                 fits = found[3] != f64(0.0) and o <= wp.min(off, f64(OUTER))
                 if fits:
                     fits = admits(mas, t, world, f, spot, x0, pad, left, anchored, facing, settling)
@@ -334,8 +336,11 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                         height = wp.abs(spot[2])
                 if not anchored and settling == f64(0.0) and crosses(mas, t, world, f, x, x0):
                     through = True
-            if before and off > f64(0.0) and not anchored:
-                best = -1  # beside a facet, and outside of the body
+            if best >= 0 and off > f64(0.0) and not anchored:
+                query = wp.bvh_query_aabb(mas.tree, down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide), root)
+                while wp.bvh_query_next(query, index):
+                    if in_front(mas, t, world, index - world * mas.count, x, pad):
+                        best = -1  # beside a facet, and outside of the body
         if best >= 0:
             sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, settling)
             most = mas.limit[best] * wp.where(off > f64(OUTER), f64(LOST), f64(1.0))
