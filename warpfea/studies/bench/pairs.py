@@ -44,7 +44,8 @@ PEER = {("tight", 4): 17.7, ("tight", 10): 44.0, ("tight", 20): 245.0, ("loose",
 TOL = {"tight": 1e-6, "loose": 1e-3}
 WANTED = {"tight": 3.0, "loose": 1.0}
 """Times that a step must be faster than the peer's."""
-STIFFNESS = 15.0
+STIFFNESS = 11.0
+"""With it the deepest point stays within `DEEPEST`."""
 DEEPEST = 2e-3
 GROWTH = 1.5
 WORLD_STEPS = 20
