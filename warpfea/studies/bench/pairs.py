@@ -28,6 +28,7 @@ import warp as wp
 
 from ...kernels.terms.contact_data import RECORD
 from ...simulation.simulation import Simulation
+from ..profile.profiling import profile
 from .contact_solves import FORCING, STEPS, count_solves
 from .measure import by_label, solver
 from .measure import write as write_file
@@ -48,6 +49,7 @@ STIFFNESS = 11.0
 """With it the deepest point stays within `DEEPEST`."""
 DEEPEST = 2e-3
 GROWTH = 1.5
+PROFILED = 3
 WORLD_STEPS = 20
 WORLD_SCENES = {"blocks": (blocks, 1e-2), "finger": (finger, 2e-3)}
 
@@ -79,6 +81,7 @@ class PileRow:
         peer_ms: of libuipc, T4 alone. wanted: times that must be gained on it.
         deepest: penetration of any contact at the end of any step, m; limit: most.
         residual: largest of a step.
+        pairs_share: of contact between bodies in the time of the steps that follow, launch by launch.
     """
 
     label: str
@@ -100,6 +103,7 @@ class PileRow:
     residual: float
     launches: int
     setup_s: float
+    pairs_share: float
 
 
 @dataclass(frozen=True)
@@ -169,8 +173,14 @@ def measure_pile(
         label, dtype, sum(len(body.mesh.points) for body in model.bodies), model.info()["elements"], TOL[how], steps,
         ms, 1e3 * statistics.median(times), peer, peer / ms if peer else None, WANTED[how] if peer else None,
         spent["newton"] / steps, spent["pcg"] / steps, halvings, depth, DEEPEST, residual,
-        sim.stepper.launch.launches, setup,
+        sim.stepper.launch.launches, setup, share_of_pairs(sim),
     )  # fmt: skip
+
+
+def share_of_pairs(sim: Simulation) -> float:
+    """Part of a step that goes to contact between bodies."""
+    found = profile(sim, steps=PROFILED)
+    return found.parts["pairs"].ms / found.total_ms
 
 
 def measure_solves(label: str, cubes: int, E: float, *, kind: str, device: Any) -> SolvesRow:
@@ -248,7 +258,7 @@ def grown(row: SolvesRow, rows: list[Any]) -> SolvesRow:
 
 HEADERS = {
     "pile": f"{'pile':18} {'dtype':8} {'nodes':>7} {'steps':>5} {'ms/step':>9} {'median':>9} {'peer':>6} {'faster':>6} "
-    f"{'wanted':>6} {'Newton':>6} {'PCG':>7} {'halved':>6} {'deepest':>8} {'residual':>9} {'set-up, s':>9}",
+    f"{'wanted':>6} {'Newton':>6} {'PCG':>7} {'halved':>6} {'deepest':>8} {'residual':>9} {'set-up, s':>9} {'pairs':>5}",
     "solves": f"{'solves':18} {'method':10} {'unknowns':>8} {'PCG: most':>9} {'mean':>6} {'ratio':>6} {'limit':>5}",
     "search": f"{'search':18} {'facets':>8} {'points':>9} {'touching':>9} {'search, ms':>10} {'force, ms':>10} "
     f"{'refit, ms':>10} {'goal':>6} {'B/point':>8} {'set-up, s':>9}",
@@ -266,7 +276,8 @@ def _line(r: Any) -> str:
         return (
             f"{r.label:18} {r.dtype:8} {r.nodes:7d} {r.steps:5d} {r.ms_per_step:9.2f} {r.median_ms:9.2f} "
             f"{_text(r.peer_ms):>6} {_text(r.times_faster):>6} {_text(r.wanted):>6} {r.newton_per_step:6.2f} "
-            f"{r.pcg_per_step:7.1f} {r.halvings:6d} {r.deepest:8.1e} {r.residual:9.1e} {r.setup_s:9.1f}"
+            f"{r.pcg_per_step:7.1f} {r.halvings:6d} {r.deepest:8.1e} {r.residual:9.1e} {r.setup_s:9.1f} "
+            f"{100 * r.pairs_share:4.0f}%"
         )
     if isinstance(r, SolvesRow):
         return (
