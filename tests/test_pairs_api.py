@@ -300,7 +300,7 @@ def test_a_body_that_begins_within_another_is_refused(named, initial):
     sides = (small.surface("z-"), big.surface("z+")) if named else (small, big)
     b.add_contact(*sides, name="pad")
     model = b.finalize(device="cpu", worlds=2)
-    with pytest.raises(wf.ModelError, match="contact 'pad': body 'small' begins (within|0.12 m inside) body 'big'"):
+    with pytest.raises(wf.ModelError, match=r"contact 'pad': body 'small' begins (within|0\.12 m inside) body 'big'"):
         wf.Simulation(model, dt=1e-3)
 
 

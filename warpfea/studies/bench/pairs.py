@@ -258,7 +258,7 @@ def grown(row: SolvesRow, rows: list[Any]) -> SolvesRow:
 
 HEADERS = {
     "pile": f"{'pile':18} {'dtype':8} {'nodes':>7} {'steps':>5} {'ms/step':>9} {'median':>9} {'peer':>6} {'faster':>6} "
-    f"{'wanted':>6} {'Newton':>6} {'PCG':>7} {'halved':>6} {'deepest':>8} {'residual':>9} {'set-up, s':>9} {'pairs':>5}",
+    f"{'wanted':>6} {'Newton':>6} {'PCG':>7} {'halved':>6} {'deepest':>8} {'residual':>9} {'set-up':>6} {'pairs':>5}",
     "solves": f"{'solves':18} {'method':10} {'unknowns':>8} {'PCG: most':>9} {'mean':>6} {'ratio':>6} {'limit':>5}",
     "search": f"{'search':18} {'facets':>8} {'points':>9} {'touching':>9} {'search, ms':>10} {'force, ms':>10} "
     f"{'refit, ms':>10} {'goal':>6} {'B/point':>8} {'set-up, s':>9}",
@@ -276,7 +276,7 @@ def _line(r: Any) -> str:
         return (
             f"{r.label:18} {r.dtype:8} {r.nodes:7d} {r.steps:5d} {r.ms_per_step:9.2f} {r.median_ms:9.2f} "
             f"{_text(r.peer_ms):>6} {_text(r.times_faster):>6} {_text(r.wanted):>6} {r.newton_per_step:6.2f} "
-            f"{r.pcg_per_step:7.1f} {r.halvings:6d} {r.deepest:8.1e} {r.residual:9.1e} {r.setup_s:9.1f} "
+            f"{r.pcg_per_step:7.1f} {r.halvings:6d} {r.deepest:8.1e} {r.residual:9.1e} {r.setup_s:6.1f} "
             f"{100 * r.pairs_share:4.0f}%"
         )
     if isinstance(r, SolvesRow):
