@@ -231,5 +231,12 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                 y[world, other] = t
 
     return _types.SimpleNamespace(
-        module=module, begin=begin, clear=clear, fill=fill, factor=factor, settle=settle, solve=solve
+        module=module,
+        begin=begin,
+        clear=clear,
+        fill=fill,
+        factor=factor,
+        settle=settle,
+        solve=solve,
+        inverse_factor=inverse_factor,
     )

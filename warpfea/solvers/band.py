@@ -20,6 +20,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.solvers.band import BLOCK, band_kernels, column_type
+from ..kernels.solvers.band_block import band_block_kernels, window_numbers
 from .assembled import coupled_slots
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from ..terms.workspace import Workspace
     from .assembled import Pattern
 
-__all__ = ["Band", "BandFactor", "find_band"]
+__all__ = ["Band", "BandFactor", "block_band", "find_band"]
 
 WIDEST = 112
 """Widest band that is chosen by itself, blocks beside the diagonal; beyond, the two-level preconditioner is cheaper."""
@@ -36,10 +37,22 @@ WHOLE_SLOTS = 160
 """A model of up to this many slots is factored as a whole: here in a band of any width, or else as a dense matrix."""
 LARGEST = 2**31
 """Bytes of the factors of a world from which on 32-bit indices can't address them."""
+BLOCK_BYTES, WORLD_BYTES = 48 * 1024, 200_000
+"""On CUDA: of the window of a block of threads, and of the factors of a world that it may take."""
 ASSEMBLY, FACTORISATION = 1.0, 5.5e-5
 """us per unknown on one core: assembling H of 3243 and T10 elements; a factorisation, per square of the bandwidth."""
 PRODUCT, SOLUTION = 0.06, 5.4e-4
 """us per unknown on one core: H p; forward and backward substitution, per bandwidth."""
+
+
+def block_band(model: Model) -> Band | None:
+    """The narrow band of a small model on CUDA that a block of threads per world factors; else None."""
+    band = find_band(model) if model.device.is_cuda else None
+    if band is None:
+        return None
+    size = wp.types.type_size_in_bytes(model.types.T)
+    factors = band.rows * (band.width + 1) * BLOCK**2 * size
+    return band if factors <= WORLD_BYTES and window_numbers(band.width) * size < BLOCK_BYTES else None
 
 
 @dataclass(eq=False)
@@ -117,10 +130,19 @@ class BandFactor:
         column: Any = column_type(model.dtype)
         B = model.worlds
         self.factors = work.array("band", (B, band.rows, BLOCK * (band.width + 1)), column)
-        self.y = work.array("band vector", (B, band.rows), column)
+        self.blocks = model.device.is_cuda
+        if self.blocks:  # a block of threads per world
+            self.by_block = band_block_kernels(model.dtype, band.rows, band.width)
+            self.outside = work.array("band outside", (1, 1), model.types.T)
+        else:
+            self.y = work.array("band vector", (B, band.rows), column)
         self.shift = work.array("band shift", (B,), model.types.T)
         self.bad, self.doing = (work.array(f"band {name}", (B,), wp.int32) for name in ("bad", "doing"))
         self.again = work.array("band again", (1,), wp.int32)
+
+    def modules(self) -> set[wp.Module]:
+        """Modules that it launches."""
+        return {self.kernels.module} | ({self.by_block.module} if self.blocks else set())
 
     def make(self, value: wp.array, active: wp.array) -> None:
         """Factor the blocks `value` [world, entry] of the active worlds.
@@ -138,10 +160,20 @@ class BandFactor:
         launch(k.clear, (self.worlds, b.rows), [slots, b.width, self.doing, self.factors])
         args = [self.pattern.data, value, b.place_of, b.width, self.shift, self.doing, self.factors]
         launch(k.fill, (self.worlds, slots), args)
-        launch(k.factor, self.worlds, [b.width, self.doing, self.bad, self.factors])
+        if self.blocks:
+            lanes = self.by_block.lanes
+            args = [lanes, self.outside, self.doing, self.bad, self.factors]
+            launch(self.by_block.factor, self.worlds * lanes, args, block_dim=lanes)
+        else:
+            launch(k.factor, self.worlds, [b.width, self.doing, self.bad, self.factors])
         launch(k.settle, self.worlds, [self.bad, self.doing, self.shift, self.again])
 
     def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = A^-1 r, [world, slot]."""
         b = self.band
+        if self.blocks:
+            lanes = self.by_block.lanes
+            args = [lanes, self.outside, self.factors, b.slot_at, r, active, z]
+            self.launch(self.by_block.solve, self.worlds * lanes, args, block_dim=lanes)
+            return
         self.launch(self.kernels.solve, self.worlds, [b.width, self.factors, b.slot_at, r, active, self.y, z])

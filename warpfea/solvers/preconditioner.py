@@ -9,7 +9,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import labelled
 from ..kernels.solvers.pcg import pcg_kernels
-from .band import WHOLE_SLOTS, find_band
+from .band import WHOLE_SLOTS, block_band, find_band
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -115,10 +115,12 @@ def choose(name: str, storage: str | None, model: Model) -> str:
     Raises:
         ModelError: "banded" on a GPU, or with inverses in another precision than the model's.
     """
-    banded = not model.device.is_cuda and storage in (None, model.dtype)
-    if name == "banded" and model.device.is_cuda:
+    kept = storage in (None, model.dtype)
+    banded = kept and (not model.device.is_cuda or block_band(model) is not None)
+    if name == "banded" and kept and not banded:
         raise ModelError(
-            f"NewtonPCG: preconditioner = 'banded' is for the CPU; on {model.device} take 'auto' or 'two-level'"
+            "NewtonPCG: preconditioner = 'banded' is for the CPU, and on a GPU for small models with a narrow band; for "
+            f"this one on {model.device} take 'auto' or 'two-level'"
         )
     if name == "banded" and not banded:
         raise ModelError(

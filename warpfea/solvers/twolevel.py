@@ -191,7 +191,7 @@ class TwoLevel:
         """Modules that it launches."""
         k = self.kernels
         out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules() | self.coupling
-        out |= {self.band.kernels.module if self.band else self.making.module}
+        out |= self.band.modules() if self.band else {self.making.module}
         return out.union(*(arrays.dense.modules() for arrays in self.arrays if not self.band and arrays.dense))
 
     # the seam
