@@ -3,82 +3,93 @@
 import numpy as np
 import pytest
 import warp as wp
+from warpfea.kernels.common.structs import pattern_struct
+from warpfea.kernels.solvers.band import BLOCK, column_type
+from warpfea.kernels.solvers.band_block import band_block_kernels, solution_numbers, window_numbers
 
-from warpfea.kernels.solvers.band import BLOCK, band_kernels, column_type
-from warpfea.kernels.solvers.band_block import band_block_kernels, window_numbers
-
-SLOTS, WIDTH = 13, 3
+SLOTS = 37
 ROWS = -(-3 * SLOTS // BLOCK)
 
 
-def banded(rng, worlds, indefinite=False):
-    """Matrices of 3 SLOTS unknowns whose blocks lie in the band."""
+def banded(rng, worlds, reach):
+    """(order, matrices) of 3 x 3 blocks whose slots lie in a band once they are put in order."""
     n = 3 * SLOTS
-    i, j = np.indices((n, n))
-    near = np.abs(i // BLOCK - j // BLOCK) <= WIDTH
-    A = rng.standard_normal((worlds, n, n)) * near
+    order = rng.permutation(SLOTS)
+    near = np.abs(np.subtract.outer(np.arange(SLOTS), np.arange(SLOTS))) <= reach
+    near &= (rng.random((SLOTS, SLOTS)) < 0.7) | np.eye(SLOTS, dtype=bool)
+    near &= near.T
+    A = rng.standard_normal((worlds, n, n)) * np.kron(near, np.ones((3, 3)))
     A = A + np.swapaxes(A, 1, 2)
-    A += np.eye(n) * np.abs(A).sum(axis=2, keepdims=True)
-    if indefinite:
-        A[0, 5, 5] = -1.0
-    return A
+    A += 1.2 * np.eye(n) * np.abs(A).sum(axis=2, keepdims=True)
+    place = np.argsort(order)
+    unknown = (3 * place[:, None] + np.arange(3)).ravel()  # of the slots as they are numbered
+    return order, A[:, unknown][:, :, unknown], near[place][:, place]
 
 
-def stored(A):
-    """Lower halves as the kernels have them, ones beyond the unknowns."""
-    B, n, _ = A.shape
-    out = np.zeros((B, ROWS, BLOCK * (WIDTH + 1), BLOCK))
-    full = np.tile(np.eye(BLOCK * ROWS), (B, 1, 1))
-    full[:, :n, :n] = A
-    for row in range(ROWS):
-        for other in range(max(row - WIDTH, 0), row + 1):
-            block = full[:, BLOCK * row : BLOCK * (row + 1), BLOCK * other : BLOCK * (other + 1)]
-            at = BLOCK * (other - row + WIDTH)
-            out[:, row, at : at + BLOCK] = np.swapaxes(block, 1, 2)
-    return out
-
-
-def factors(A, dtype, blocks):
-    """(bad, the array of factors) by the kernels of blocks or by those of the CPU."""
+def solved(A, graph, order, r, dtype, shift=0.0):
+    """(z, bad): of the kernels."""
     B = len(A)
-    band = wp.array(stored(A), dtype=column_type(dtype), device="cpu")
-    active, bad = wp.ones(B, dtype=wp.int32, device="cpu"), wp.zeros(B, dtype=wp.int32, device="cpu")
-    if blocks:
-        scalar = wp.dtype_from_numpy(np.dtype(dtype))
-        outside = wp.zeros((B, window_numbers(WIDTH)), dtype=scalar, device="cpu")
-        args = [1, outside, active, bad, band]
-        wp.launch(band_block_kernels(dtype, ROWS, WIDTH).factor, B, args, device="cpu")
-    else:
-        wp.launch(band_kernels(dtype).factor, B, [WIDTH, active, bad, band], device="cpu")
-    return bad.numpy(), band
+    rows, columns = np.nonzero(graph)
+    place = np.argsort(order)
+    width = int(((3 * place[rows] + 2) // BLOCK - 3 * place[columns] // BLOCK).max())
+    scalar = wp.dtype_from_numpy(np.dtype(dtype))
+    vec3, mat33 = wp.types.vector(length=3, dtype=scalar), wp.types.matrix(shape=(3, 3), dtype=scalar)
+    kernels = band_block_kernels(dtype, ROWS, width)
+
+    def array(values, kind):
+        return wp.array(values, dtype=kind, device="cpu")
+
+    pattern = pattern_struct()()
+    pattern.start = array(np.concatenate([[0], np.cumsum(graph.sum(axis=1))]), wp.int32)
+    pattern.column = array(columns, wp.int32)
+    blocks = A.reshape(B, SLOTS, 3, SLOTS, 3).transpose(0, 1, 3, 2, 4)[:, rows, columns]
+    slot_at, place_of, active = array(order, wp.int32), array(place, wp.int32), array(np.ones(B), wp.int32)
+    bad = array(np.zeros(B), wp.int32)
+    band = wp.zeros((B, ROWS, BLOCK * (width + 1)), dtype=column_type(dtype), device="cpu")
+    outside = wp.zeros((B, window_numbers(width)), dtype=scalar, device="cpu")
+    args = [1, outside, pattern, array(blocks, mat33), slot_at, place_of, array(np.full(B, shift), scalar)]
+    wp.launch(kernels.factor, B, [*args, active, bad, band], device="cpu")
+    outside = wp.zeros((B, solution_numbers(ROWS, width)), dtype=scalar, device="cpu")
+    z = wp.zeros((B, SLOTS), dtype=vec3, device="cpu")
+    wp.launch(kernels.solve, B, [1, outside, band, slot_at, array(r, vec3), active, z], device="cpu")
+    return z.numpy(), bad.numpy()
 
 
 @pytest.mark.parametrize("dtype, bound", [("float64", 1e-13), ("float32", 1e-5)])
-@pytest.mark.parametrize("indefinite", [False, True])
-def test_factors_are_those_of_the_cpu(dtype, bound, indefinite):
-    A = banded(np.random.default_rng(1), 2, indefinite)
-    (bad, mine), (other_bad, other) = factors(A, dtype, True), factors(A, dtype, False)
-    np.testing.assert_array_equal(bad, other_bad)
-    assert bool(bad[0]) == indefinite
-    expected = other.numpy()
-    first = [BLOCK * max(WIDTH - row, 0) for row in range(ROWS)]
-    for row in range(ROWS):  # blocks before the first column are not used
-        difference = np.abs(mine.numpy()[:, row, first[row] :] - expected[:, row, first[row] :])
-        assert difference.max() <= bound * np.abs(expected).max()
-
-
-@pytest.mark.parametrize("dtype, bound", [("float64", 1e-12), ("float32", 1e-4)])
-def test_solutions(dtype, bound):
-    rng = np.random.default_rng(2)
-    A, order = banded(rng, 2), rng.permutation(SLOTS)
-    _, band = factors(A, dtype, True)
-    scalar = wp.dtype_from_numpy(np.dtype(dtype))
-    vec3 = wp.types.vector(length=3, dtype=scalar)
+@pytest.mark.parametrize("reach", [1, 4, 11])
+def test_solutions_are_those_of_numpy(dtype, bound, reach):
+    rng = np.random.default_rng(reach)
+    order, A, graph = banded(rng, 2, reach)
     r = rng.standard_normal((2, SLOTS, 3))
-    given, z = wp.array(r, dtype=vec3, device="cpu"), wp.zeros((2, SLOTS), dtype=vec3, device="cpu")
-    outside = wp.zeros((2, BLOCK * ROWS + BLOCK), dtype=scalar, device="cpu")
-    active = wp.ones(2, dtype=wp.int32, device="cpu")
-    args = [1, outside, band, wp.array(order, dtype=wp.int32, device="cpu"), given, active, z]
-    wp.launch(band_block_kernels(dtype, ROWS, WIDTH).solve, 2, args, device="cpu")
-    expected = np.linalg.solve(A, r[:, order].reshape(2, -1, 1)).reshape(2, SLOTS, 3)
-    assert np.abs(z.numpy()[:, order] - expected).max() <= bound * np.abs(expected).max()
+    z, bad = solved(A, graph, order, r, dtype)
+    expected = np.linalg.solve(A, r.reshape(2, -1, 1)).reshape(2, SLOTS, 3)
+    assert not bad.any()
+    assert np.abs(z - expected).max() <= bound * np.abs(expected).max()
+
+
+def test_a_shift_adds_to_the_diagonal():
+    rng = np.random.default_rng(5)
+    order, A, graph = banded(rng, 1, 2)
+    r = rng.standard_normal((1, SLOTS, 3))
+    z, _ = solved(A, graph, order, r, "float64", shift=0.25)
+    shifted = A + 0.25 * np.eye(3 * SLOTS) * np.abs(np.einsum("bii->bi", A))[:, None]
+    expected = np.linalg.solve(shifted, r.reshape(1, -1, 1)).reshape(1, SLOTS, 3)
+    assert np.abs(z - expected).max() <= 1e-13 * np.abs(expected).max()
+
+
+def test_what_is_not_positive_is_counted_and_leaves_a_positive_operator():
+    rng = np.random.default_rng(6)
+    order, A, graph = banded(rng, 1, 2)
+    slot = order[SLOTS // 2]
+    A[0, 3 * slot : 3 * slot + 3] *= 40.0  # beside the diagonal: |diagonal| no longer dominates
+    A[0, :, 3 * slot : 3 * slot + 3] *= 40.0
+    A[0, 3 * slot : 3 * slot + 3, 3 * slot : 3 * slot + 3] /= 1600.0**1.5
+    basis = np.eye(3 * SLOTS).reshape(-1, SLOTS, 3)
+    columns = []
+    for r in basis:
+        z, bad = solved(A, graph, order, r[None], "float64")
+        assert bad[0] > 0
+        columns.append(z.ravel())
+    B = np.array(columns)
+    np.testing.assert_allclose(B, B.T, atol=1e-10 * np.abs(B).max())
+    assert np.linalg.eigvalsh(0.5 * (B + B.T)).min() > 0.0

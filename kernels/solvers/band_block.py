@@ -1,8 +1,10 @@
 """Cholesky factors of narrow banded matrices by a block of threads per world: for GPUs, and many small worlds.
 
-The storage is that of band.py: block row I of L holds the 4 x 4 blocks J = I - width .. I, each by columns, and of L_II
-its inverse. The factorisation looks to the right: the blocks that a column still changes, (width + 1)^2 of them, are in
-memory of the block of threads, and rows enter as the window moves on. On the CPU one thread does the same.
+A = D U U^T D^T with D the lower triangular 4 x 4 blocks on the diagonal of the Cholesky factor and U of unit diagonal.
+Block row I of the factors holds U_IJ, J = I - width .. I - 1, each by columns, and of D_II its inverse. So only products
+with U go from row to row in a solution. The factorisation looks to the right: the (width + 1)^2 blocks that a column
+still changes are in memory of the block of threads, and rows enter as this window moves on. Solutions take rows of the
+factors over in chunks, whose loads are under way at once. On the CPU one thread does the same.
 """
 
 import functools
@@ -11,12 +13,15 @@ import types as _types
 import warp as wp
 
 from ..common.lanes import WARP, block_memory, lane_functions
+from ..common.structs import pattern_struct
 from ..common.types import kernel_module, precision
 from .band import BLOCK, band_kernels, column_type
 
-__all__ = ["band_block_kernels", "window_numbers"]
+__all__ = ["band_block_kernels", "solution_numbers", "window_numbers"]
 
 SIZE = BLOCK * BLOCK
+CHUNK_NUMBERS = 1536
+"""Numbers of the rows that a solution takes over at once, about."""
 
 
 def window_numbers(width: int) -> int:
@@ -24,22 +29,33 @@ def window_numbers(width: int) -> int:
     return (width + 1) * (width + 1) * SIZE + (width + 1) * BLOCK
 
 
+def _chunk(width: int) -> int:
+    """Rows of a chunk."""
+    return max(1, CHUNK_NUMBERS // (SIZE * width)) if width else 1
+
+
+def solution_numbers(rows: int, width: int) -> int:
+    """Numbers of a solution and of a chunk of rows."""
+    return BLOCK * rows + _chunk(width) * SIZE * max(width, 1)
+
+
 @functools.cache
 def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamespace:
     """Kernels in one precision, for so many block rows and blocks beside the diagonal."""
     p = precision(dtype)
-    T, vec3 = p.T, p.vec3
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
     f = lane_functions(dtype)
     sync, scalar_sum = f.sync, f.scalar_sum
-    Column = column_type(dtype)
+    Pattern, Column = pattern_struct(), column_type(dtype)
     Block = wp.types.matrix(shape=(BLOCK, BLOCK), dtype=T)
     inverse_factor = band_kernels(dtype).inverse_factor
     NUMBER = wp.types.type_size_in_bytes(T)
-    M = width + 1
+    M, CHUNK = width + 1, _chunk(width)
     GIVEN = M * M * SIZE
-    ENTRIES = BLOCK * M  # columns of a block row
+    BESIDE = BLOCK * width  # columns of a block row beside the diagonal
+    Y = BLOCK * rows
     module = kernel_module(f"band_block_{dtype}_{rows}_{width}", max_unroll=BLOCK)
-    window, vector = block_memory(dtype, window_numbers(width)), block_memory(dtype, BLOCK * rows + BLOCK)
+    window, vector = block_memory(dtype, window_numbers(width)), block_memory(dtype, solution_numbers(rows, width))
 
     @wp.func
     def place(row: int, other: int) -> int:
@@ -47,20 +63,37 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         return ((row % M) * M + other % M) * SIZE
 
     @wp.func
-    def enter(at: wp.uint64, band: wp.array3d(dtype=Column), world: int, row: int, lane: int, lanes: int):
-        """Load a block row into the window."""
-        first = wp.max(row - width, 0)
-        for task in range(BLOCK * (first - row + width) + lane, ENTRIES, lanes):
-            other = row - width + task / BLOCK
-            column = band[world, row, task]
-            for r in range(BLOCK):
-                window.store(at, place(row, other) + BLOCK * r + task % BLOCK, column[r])
-            if other == row:
-                window.store(at, GIVEN + BLOCK * (row % M) + task % BLOCK, column[task % BLOCK])
+    def enter(
+        at: wp.uint64, pattern: Pattern, value: wp.array2d(dtype=mat33), slot_at: wp.array(dtype=wp.int32),
+        place_of: wp.array(dtype=wp.int32), shift: T, world: int, row: int, lane: int, lanes: int,
+    ):  # fmt: skip
+        """Take a block row of A + shift |diag A| into the window; ones on the diagonal beyond the unknowns."""
+        for k in range(lane, M * SIZE, lanes):
+            window.store(at, (row % M) * M * SIZE + k, T(0.0))
+        sync()
+        for a in range(BLOCK):
+            i = BLOCK * row + a
+            if i / 3 >= slot_at.shape[0]:
+                if lane == 0:
+                    window.store(at, place(row, row) + (BLOCK + 1) * a, T(1.0))
+                    window.store(at, GIVEN + BLOCK * (row % M) + a, T(1.0))
+            else:
+                slot = slot_at[i / 3]
+                for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
+                    first = 3 * place_of[pattern.column[k]]
+                    A = value[world, k]
+                    for b in range(3):
+                        j = first + b
+                        if j <= i:
+                            x = A[i % 3, b]
+                            if j == i:
+                                x = (T(1.0) + shift) * wp.abs(x)
+                                window.store(at, GIVEN + BLOCK * (row % M) + a, x)
+                            window.store(at, place(row, j / BLOCK) + BLOCK * a + j % BLOCK, x)
 
     @wp.func
     def scale_row(at: wp.uint64, R: Block, where: int):
-        """A row of A_Ik L_kk^-T, in place; columns whose pivot was replaced are zero."""
+        """A row of A_Ik D_kk^-T, in place; columns whose pivot was replaced are zero."""
         a = Column()
         for c in range(BLOCK):
             a[c] = window.load(at, where + c)
@@ -82,12 +115,28 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
                 s -= a[k] * window.load(at, right + BLOCK * c + k)
             window.store(at, where + c, s)
 
+    @wp.func
+    def eliminate(at: wp.uint64, row: int, below: int, lane: int, lanes: int):
+        """What column `row` changes to its right."""
+        for task in range(lane, BLOCK * (below * (below + 1) / 2), lanes):
+            pair = task / BLOCK
+            i = wp.int32((wp.sqrt(8.0 * float(pair) + 1.0) - 1.0) * 0.5)
+            if (i + 1) * (i + 2) / 2 <= pair:
+                i += 1
+            if i * (i + 1) / 2 > pair:
+                i -= 1
+            one = row + 1 + i
+            two = row + 1 + pair - i * (i + 1) / 2
+            r = BLOCK * (task % BLOCK)
+            update_row(at, place(one, row) + r, place(two, row), place(one, two) + r)
+
     @wp.kernel(module=module)
     def factor(
-        lanes: int, outside: wp.array2d(dtype=T), active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32),
-        band: wp.array3d(dtype=Column),
+        lanes: int, outside: wp.array2d(dtype=T), pattern: Pattern, value: wp.array2d(dtype=mat33),
+        slot_at: wp.array(dtype=wp.int32), place_of: wp.array(dtype=wp.int32), shift: wp.array(dtype=T),
+        active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column),
     ):  # fmt: skip
-        """Factor A into L, in place; `bad`: number of unknowns whose pivot had to be replaced."""
+        """The factors of A; `bad`: number of unknowns whose pivot had to be replaced."""
         thread = wp.tid()
         world = thread / lanes
         lane = thread % lanes
@@ -96,7 +145,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         at = window.open(outside.ptr + wp.uint64(world) * wp.uint64(outside.shape[1]) * wp.uint64(wp.static(NUMBER)))
         count = wp.int32(0)
         for row in range(wp.min(M, rows)):
-            enter(at, band, world, row, lane, lanes)
+            enter(at, pattern, value, slot_at, place_of, shift[world], world, row, lane, lanes)
         sync()
         for row in range(rows):
             S = Block()
@@ -110,89 +159,102 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
             sync()
             for task in range(lane, BLOCK * below, lanes):
                 scale_row(at, R, place(row + 1 + task / BLOCK, row) + BLOCK * (task % BLOCK))
-            sync()
+            for task in range(BLOCK * wp.max(width - row, 0) + lane, BESIDE, lanes):  # U = D^-1 L
+                other = place(row, row - width + task / BLOCK) + task % BLOCK
+                column = Column()
+                for k in range(BLOCK):
+                    column += window.load(at, other + BLOCK * k) * R[k]
+                band[world, row, task] = column
             if lane == 0:
                 for c in range(BLOCK):
-                    band[world, row, BLOCK * width + c] = R[c]
+                    band[world, row, BESIDE + c] = R[c]
                     if R[c][c] < T(0.0):
                         count += 1
-            for task in range(lane, BLOCK * below, lanes):
-                other = row + 1 + task / BLOCK
-                column = Column()
-                for r in range(BLOCK):
-                    column[r] = window.load(at, place(other, row) + BLOCK * r + task % BLOCK)
-                band[world, other, BLOCK * (row - other + width) + task % BLOCK] = column
-            for task in range(lane, BLOCK * (below * (below + 1) / 2), lanes):
-                pair = task / BLOCK
-                i = wp.int32((wp.sqrt(8.0 * float(pair) + 1.0) - 1.0) * 0.5)
-                if (i + 1) * (i + 2) / 2 <= pair:
-                    i += 1
-                if i * (i + 1) / 2 > pair:
-                    i -= 1
-                one = row + 1 + i
-                two = row + 1 + pair - i * (i + 1) / 2
-                r = BLOCK * (task % BLOCK)
-                update_row(at, place(one, row) + r, place(two, row), place(one, two) + r)
+            sync()
+            eliminate(at, row, below, lane, lanes)
             sync()
             if row + M < rows:
-                enter(at, band, world, row + M, lane, lanes)
+                enter(at, pattern, value, slot_at, place_of, shift[world], world, row + M, lane, lanes)
             sync()
         if lane == 0:
             bad[world] = count
+
+    @wp.func
+    def take_rows(at: wp.uint64, band: wp.array3d(dtype=Column), world: int, first: int, lane: int, lanes: int):
+        """Copy a chunk of rows beside the diagonal."""
+        for task in range(lane, wp.min(CHUNK, rows - first) * BESIDE, lanes):
+            column = band[world, first + task / BESIDE, task % BESIDE]
+            for r in range(BLOCK):
+                vector.store(at, Y + BLOCK * task + r, column[r])
+
+    @wp.func
+    def forward(at: wp.uint64, row: int, chunk: int, lane: int, lanes: int):
+        """y_I -= sum of U_IJ y_J; `across` threads per unknown."""
+        across = wp.max(lanes / BLOCK, 1)
+        for a in range(lane / across, BLOCK, wp.max(lanes / across, 1)):
+            s = T(0.0)
+            for j in range(BLOCK * wp.max(width - row, 0) + lane % across, BESIDE, across):
+                s += vector.load(at, chunk + BLOCK * j + a) * vector.load(at, BLOCK * (row - width) + j)
+            s = scalar_sum(s, across)
+            if lane % across == 0:
+                vector.store(at, BLOCK * row + a, vector.load(at, BLOCK * row + a) - s)
+
+    @wp.func
+    def backward(at: wp.uint64, row: int, chunk: int, lane: int, lanes: int):
+        """y_J -= U_IJ^T y_I."""
+        x = Column()
+        for r in range(BLOCK):
+            x[r] = vector.load(at, BLOCK * row + r)
+        for j in range(BLOCK * wp.max(width - row, 0) + lane, BESIDE, lanes):
+            s = vector.load(at, BLOCK * (row - width) + j)
+            for r in range(BLOCK):
+                s -= vector.load(at, chunk + BLOCK * j + r) * x[r]
+            vector.store(at, BLOCK * (row - width) + j, s)
 
     @wp.kernel(module=module)
     def solve(
         lanes: int, outside: wp.array2d(dtype=T), band: wp.array3d(dtype=Column), slot_at: wp.array(dtype=wp.int32),
         r: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), z: wp.array2d(dtype=vec3),
     ):  # fmt: skip
-        """z = A^-1 r by forward and backward substitution."""
+        """z = A^-1 r: D^-1, forward and backward substitution with U, D^-T."""
         thread = wp.tid()
         world = thread / lanes
         lane = thread % lanes
         if active[world] == 0:
             return
-        y = vector.open(outside.ptr + wp.uint64(world) * wp.uint64(outside.shape[1]) * wp.uint64(wp.static(NUMBER)))
-        slots = slot_at.shape[0]
-        for i in range(lane, BLOCK * rows, lanes):
-            given = T(0.0)
-            if i / 3 < slots:
-                given = r[world, slot_at[i / 3]][i % 3]
-            vector.store(y, i, given)
-        sync()
-        across = wp.max(lanes / BLOCK, 1)
-        for row in range(rows):
-            first = BLOCK * wp.max(width - row, 0)
-            for a in range(lane / across, BLOCK, wp.max(lanes / across, 1)):
-                s = T(0.0)
-                for j in range(first + lane % across, BLOCK * width, across):
-                    s += band[world, row, j][a] * vector.load(y, BLOCK * (row - width) + j)
-                s = scalar_sum(s, across)
-                if lane % across == 0:
-                    vector.store(y, BLOCK * rows + a, vector.load(y, BLOCK * row + a) - s)
-            sync()
-            for a in range(lane, BLOCK, lanes):
-                s = T(0.0)
-                for k in range(BLOCK):
-                    s += vector.load(y, BLOCK * rows + k) * band[world, row, BLOCK * width + k][a]
-                vector.store(y, BLOCK * row + a, s)
-            sync()
-        for back in range(rows):
-            row = rows - 1 - back
-            x = Column()
+        at = vector.open(outside.ptr + wp.uint64(world) * wp.uint64(outside.shape[1]) * wp.uint64(wp.static(NUMBER)))
+        unknowns = 3 * slot_at.shape[0]
+        for i in range(lane, Y, lanes):
+            s = T(0.0)
             for k in range(BLOCK):
-                column = band[world, row, BLOCK * width + k]
-                s = T(0.0)
-                for a in range(BLOCK):
-                    s += column[a] * vector.load(y, BLOCK * row + a)
-                x[k] = s
+                j = i - i % BLOCK + k
+                if j < unknowns:
+                    s += band[world, i / BLOCK, BESIDE + k][i % BLOCK] * r[world, slot_at[j / 3]][j % 3]
+            vector.store(at, i, s)
+        chunks = (rows + CHUNK - 1) / CHUNK
+        for chunk in range(chunks):
             sync()
-            for j in range(BLOCK * wp.max(width - row, 0) + lane, BLOCK * width, lanes):
-                k = BLOCK * (row - width) + j
-                vector.store(y, k, vector.load(y, k) - wp.dot(band[world, row, j], x))
-            for a in range(lane, BLOCK, lanes):
-                i = BLOCK * row + a
-                if i / 3 < slots:
-                    z[world, slot_at[i / 3]][i % 3] = x[a]
+            take_rows(at, band, world, CHUNK * chunk, lane, lanes)
             sync()
+            for row in range(CHUNK * chunk, wp.min(CHUNK * (chunk + 1), rows)):
+                forward(at, row, Y + SIZE * width * (row - CHUNK * chunk), lane, lanes)
+                sync()
+        for back in range(chunks):
+            chunk = chunks - 1 - back
+            if back > 0:  # the last one is still there
+                sync()
+                take_rows(at, band, world, CHUNK * chunk, lane, lanes)
+            sync()
+            last = wp.min(CHUNK * (chunk + 1), rows) - 1
+            for k in range(last + 1 - CHUNK * chunk):
+                row = last - k
+                backward(at, row, Y + SIZE * width * (row - CHUNK * chunk), lane, lanes)
+                sync()
+        for i in range(lane, unknowns, lanes):
+            column = band[world, i / BLOCK, BESIDE + i % BLOCK]
+            s = T(0.0)
+            for k in range(BLOCK):
+                s += column[k] * vector.load(at, i - i % BLOCK + k)
+            z[world, slot_at[i / 3]][i % 3] = s
 
     return _types.SimpleNamespace(module=module, lanes=WARP, factor=factor, solve=solve)

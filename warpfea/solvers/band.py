@@ -155,16 +155,17 @@ class BandFactor:
 
     def _factor(self, value: wp.array) -> None:
         b, k, launch = self.band, self.kernels, self.launch
-        slots = self.pattern.graph.shape[0]
         self.again.zero_()
-        launch(k.clear, (self.worlds, b.rows), [slots, b.width, self.doing, self.factors])
-        args = [self.pattern.data, value, b.place_of, b.width, self.shift, self.doing, self.factors]
-        launch(k.fill, (self.worlds, slots), args)
         if self.blocks:
             lanes = self.by_block.lanes
-            args = [lanes, self.outside, self.doing, self.bad, self.factors]
+            args = [lanes, self.outside, self.pattern.data, value, b.slot_at, b.place_of, self.shift]
+            args += [self.doing, self.bad, self.factors]
             launch(self.by_block.factor, self.worlds * lanes, args, block_dim=lanes)
         else:
+            slots = self.pattern.graph.shape[0]
+            launch(k.clear, (self.worlds, b.rows), [slots, b.width, self.doing, self.factors])
+            args = [self.pattern.data, value, b.place_of, b.width, self.shift, self.doing, self.factors]
+            launch(k.fill, (self.worlds, slots), args)
             launch(k.factor, self.worlds, [b.width, self.doing, self.bad, self.factors])
         launch(k.settle, self.worlds, [self.bad, self.doing, self.shift, self.again])
 

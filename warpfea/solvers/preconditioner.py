@@ -119,8 +119,8 @@ def choose(name: str, storage: str | None, model: Model) -> str:
     banded = kept and (not model.device.is_cuda or block_band(model) is not None)
     if name == "banded" and kept and not banded:
         raise ModelError(
-            "NewtonPCG: preconditioner = 'banded' is for the CPU, and on a GPU for small models with a narrow band; for "
-            f"this one on {model.device} take 'auto' or 'two-level'"
+            "NewtonPCG: preconditioner = 'banded' is for the CPU, and on a GPU for small models with a narrow band; "
+            f"for this one on {model.device} take 'auto' or 'two-level'"
         )
     if name == "banded" and not banded:
         raise ModelError(
