@@ -55,7 +55,7 @@ def solved(A, graph, order, r, dtype, shift=0.0):
     return z.numpy(), bad.numpy()
 
 
-@pytest.mark.parametrize("dtype, bound", [("float64", 1e-13), ("float32", 1e-5)])
+@pytest.mark.parametrize(("dtype", "bound"), [("float64", 1e-13), ("float32", 1e-5)])
 @pytest.mark.parametrize("reach", [1, 4, 11])
 def test_solutions_are_those_of_numpy(dtype, bound, reach):
     rng = np.random.default_rng(reach)

@@ -20,7 +20,9 @@ from .band import BLOCK, band_kernels, column_type
 __all__ = ["band_block_kernels", "solution_numbers", "window_numbers"]
 
 SIZE = BLOCK * BLOCK
-CHUNK_NUMBERS = 1536
+NARROW = 7
+"""Bands of up to so many blocks beside the diagonal are the work of two warps, wider ones of four."""
+CHUNK_NUMBERS = 3072
 """Numbers of the rows that a solution takes over at once, about."""
 
 
@@ -257,4 +259,5 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
                 s += column[k] * vector.load(at, i - i % BLOCK + k)
             z[world, slot_at[i / 3]][i % 3] = s
 
-    return _types.SimpleNamespace(module=module, lanes=WARP, factor=factor, solve=solve)
+    lanes = (4 if width > NARROW else 2) * WARP
+    return _types.SimpleNamespace(module=module, lanes=lanes, factor=factor, solve=solve)
