@@ -148,9 +148,36 @@ def test_auto_takes_it_where_the_band_is_narrow():
     assert kind(simulation(PROBLEMS["bar"].build((30, 1, 1)), preconditioner_dtype="float32")) == "two-level"
     with pytest.raises(wf.ModelError, match=r"'banded' keeps its factors in.*float64: leave out.*'float32', or take"):
         simulation(PROBLEMS["bar"].build((3, 1, 1)), preconditioner="banded", preconditioner_dtype="float32")
-    gpu = SimpleNamespace(device=SimpleNamespace(is_cuda=True), dtype="float64")
-    with pytest.raises(wf.ModelError, match=r"'banded' is for the CPU; on .* take 'auto' or 'two-level'"):
-        choose("banded", None, gpu)
+
+
+def test_on_a_gpu_it_is_for_small_models():
+    def beam(elements):
+        b = wf.ModelBuilder()
+        steel = wf.SVK(E=2e11, nu=0.3, density=7800.0)
+        b.add_beam(
+            [(0, 0, 0), (1, 0, 0)],
+            elements=elements,
+            section=wf.Rectangle(0.02, 0.02),
+            normal=(0, 0, 1),
+            material=steel,
+        )
+        return b.finalize(device="cpu")
+
+    small, large = beam(16), beam(200)
+    assert choose("auto", None, small) == "banded"
+    cuda = SimpleNamespace(is_cuda=True)
+    with pytest.MonkeyPatch.context() as patch:
+        for model in (small, large):
+            patch.setattr(model, "device", cuda)
+            model.cache.pop("narrow band", None)
+        # the tables of a band lie on the device
+        patch.setattr(
+            type(small), "array", lambda self, name, values, dtype: wp.array(values, dtype=dtype, device="cpu")
+        )
+        assert choose("banded", None, small) == "banded"
+        assert choose("auto", None, small) == "two-level"
+        with pytest.raises(wf.ModelError, match=r"on a GPU for small models with a narrow band; .* take 'auto' or"):
+            choose("banded", None, large)
 
 
 def test_wider_bands_are_kept_for_longer():

@@ -71,13 +71,19 @@ def block_memory(dtype: str, size: int) -> _types.SimpleNamespace:
     T, number = precision(dtype).T, _NUMBER[dtype]
 
     @wp.func_native(snippet=_SHARED.format(number=number, size=size))
-    def open_memory(outside: wp.uint64) -> wp.uint64: ...
+    def open_memory(outside: wp.uint64) -> wp.uint64:
+        """Where the numbers are."""
+        ...
 
     @wp.func_native(snippet=f"return (({number}*)at)[i];")
-    def load(at: wp.uint64, i: int) -> T: ...
+    def load(at: wp.uint64, i: int) -> T:
+        """Number i."""
+        ...
 
     @wp.func_native(snippet=f"(({number}*)at)[i] = x;")
-    def store(at: wp.uint64, i: int, x: T): ...
+    def store(at: wp.uint64, i: int, x: T):
+        """Number i = x."""
+        ...
 
     return _types.SimpleNamespace(open=open_memory, load=load, store=store)
 

@@ -113,7 +113,8 @@ def choose(name: str, storage: str | None, model: Model) -> str:
     on joints are too small to hold several groups of nodes.
 
     Raises:
-        ModelError: "banded" on a GPU, or with inverses in another precision than the model's.
+        ModelError: "banded" on a GPU for a model that is not small, or with inverses in another precision than the
+            model's.
     """
     kept = storage in (None, model.dtype)
     banded = kept and (not model.device.is_cuda or block_band(model) is not None)
@@ -129,7 +130,7 @@ def choose(name: str, storage: str | None, model: Model) -> str:
         )
     if name != "auto":
         return name
-    if banded and find_band(model) is not None:
+    if banded and not model.device.is_cuda and find_band(model) is not None:
         return "banded"
     small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
     return "deflated" if model.terms.traits.gated and small and model.slots > WHOLE_SLOTS else "two-level"
