@@ -23,6 +23,11 @@ LABELS = [case.label for case in bench.cases()]
 COSTS = ("launches", "modules")
 BYTES = 1.03
 """Most that a scene may hold over what it did: a field more, the best iterate of a step."""
+DEARER = {"ball_on_plate": 1.04, "finger_beam_shell": 1.06}
+"""Of contact between bodies, whose tangent has the second derivative of the depth since: 220 B a point, for which solids
+that slide take less than half of the iterations."""
+NEWER = {"gears": 1}
+"""Modules more: dense inverses of each gear by itself."""
 
 
 def content():
@@ -54,8 +59,9 @@ def test_costs_no_more_than_before(tables, label):
     now, before = (table[label] for table in tables)
     for name in COSTS:
         assert (now[name] is None) == (before[name] is None), name
-        assert now[name] is None or now[name] <= before[name], (name, now[name], before[name])
-    assert now["bytes"] <= BYTES * before["bytes"]
+        most = (before[name] or 0) + (NEWER.get(label, 0) if name == "modules" else 0)
+        assert now[name] is None or now[name] <= most, (name, now[name], before[name])
+    assert now["bytes"] <= DEARER.get(label, BYTES) * before["bytes"]
 
 
 def test_all_scenes_take_fewer_iterations_than_before(tables):
