@@ -24,8 +24,8 @@ COSTS = ("launches", "modules")
 BYTES = 1.03
 """Most that a scene may hold over what it did: a field more, the best iterate of a step."""
 DEARER = {"ball_on_plate": 1.04, "finger_beam_shell": 1.06}
-"""Of contact between bodies, whose tangent has the second derivative of the depth since: 220 B a point, for which solids
-that slide take less than half of the iterations."""
+"""Of contact between bodies, whose tangent has the second derivative of the depth: 220 B a point, for which bodies that
+slide take less than half of the iterations."""
 NEWER = {"gears": 1}
 """Modules more: dense inverses of each gear by itself."""
 
