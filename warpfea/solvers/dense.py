@@ -111,7 +111,7 @@ class DenseInverse:
         more = {self.by_part.module} if self.parts else set()
         return {self.making.module, self.kernels.module} | more
 
-    def fill(self, pattern: Pattern, value: wp.array, flags: wp.array) -> None:
+    def fill(self, pattern: Pattern, value: Any, flags: wp.array) -> None:
         """Take over a matrix of 3x3 blocks in the flagged worlds."""
         if self.parts:
             self.launch(self.by_part.spread, self.blocks, [flags, self.flags])

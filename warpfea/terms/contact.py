@@ -247,9 +247,9 @@ class Contact(Term):
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
             at.launch(k.product_points, dim, [group.data, active, p, attempt])
-            dim, lanes = group.sides(at.launch, m.worlds)
+            sides, lanes = group.sides(at.launch, m.worlds)
             args = [group.data, active, lanes, attempt, at.work.pool_product]
-            at.launch(k.product_facets, dim, args)
+            at.launch(k.product_facets, sides, args)
 
     @part("contact")
     def diagonal(self, at: At, active: wp.array) -> None:

@@ -267,9 +267,9 @@ class Pairs(PairSolves):
             at.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
         wp.capture_if(touching.changed, self._list, at=at)
         for group in t.groups:
-            dim, lanes = group.sides(at.launch, m.worlds)
+            sides, lanes = group.sides(at.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
-            at.launch(self.shared.gather_points, dim, args)
+            at.launch(self.shared.gather_points, sides, args)
         lanes = at.launch.lanes(LISTED)
         args = [masters, active, lanes, s["attempt"], touching, w.pool_force]
         at.launch(self.kernels.gather_masters, (m.worlds, at.launch.padded(lanes * t.master_conn.size)), args)
