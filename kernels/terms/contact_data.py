@@ -71,7 +71,6 @@ def facet_struct(dtype: str):
         point: wp.int32  # first point: [facet, point] are numbered in this order
         count: wp.int32
         points: wp.int32  # of a facet
-        corner: wp.vec3i  # three of them, whose triangle faces outward; the same where there is none
         moving: wp.int32  # one point acts, where `Attempt.weight` says
         corners: wp.int32
         coords: wp.array(dtype=wp.vec2d)  # [point] on the unit triangle or square; of lumped contacts, as what follows

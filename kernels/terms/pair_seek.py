@@ -26,8 +26,6 @@ TURNED = 0.1
 """Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
 LOST = 0.25
 """A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
-OPPOSED = -0.5
-"""Cosine of normals of a slave and a master facet that face each other, at most."""
 GLANCE = 0.5
 """A place that the tangent plane in the middle of a facet puts so far beyond its sides is not on it."""
 
@@ -37,7 +35,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in one precision of the displacements."""
     p = precision(dtype)
     vec3 = p.vec3
-    f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
+    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
     Attempt, Clock = attempt_struct(dtype), clock_struct()
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
@@ -49,16 +47,6 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     Jet, boxes = f.Jet, box_kernels(dtype)
     down, up, contains, jet_of = boxes.down, boxes.up, boxes.contains, boxes.jet_of
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
-
-    @wp.struct
-    class Seat:
-        """Where a point may be in contact."""
-
-        facet: wp.int32  # -1: nowhere
-        spot: vec3d
-        off: f64  # beyond the sides of the facet
-        height: f64  # beside it
-        through: wp.bool  # it has crossed a facet, and deep
 
     @wp.func
     def approach(
@@ -254,53 +242,6 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         return found[3] != f64(0.0) and within and found[2] > pad
 
     @wp.func
-    def own_normal(facets: Facets, t: Touching, world: int, item: int) -> vec3d:
-        """Outward normal of a slave facet as the attempt began; 0 where it is a line."""
-        first = facets.point + item * facets.points
-        a = t.x0[world, first + facets.corner[0]]
-        side = t.x0[world, first + facets.corner[1]] - a
-        return wp.normalize(wp.cross(side, t.x0[world, first + facets.corner[2]] - a))
-
-    @wp.func
-    def opposed(mas: Masters, t: Touching, world: int, f: int, n: vec3d) -> bool:
-        """Whether a facet's normal, in its middle, opposes a slave's."""
-        return wp.dot(outward(jet_of(t.middle[world, f])), n) < f64(OPPOSED)
-
-    @wp.func
-    def reconsider(
-        mas: Masters, t: Touching, world: int, root: int, low: box3, high: box3, x: vec3d, pad: f64, n: vec3d,
-        seat: Seat,
-    ) -> Seat:  # fmt: skip
-        """The seat of a point that enters. None where it is beside the facet that it would take and in front of another
-        one: outside of the body. Where it came in through a side that does not face it, as before a body that slides
-        and has sunk in, the facet that does."""
-        out = seat
-        turn = wp.length_sq(n) > f64(0.0) and not opposed(mas, t, world, seat.facet, n)
-        if seat.off == f64(0.0) and not turn:
-            return out
-        query = wp.bvh_query_aabb(mas.tree, low, high, root)
-        index = wp.int32(0)
-        height = f64(1.0e300)
-        while wp.bvh_query_next(query, index):
-            f = index - world * mas.count
-            if seat.off > f64(0.0) and in_front(mas, t, world, f, x, pad):
-                out.facet = -1
-                height = f64(-1.0)  # none is taken any more
-            if turn and opposed(mas, t, world, f, n):
-                corners = mas.corners[mas.kind[f]]
-                found = locate(mas, t.C, t.D, world, f, x, middle(corners))
-                spot = vec3d(found[0], found[1], found[2])
-                s = jet(mas, t.C, t.D, world, f, spot)
-                deep = -spot[2] * wp.dot(outward(s), s.c)
-                fits = found[3] != f64(0.0) and outside(corners, spot) == f64(0.0)
-                if fits and deep > f64(0.0) and deep < f64(LOST) * mas.limit[f] and deep < height:
-                    height = deep
-                    out.facet = f
-                    out.spot = spot
-                    out.off = f64(0.0)
-        return out
-
-    @wp.func
     def admits(
         mas: Masters, t: Touching, world: int, f: int, spot: vec3d, x0: vec3d, pad: f64, left: f64, anchored: bool,
         facing: vec3d, settling: f64,
@@ -317,37 +258,6 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
             fits = fits and wp.dot(x0 - foot.x, outward(foot)) >= -left
         return fits
-
-    @wp.func
-    def look(
-        mas: Masters, t: Touching, world: int, root: int, low: box3, high: box3, x: vec3d, x0: vec3d, pad: f64,
-        left: f64, anchored: bool, facing: vec3d, settling: f64, seat: Seat,
-    ) -> Seat:  # fmt: skip
-        """The best seat among the facets whose boxes a point's way meets."""
-        out = seat
-        query = wp.bvh_query_aabb(mas.tree, low, high, root)
-        index = wp.int32(0)
-        while wp.bvh_query_next(query, index):
-            f = index - world * mas.count
-            if apart(mas, t, world, f, x, x0, pad):
-                continue
-            corners = mas.corners[mas.kind[f]]
-            found = locate(mas, t.C, t.D, world, f, x, middle(corners))
-            spot = vec3d(found[0], found[1], found[2])
-            o = outside(corners, spot)
-            fits = found[3] != f64(0.0) and o <= wp.min(out.off, f64(OUTER))
-            if fits:
-                fits = admits(mas, t, world, f, spot, x0, pad, left, anchored, facing, settling)
-                same = wp.abs(spot[2]) == out.height and f < out.facet
-                closer = wp.abs(spot[2]) < out.height or same
-                if fits and (o < out.off or out.facet < 0 or closer):
-                    out.facet = f
-                    out.spot = spot
-                    out.off = o
-                    out.height = wp.abs(spot[2])
-            if not anchored and settling == f64(0.0) and crosses(mas, t, world, f, x, x0):
-                out.through = True
-        return out
 
     @wp.kernel(module=module)
     def seek(
@@ -370,11 +280,15 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         shift = along(facets, u, world, q, item)
         x = facets.X[q, item] + shift
         x0 = t.x0[world, point]
-        seat = Seat(-1, vec3d(), f64(OUTER), f64(1.0e300), False)
+        best = wp.int32(-1)
+        place = vec3d()
+        off = f64(OUTER)
         if settling > f64(0.0):
-            seat.off = f64(0.0)  # what lies before one face of a body is beside another
+            off = f64(0.0)  # what lies before one face of a body is beside another
+        height = f64(1.0e300)
         inside = allowance(con, his, world, c, point, clock.time[world])
         pad = settling + inside + wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
+        through = bool(False)
         anchored = t.first[world, point] > 0
         motion = vec3d()
         from0 = t.spot0[world, point]
@@ -386,30 +300,53 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 found = locate(mas, t.C, t.D, world, f, x, middle(mas.corners[mas.kind[f]]))
             spot = vec3d(found[0], found[1], found[2])
             o = outside(mas.corners[mas.kind[f]], spot)
-            if found[3] != f64(0.0) and (o <= seat.off or (o <= f64(HOLD) and his.speed[world, point] > f64(0.0))):
-                seat = Seat(f, spot, o, wp.abs(spot[2]), False)
+            if found[3] != f64(0.0) and (o <= off or (o <= f64(HOLD) and his.speed[world, point] > f64(0.0))):
+                best = f
+                place = spot
+                off = o
+                height = wp.abs(spot[2])
             pad += f64(2.0) * wp.abs(from0[2])
-        if seat.facet < 0 or seat.off > f64(OUTER):
+        if best < 0 or off > f64(OUTER):
             facing = vec3d()
             if anchored:
                 f = t.first[world, point] - 1
                 facing = outward(jet(mas, t.C, t.D, world, f, from0))
-                seat.through = at.depth[world, point] - wp.dot(motion, facing) > f64(LOST) * mas.limit[f]
+                through = at.depth[world, point] - wp.dot(motion, facing) > f64(LOST) * mas.limit[f]
             wide = vec3d(pad, pad, pad)
-            low, high = down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide)
             root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.of[c])
+            query = wp.bvh_query_aabb(mas.tree, down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide), root)
+            index = wp.int32(0)
             left = inside + mas.touch - wp.min(con.offset[c], f64(0.0))
-            seat = look(mas, t, world, root, low, high, x, x0, pad, left, anchored, facing, settling, seat)
-            if seat.facet >= 0 and not anchored and settling == f64(0.0):
-                n = own_normal(facets, t, world, item)
-                seat = reconsider(mas, t, world, root, low, high, x, pad, n, seat)
-        if seat.facet >= 0:
-            sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, seat.facet, seat.spot, shift,
-                settling)  # fmt: skip
-            most = mas.limit[seat.facet] * wp.where(seat.off > f64(OUTER), f64(LOST), f64(1.0))
+            while wp.bvh_query_next(query, index):
+                f = index - world * mas.count
+                corners = mas.corners[mas.kind[f]]
+                if apart(mas, t, world, f, x, x0, pad):
+                    continue
+                found = locate(mas, t.C, t.D, world, f, x, middle(corners))
+                spot = vec3d(found[0], found[1], found[2])
+                o = outside(corners, spot)
+                fits = found[3] != f64(0.0) and o <= wp.min(off, f64(OUTER))
+                if fits:
+                    fits = admits(mas, t, world, f, spot, x0, pad, left, anchored, facing, settling)
+                    closer = wp.abs(spot[2]) < height or (wp.abs(spot[2]) == height and f < best)
+                    if fits and (o < off or best < 0 or closer):
+                        best = f
+                        place = spot
+                        off = o
+                        height = wp.abs(spot[2])
+                if not anchored and settling == f64(0.0) and crosses(mas, t, world, f, x, x0):
+                    through = True
+            if best >= 0 and off > f64(0.0) and not anchored:
+                query = wp.bvh_query_aabb(mas.tree, down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide), root)
+                while wp.bvh_query_next(query, index):
+                    if in_front(mas, t, world, index - world * mas.count, x, pad):
+                        best = -1  # beside a facet, and outside of the body
+        if best >= 0:
+            sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, settling)
+            most = mas.limit[best] * wp.where(off > f64(OUTER), f64(LOST), f64(1.0))
             if t.depth[world, point] > most:
                 t.seat[world, point] = THROUGH
-        elif seat.through:
+        elif through:
             t.seat[world, point] = THROUGH
 
     return _types.SimpleNamespace(

@@ -105,17 +105,6 @@ class FacetGroup:
         return (worlds, launch.padded(lanes * self.conn.size)), lanes
 
 
-def facing_corners(parts: list[ContactPoints]) -> tuple[int, int, int]:
-    """Three points of every facet whose triangle faces outward; three times the first where there are none."""
-    X, normal, area = (np.concatenate([getattr(p, name) for p in parts]) for name in ("X", "normal", "area"))
-    b = int(np.linalg.norm(X[0] - X[0, 0], axis=1).argmax())
-    c = int(np.linalg.norm(np.cross(X[0, b] - X[0, 0], X[0] - X[0, 0]), axis=1).argmax())
-    facing = np.einsum("fk,fk->f", np.cross(X[:, b] - X[:, 0], X[:, c] - X[:, 0]), normal.mean(axis=1))
-    if not (area[:, [0, b, c]] > 0.0).all():
-        return 0, 0, 0
-    return (0, b, c) if (facing > 0.0).all() else (0, c, b) if (facing < 0.0).all() else (0, 0, 0)
-
-
 class FacetTables(Generic[AnyContact]):
     """Contacts and the points of their surfaces, in the order of the device: by the kind of their facets.
 
@@ -184,7 +173,6 @@ class FacetTables(Generic[AnyContact]):
         data.pool, data.row, data.point = pool, self.rows, self.points
         _, data.points, acts = kind
         data.count, data.moving, data.corners = len(conn), int(acts == MOVING), 3 if data.points in RULES[3] else 4
-        data.corner = wp.vec3i(*facing_corners(parts))
         if acts != PATCH:
             points = RULES[data.corners][data.points].points
             basis, power = lagrange_basis(points)
