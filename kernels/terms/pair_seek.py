@@ -26,10 +26,9 @@ TURNED = 0.1
 """Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
 LOST = 0.25
 """A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
-REFUSED = -2.0
-"""In place of a cosine."""
 OPPOSES = 0.5
-"""Least cosine, with a facet's normal reversed, of the slave's own normal at a point that comes from its front."""
+"""Cosine of a facet's normal and the slave's own, one reversed, from which on they face each other; below minus that
+they face the same way."""
 ALIKE = 2.0
 """A point that comes in from beside a facet is in contact if its depth is at most so many times what there is."""
 LEAN = 2.0
@@ -78,7 +77,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             if not live:
                 return
             spot = start
-        if outside(mas.corners[mas.kind[f]], spot) > f64(OUTER):
+        if live and outside(mas.corners[mas.kind[f]], spot) > f64(OUTER):
             return  # it has slid off the surface
         foot = foot_of(mas, t.C0, t.D0, world, f, spot)
         t.first[world, point] = f + 1
@@ -290,22 +289,29 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     def admits(
         mas: Masters, at: Attempt, t: Touching, world: int, c: int, point: int, f: int, spot: vec3d, pad: f64,
         left: f64, anchored: bool, facing: vec3d, settling: f64,
-    ) -> f64:  # fmt: skip
-        """Cosine of the normals where a place on a facet may be the seat of a point, REFUSED elsewhere: by its depth,
-        by the facet that it was on, or by the side that it was on as the attempt began."""
+    ) -> int:  # fmt: skip
+        """-1 where a place on a facet may not be the seat of a point: by its depth, by the facet that it was on, or by
+        the side that it was on as the attempt began. Else larger for facets that face the slave's, by twos, and for
+        one that the point came to from beside."""
         s = jet(mas, t.C, t.D, world, f, spot)
         n = outward(s)
         cosine = wp.dot(n, facing)
         gap = spot[2] * wp.dot(n, s.c)
-        fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
+        if -gap > mas.limit[f] or gap > pad:  # boxes vary with what other worlds do
+            return -1
         if anchored:
-            fits = fits and cosine > f64(TURNED)
-        elif settling == f64(0.0):
+            return wp.where(cosine > f64(TURNED), 0, -1)
+        rank = wp.where(cosine > f64(OPPOSES), 4, wp.where(cosine > -f64(OPPOSES), 2, 0))
+        if settling > f64(0.0):
+            rank = 0
+        else:
             foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
             before = wp.dot(t.x0[world, point] - foot.x, outward(foot))
-            if fits and before < -left:
-                fits = cosine > f64(OPPOSES) and from_beside(mas, at, t, world, c, point, f, spot, before)
-        return wp.where(fits, cosine, f64(REFUSED))
+            if before < -left:
+                if rank == 0 or not from_beside(mas, at, t, world, c, point, f, spot, before):
+                    return -1
+                rank += 1
+        return rank
 
     @wp.kernel(module=module)
     def seek(
@@ -356,7 +362,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             pad += f64(2.0) * wp.abs(from0[2])
         if best < 0 or off > f64(OUTER):
             facing = vec3d()
-            against = bool(False)
+            best_rank = wp.int32(-1)
             if anchored:
                 f = t.first[world, point] - 1
                 facing = outward(jet(mas, t.C, t.D, world, f, from0))
@@ -379,18 +385,17 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 if found[3] != f64(0.0) and o <= wp.min(wp.max(off, slack), f64(OUTER)):
                     if free:
                         facing = opposite(facets, t, world, item, trio[item])
-                    cosine = admits(mas, at, t, world, c, point, f, spot, pad, left, anchored, facing, settling)
-                    front = free and cosine > f64(OPPOSES)
-                    if front and o <= slack:
+                    rank = admits(mas, at, t, world, c, point, f, spot, pad, left, anchored, facing, settling)
+                    if rank > 2 and o <= slack:
                         o = f64(0.0)
                     closer = wp.abs(spot[2]) < height or (wp.abs(spot[2]) == height and f < best)
-                    closer = (front and not against) or (closer and front == against)
-                    if cosine > f64(REFUSED) and (o < off or best < 0 or (o == off and closer)):
+                    closer = rank > best_rank or (closer and rank == best_rank)
+                    if rank >= 0 and (o < off or best < 0 or (o == off and closer)):
                         best = f
                         place = spot
                         off = o
                         height = wp.abs(spot[2])
-                        against = front
+                        best_rank = rank
                 if free and crosses(mas, t, world, f, x, x0):
                     through = True
             if best >= 0 and off > f64(0.0) and not anchored:
