@@ -291,8 +291,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         left: f64, anchored: bool, facing: vec3d, settling: f64,
     ) -> int:  # fmt: skip
         """-1 where a place on a facet may not be the seat of a point: by its depth, by the facet that it was on, or by
-        the side that it was on as the attempt began. Else larger for facets that face the slave's, by twos, and for
-        one that the point came to from beside."""
+        the side that it was on as the attempt began. Else larger for facets that face the slave's; of others, for one
+        that the point came to from beside."""
         s = jet(mas, t.C, t.D, world, f, spot)
         n = outward(s)
         cosine = wp.dot(n, facing)
@@ -301,7 +301,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             return -1
         if anchored:
             return wp.where(cosine > f64(TURNED), 0, -1)
-        rank = wp.where(cosine > f64(OPPOSES), 4, wp.where(cosine > -f64(OPPOSES), 2, 0))
+        rank = wp.where(cosine > f64(OPPOSES), 4, wp.where(cosine > -f64(OPPOSES), 1, 0))
         if settling > f64(0.0):
             rank = 0
         else:
@@ -310,7 +310,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             if before < -left:
                 if rank == 0 or not from_beside(mas, at, t, world, c, point, f, spot, before):
                     return -1
-                rank += 1
+                rank = wp.where(rank == 4, 3, 2)
         return rank
 
     @wp.kernel(module=module)
@@ -363,6 +363,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         if best < 0 or off > f64(OUTER):
             facing = vec3d()
             best_rank = wp.int32(-1)
+            entered = bool(False)
+            loose = bool(False)
             if anchored:
                 f = t.first[world, point] - 1
                 facing = outward(jet(mas, t.C, t.D, world, f, from0))
@@ -386,7 +388,10 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                     if free:
                         facing = opposite(facets, t, world, item, trio[item])
                     rank = admits(mas, at, t, world, c, point, f, spot, pad, left, anchored, facing, settling)
-                    if rank > 2 and o <= slack:
+                    beside = rank == 2 or rank == 3
+                    near = beside and o > f64(0.0)
+                    entered = entered or (rank >= 0 and not beside)
+                    if rank > 1 and o <= slack:
                         o = f64(0.0)
                     closer = wp.abs(spot[2]) < height or (wp.abs(spot[2]) == height and f < best)
                     closer = rank > best_rank or (closer and rank == best_rank)
@@ -396,8 +401,11 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                         off = o
                         height = wp.abs(spot[2])
                         best_rank = rank
+                        loose = near
                 if free and crosses(mas, t, world, f, x, x0):
                     through = True
+            if loose and not entered:
+                best = -1  # it passed no side of the body
             if best >= 0 and off > f64(0.0) and not anchored:
                 query = wp.bvh_query_aabb(mas.tree, down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide), root)
                 while wp.bvh_query_next(query, index):
