@@ -58,8 +58,11 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
         t: Touching,
     ):  # fmt: skip
-        """Those of displacements and velocities as an attempt begins."""
+        """Those of displacements and velocities as an attempt begins; no depth is known yet."""
         world, item, m = wp.tid()
+        if active[world] != 0:
+            for body in range(mas.most * item + m, t.deepest.shape[1], mas.most * mas.count):
+                t.deepest[world, body] = f64(0.0)
         if active[world] != 0 and m < mas.terms[mas.kind[item]]:
             control(mas, v_n, world, item, m, t.V0, t.D0)
             control(mas, u_n, world, item, m, t.C0, t.D0)

@@ -23,6 +23,7 @@ def master_struct(dtype: str):
         tree: wp.uint64  # boxes of [world, facet], grouped by world and surface
         of: wp.array(dtype=wp.int32)  # [contact] its surface
         sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points are of the second body
+        bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points and of the facets, among those in pairs
         surfaces: wp.int32
         touch: wp.float64  # depth as a step begins that counts as touch, m
         most: wp.int32  # monomials of a facet, at most
@@ -85,6 +86,7 @@ def touching_struct(dtype: str):
         calm_upper: wp.array2d(dtype=wp.vec3)
         calm: wp.array2d(dtype=wp.int32)
         x0: wp.array2d(dtype=wp.vec3d)  # [world, point] place as the attempt began
+        deepest: wp.array2d(dtype=wp.float64)  # [world, body] largest depth of its points in contact then, m
         first: wp.array2d(dtype=wp.int32)  # facet + 1 from which its motion is measured, 0: none yet
         spot0: wp.array2d(dtype=wp.vec3d)  # where it was on that
         stretch: wp.array2d(dtype=wp.vec2d)  # then: gap per coordinate along the outward vector, and its rest, m

@@ -26,6 +26,13 @@ TURNED = 0.1
 """Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
 LOST = 0.25
 """A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
+OPPOSES = 0.5
+"""Cosine of a facet's normal and the slave's own, one reversed, from which on they face each other; below minus that
+they face the same way."""
+ALIKE = 2.0
+"""A point that comes in from beside a facet is in contact if its depth is at most so many times what there is."""
+LEAN = 2.0
+"""Most tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
 GLANCE = 0.5
 """A place that the tangent plane in the middle of a facet puts so far beyond its sides is not on it."""
 
@@ -70,7 +77,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             if not live:
                 return
             spot = start
-        if outside(mas.corners[mas.kind[f]], spot) > f64(OUTER):
+        if live and outside(mas.corners[mas.kind[f]], spot) > f64(OUTER):
             return  # it has slid off the surface
         foot = foot_of(mas, t.C0, t.D0, world, f, spot)
         t.first[world, point] = f + 1
@@ -112,6 +119,12 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         if his.speed[world, point] > f64(0.0):
             anchor(mas, facets, his, seats, clock, at, t, v_n, world, q, item, point, seats.seat[world, point] - 1,
                    seats.spot[world, point])  # fmt: skip
+            if t.first[world, point] > 0:
+                depth = at.depth[world, point]
+                for i in range(2):
+                    body = mas.bodies[c][i]
+                    if depth > t.deepest[world, body]:
+                        wp.atomic_max(t.deepest, world, body, depth)
 
     @wp.kernel(module=module)
     def look_around(
@@ -242,31 +255,72 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         return found[3] != f64(0.0) and within and found[2] > pad
 
     @wp.func
-    def admits(
-        mas: Masters, t: Touching, world: int, f: int, spot: vec3d, x0: vec3d, pad: f64, left: f64, anchored: bool,
-        facing: vec3d, settling: f64,
+    def opposite(facets: Facets, t: Touching, world: int, item: int, corners: wp.vec3i) -> vec3d:
+        """Normal of a slave facet as the attempt began, inward; 0 where it has none."""
+        if corners[0] < 0:
+            return vec3d()
+        point = facets.point + item * facets.points
+        x = t.x0[world, point + corners[0]]
+        return wp.normalize(wp.cross(t.x0[world, point + corners[2]] - x, t.x0[world, point + corners[1]] - x))
+
+    @wp.func
+    def lean(mas: Masters, f: int, spot: vec3d) -> f64:
+        """By how much of a side a place inside of an edge may lie beyond a facet: outward vectors lean there."""
+        return wp.max(-f64(LEAN) * spot[2] / mas.size[f], f64(0.0))
+
+    @wp.func
+    def from_beside(
+        mas: Masters, at: Attempt, t: Touching, world: int, c: int, point: int, f: int, spot: vec3d, gap: f64
     ) -> bool:  # fmt: skip
-        """Whether a place on a facet may be the seat of a point: by its depth, by the facet that it was on, or by the
-        side that it was on as the attempt began."""
+        """Whether a point is at a facet now and was beside it as the attempt began, below its plane by no more than
+        what the bodies are in contact with: it slid under the edge of a body that has sunk in.
+        """
+        kind = mas.kind[f]
+        most = wp.max(t.deepest[world, mas.bodies[c][0]], t.deepest[world, mas.bodies[c][1]])
+        depth = at.reach[world, point] - gap
+        if depth > wp.min(f64(ALIKE) * most, f64(LOST) * mas.limit[f]):
+            return False
+        if outside(mas.corners[kind], spot) > lean(mas, f, spot):
+            return False
+        found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], spot)
+        return found[3] == f64(0.0) or outside(mas.corners[kind], vec3d(found[0], found[1], found[2])) > f64(0.0)
+
+    @wp.func
+    def admits(
+        mas: Masters, at: Attempt, t: Touching, world: int, c: int, point: int, f: int, spot: vec3d, pad: f64,
+        left: f64, anchored: bool, facing: vec3d, settling: f64,
+    ) -> int:  # fmt: skip
+        """-1 where a place on a facet may not be the seat of a point: by its depth, by the facet that it was on, or by
+        the side that it was on as the attempt began. Else larger for facets that face the slave's; of others, for one
+        that the point came to from beside."""
         s = jet(mas, t.C, t.D, world, f, spot)
         n = outward(s)
+        cosine = wp.dot(n, facing)
         gap = spot[2] * wp.dot(n, s.c)
-        fits = -gap <= mas.limit[f] and gap <= pad  # boxes vary with what other worlds do
+        if -gap > mas.limit[f] or gap > pad:  # boxes vary with what other worlds do
+            return -1
         if anchored:
-            fits = fits and wp.dot(n, facing) > f64(TURNED)
-        elif settling == f64(0.0):
+            return wp.where(cosine > f64(TURNED), 0, -1)
+        rank = wp.where(cosine > f64(OPPOSES), 4, wp.where(cosine > -f64(OPPOSES), 1, 0))
+        if settling > f64(0.0):
+            rank = 0
+        else:
             foot = jet(mas, t.C0, t.D0, world, f, vec3d(spot[0], spot[1], f64(0.0)))
-            fits = fits and wp.dot(x0 - foot.x, outward(foot)) >= -left
-        return fits
+            before = wp.dot(t.x0[world, point] - foot.x, outward(foot))
+            if before < -left:
+                if rank == 0 or not from_beside(mas, at, t, world, c, point, f, spot, before):
+                    return -1
+                rank = wp.where(rank == 4, 3, 2)
+        return rank
 
     @wp.kernel(module=module)
     def seek(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
         u: wp.array2d(dtype=vec3d), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: f64,
-        at: Attempt, t: Touching,
+        at: Attempt, t: Touching, trio: wp.array(dtype=wp.vec3i),
     ):  # fmt: skip
         """The seat of each point at an iterate. `settling`: above 0 there is no step; what is inside, no deeper than
-        that, m, is in contact."""
+        that, m, is in contact. `trio`: three points of each slave facet, or -1."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
@@ -308,6 +362,9 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             pad += f64(2.0) * wp.abs(from0[2])
         if best < 0 or off > f64(OUTER):
             facing = vec3d()
+            best_rank = wp.int32(-1)
+            entered = bool(False)
+            loose = bool(False)
             if anchored:
                 f = t.first[world, point] - 1
                 facing = outward(jet(mas, t.C, t.D, world, f, from0))
@@ -325,17 +382,30 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 found = locate(mas, t.C, t.D, world, f, x, middle(corners))
                 spot = vec3d(found[0], found[1], found[2])
                 o = outside(corners, spot)
-                fits = found[3] != f64(0.0) and o <= wp.min(off, f64(OUTER))
-                if fits:
-                    fits = admits(mas, t, world, f, spot, x0, pad, left, anchored, facing, settling)
+                free = not anchored and settling == f64(0.0)
+                slack = wp.where(free, lean(mas, f, spot), f64(0.0))
+                if found[3] != f64(0.0) and o <= wp.min(wp.max(off, slack), f64(OUTER)):
+                    if free:
+                        facing = opposite(facets, t, world, item, trio[item])
+                    rank = admits(mas, at, t, world, c, point, f, spot, pad, left, anchored, facing, settling)
+                    beside = rank == 2 or rank == 3
+                    near = beside and o > f64(0.0)
+                    entered = entered or (rank >= 0 and not beside)
+                    if rank > 1 and o <= slack:
+                        o = f64(0.0)
                     closer = wp.abs(spot[2]) < height or (wp.abs(spot[2]) == height and f < best)
-                    if fits and (o < off or best < 0 or closer):
+                    closer = rank > best_rank or (closer and rank == best_rank)
+                    if rank >= 0 and (o < off or best < 0 or (o == off and closer)):
                         best = f
                         place = spot
                         off = o
                         height = wp.abs(spot[2])
-                if not anchored and settling == f64(0.0) and crosses(mas, t, world, f, x, x0):
+                        best_rank = rank
+                        loose = near
+                if free and crosses(mas, t, world, f, x, x0):
                     through = True
+            if loose and not entered:
+                best = -1  # it passed no side of the body
             if best >= 0 and off > f64(0.0) and not anchored:
                 query = wp.bvh_query_aabb(mas.tree, down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide), root)
                 while wp.bvh_query_next(query, index):

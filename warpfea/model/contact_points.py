@@ -23,6 +23,7 @@ __all__ = [
     "body_mass_total",
     "check_points",
     "contact_points",
+    "corner_points",
     "effective_modulus",
     "lagrange_basis",
     "points_by_rules",
@@ -91,6 +92,23 @@ def points_by_rules(
     length = np.linalg.norm(cross, axis=2, keepdims=True)
     normal = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0)
     return ContactPoints(t.conn, t.shape, area, X, normal, surface.faces)
+
+
+def corner_points(p: ContactPoints) -> np.ndarray:
+    """(F, 3) points of each face whose cross product (x_1 - x_0) x (x_2 - x_0) points outward; -1 where none does.
+
+    The second is the farthest from the first, the third spans the largest triangle with both.
+    """
+    face = np.arange(len(p.X))
+    way = np.where(p.area[..., None] > 0.0, p.X - p.X[:, :1], 0.0)
+    j = np.argmax(np.einsum("fpk,fpk->fp", way, way), axis=1)
+    cross = np.cross(way[face, j][:, None], way)
+    size = np.linalg.norm(cross, axis=2)
+    k = np.argmax(size, axis=1)
+    side = np.einsum("fk,fk->f", cross[face, k], p.normal.sum(axis=1))
+    out = np.stack([np.zeros_like(j), np.where(side > 0.0, j, k), np.where(side > 0.0, k, j)], axis=1)
+    flat = (size[face, k] <= 1e-6 * np.einsum("fk,fk->f", way[face, j], way[face, j])) | (side == 0.0)
+    return np.where(flat[:, None], -1, out).astype(np.int32)
 
 
 def lagrange_basis(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -88,11 +88,13 @@ class FacetGroup:
         points: (F, P) numbers of the points.
         data: the device struct.
         lumped: whether at most one of its places acts.
+        contacts: in the order of the device.
     """
 
     conn: np.ndarray
     data: Any
     lumped: bool
+    contacts: list[int]
 
     @property
     def count(self) -> int:
@@ -179,7 +181,7 @@ class FacetTables(Generic[AnyContact]):
             put("coords", points, wp.vec2d)
             put("basis", basis, wp.float64)
             put("power", power, wp.vec2i)
-        return FacetGroup(conn, data, acts != PATCH)
+        return FacetGroup(conn, data, acts != PATCH, chosen)
 
     def _put_laws(self, out: Any, numbers: list[dict[str, float]]) -> None:
         """Upload what a law has; `numbers` of each contact: normal, tangent, normal_damping, mass."""

@@ -11,6 +11,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.terms.contact_data import contact_struct
 from ..kernels.terms.pair_data import master_struct
+from ..model.contact_points import corner_points
 from ..model.handles import SurfaceSet
 from ..model.pairs import (
     MasterFacets,
@@ -38,7 +39,7 @@ class PairTables(FacetTables[PairContact]):
     Attributes:
         surfaces, masters: master surfaces, each once, and their facets; of: that of each contact.
         regions: area of each contact, m^2.
-        facets: master facets in all.
+        facets: master facets in all. bodies: that are in a pair. corners: of the slave facets of each group.
         far: how far off a gap is told, m. deepest: overlap that is looked for at the start, m.
     """
 
@@ -58,6 +59,8 @@ class PairTables(FacetTables[PairContact]):
         self.regions = [self._region(contact) for contact in self.contacts]
         self.shares = [p.area / region for p, region in zip(self.host, self.regions)]
         self.facets = sum(len(m.conn) for m in self.masters)
+        self.bodies = sorted({surface.body.index for c in self.contacts for surface in (c.slave, c.master)})
+        self.corners: list[wp.array] = []
 
     def _check_clamped(self) -> None:
         """ModelError for a contact of which nothing can move."""
@@ -88,6 +91,9 @@ class PairTables(FacetTables[PairContact]):
     def build(self, pool: int) -> None:
         """Upload; `pool`: the first entry of the term in the pool."""
         self.pool = self._build_facets(pool)
+        for group in self.groups:
+            corners = np.concatenate([corner_points(self.host[k]) for k in group.contacts])
+            self.corners.append(self.model.array("contact", corners, wp.vec3i))
         self.data = contact_struct(False)()
         self._put_laws(self.data, [self._numbers(c, region) for c, region in zip(self.contacts, self.regions)])
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
@@ -161,6 +167,8 @@ class PairTables(FacetTables[PairContact]):
             m.cache["pair masters"] = {
                 "of": put(self.of, wp.int32),
                 "sign": put([1.0 if c.slave is c.first else -1.0 for c in self.contacts], wp.float64),
+                "bodies": put([[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts],
+                              wp.vec2i),
                 "conn": put(self.master_conn.T, wp.int32),
                 "shape": put(np.moveaxis(whole("shape"), 0, 2), m.types.T),
                 "rise": put(np.moveaxis(whole("rise"), 0, 2), m.types.T),

@@ -113,7 +113,7 @@ class Pairs(PairSolves):
         shapes |= dict.fromkeys(("points", "start", "middle", "middle0", "swell"), (B, F))
         shapes |= {"chunk": (B, -(-F // CHUNK))}
         shapes |= dict.fromkeys(("weight", "held_weight", "slope"), (B, P, t.master_conn.shape[1]))
-        shapes |= {"lean": (B, P, 2)}
+        shapes |= {"lean": (B, P, 2), "deepest": (B, len(t.bodies))}
         out = touching_struct(self.model.dtype)()
         for name, var in touching_struct(self.model.dtype).vars.items():
             setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))
@@ -240,11 +240,11 @@ class Pairs(PairSolves):
         at.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, touching])
         at.launch(k.keep_middles, (m.worlds, t.facets), [masters, active, touching])
         wp.capture_if(touching.stale, self._refit, at=at)
-        for group in t.groups:
+        for group, corners in zip(t.groups, t.corners):
             args = [t.data, masters, group.data, s["history"]]
             at.launch(k.look_around, (m.worlds, group.count), [*args, u, active, t.reaching + settling, touching])
             args += [s["seats"], s["clock"], u, at.state.velocity, active, settling]
-            at.launch(k.seek, (m.worlds, group.count, group.data.points), [*args, s["attempt"], touching])
+            at.launch(k.seek, (m.worlds, group.count, group.data.points), [*args, s["attempt"], touching, corners])
 
     def prepare(self, at: At, active: wp.array) -> None:
         """The first caps, and the stiffness that blocks are made from."""
