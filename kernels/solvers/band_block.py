@@ -1,9 +1,9 @@
 """Cholesky factors of narrow banded matrices by a block of threads per world: for GPUs, and many small worlds.
 
 A = D U U^T D^T with D the lower triangular 4 x 4 blocks on the diagonal of the Cholesky factor and U of unit diagonal.
-Block row I of the factors holds U_IJ, J = I - width .. I - 1, each by columns, and the inverse of D_II. So products with
-U alone go from row to row in a solution. The factorisation looks to the right: the (width + 1)^2 blocks that a column
-still changes are in memory of the block of threads, and rows enter as this window moves on. Solutions load rows of the
+Block row I of the factors holds U_IJ, J = I - width .. I - 1, each by columns, and the inverse of D_II. In a solution
+products with U alone go from row to row. The factorisation looks to the right: the (width + 1)^2 blocks that a column
+still changes are in memory of the block of threads, and rows enter as this window moves. Solutions load rows of the
 factors by chunks, many numbers at a time. On the CPU one thread does the same.
 
 Measured on an H200, world-steps per second of 4096 worlds and of one, and bytes per world, beside the dense inverses of

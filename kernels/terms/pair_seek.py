@@ -55,6 +55,18 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     down, up, contains, jet_of = boxes.down, boxes.up, boxes.contains, boxes.jet_of
     module = kernel_module(f"pair_seek_{dtype}", max_unroll=SMALL)
 
+    @wp.struct
+    class Seat:
+        """Where a point may be in contact."""
+
+        facet: wp.int32  # -1: nowhere
+        spot: vec3d
+        off: f64  # beyond the sides of the facet
+        height: f64  # beside it
+        rank: wp.int32  # see `admits`
+        entered: wp.bool  # the point passed a side of the body
+        loose: wp.bool  # it must have, to be seated here
+
     @wp.func
     def approach(
         mas: Masters, facets: Facets, t: Touching, v: wp.array2d(dtype=vec3), world: int, q: int, item: int, f: int,
@@ -313,6 +325,34 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 rank = wp.where(rank == 4, 3, 2)
         return rank
 
+    @wp.func
+    def offer(
+        mas: Masters, at: Attempt, t: Touching, world: int, c: int, point: int, f: int, x: vec3d, pad: f64, left: f64,
+        anchored: bool, facing: vec3d, settling: f64, seat: Seat,
+    ) -> Seat:  # fmt: skip
+        """The better one of a seat and of that which a facet has for a point."""
+        out = seat
+        corners = mas.corners[mas.kind[f]]
+        found = locate(mas, t.C, t.D, world, f, x, middle(corners))
+        spot = vec3d(found[0], found[1], found[2])
+        o = outside(corners, spot)
+        slack = f64(0.0)
+        if not anchored and settling == f64(0.0):
+            slack = lean(mas, f, spot)
+        if found[3] == f64(0.0) or o > wp.min(wp.max(seat.off, slack), f64(OUTER)):
+            return out
+        rank = admits(mas, at, t, world, c, point, f, spot, pad, left, anchored, facing, settling)
+        beside = rank == 2 or rank == 3
+        near = beside and o > f64(0.0)
+        out.entered = out.entered or (rank >= 0 and not beside)
+        if rank > 1 and o <= slack:
+            o = f64(0.0)
+        closer = wp.abs(spot[2]) < seat.height or (wp.abs(spot[2]) == seat.height and f < seat.facet)
+        closer = rank > seat.rank or (closer and rank == seat.rank)
+        if rank >= 0 and (o < seat.off or seat.facet < 0 or (o == seat.off and closer)):
+            out = Seat(f, spot, o, wp.abs(spot[2]), rank, out.entered, near)
+        return out
+
     @wp.kernel(module=module)
     def seek(
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
@@ -334,12 +374,9 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         shift = along(facets, u, world, q, item)
         x = facets.X[q, item] + shift
         x0 = t.x0[world, point]
-        best = wp.int32(-1)
-        place = vec3d()
-        off = f64(OUTER)
+        seat = Seat(-1, vec3d(), f64(OUTER), f64(1.0e300), -1, False, False)
         if settling > f64(0.0):
-            off = f64(0.0)  # what lies before one face of a body is beside another
-        height = f64(1.0e300)
+            seat.off = f64(0.0)  # what lies before one face of a body is beside another
         inside = allowance(con, his, world, c, point, clock.time[world])
         pad = settling + inside + wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)
@@ -354,17 +391,12 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 found = locate(mas, t.C, t.D, world, f, x, middle(mas.corners[mas.kind[f]]))
             spot = vec3d(found[0], found[1], found[2])
             o = outside(mas.corners[mas.kind[f]], spot)
-            if found[3] != f64(0.0) and (o <= off or (o <= f64(HOLD) and his.speed[world, point] > f64(0.0))):
-                best = f
-                place = spot
-                off = o
-                height = wp.abs(spot[2])
+            if found[3] != f64(0.0) and (o <= seat.off or (o <= f64(HOLD) and his.speed[world, point] > f64(0.0))):
+                seat = Seat(f, spot, o, wp.abs(spot[2]), -1, False, False)
             pad += f64(2.0) * wp.abs(from0[2])
-        if best < 0 or off > f64(OUTER):
+        if seat.facet < 0 or seat.off > f64(OUTER):
             facing = vec3d()
-            best_rank = wp.int32(-1)
-            entered = bool(False)
-            loose = bool(False)
+            free = not anchored and settling == f64(0.0)
             if anchored:
                 f = t.first[world, point] - 1
                 facing = outward(jet(mas, t.C, t.D, world, f, from0))
@@ -376,44 +408,24 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             left = inside + mas.touch - wp.min(con.offset[c], f64(0.0))
             while wp.bvh_query_next(query, index):
                 f = index - world * mas.count
-                corners = mas.corners[mas.kind[f]]
                 if apart(mas, t, world, f, x, x0, pad):
                     continue
-                found = locate(mas, t.C, t.D, world, f, x, middle(corners))
-                spot = vec3d(found[0], found[1], found[2])
-                o = outside(corners, spot)
-                free = not anchored and settling == f64(0.0)
-                slack = wp.where(free, lean(mas, f, spot), f64(0.0))
-                if found[3] != f64(0.0) and o <= wp.min(wp.max(off, slack), f64(OUTER)):
-                    if free:
-                        facing = opposite(facets, t, world, item, trio[item])
-                    rank = admits(mas, at, t, world, c, point, f, spot, pad, left, anchored, facing, settling)
-                    beside = rank == 2 or rank == 3
-                    near = beside and o > f64(0.0)
-                    entered = entered or (rank >= 0 and not beside)
-                    if rank > 1 and o <= slack:
-                        o = f64(0.0)
-                    closer = wp.abs(spot[2]) < height or (wp.abs(spot[2]) == height and f < best)
-                    closer = rank > best_rank or (closer and rank == best_rank)
-                    if rank >= 0 and (o < off or best < 0 or (o == off and closer)):
-                        best = f
-                        place = spot
-                        off = o
-                        height = wp.abs(spot[2])
-                        best_rank = rank
-                        loose = near
+                if free and wp.length_sq(facing) == f64(0.0):
+                    facing = opposite(facets, t, world, item, trio[item])
+                seat = offer(mas, at, t, world, c, point, f, x, pad, left, anchored, facing, settling, seat)
                 if free and crosses(mas, t, world, f, x, x0):
                     through = True
-            if loose and not entered:
-                best = -1  # it passed no side of the body
-            if best >= 0 and off > f64(0.0) and not anchored:
+            if seat.loose and not seat.entered:
+                seat.facet = -1  # it passed no side of the body
+            if seat.facet >= 0 and seat.off > f64(0.0) and not anchored:
                 query = wp.bvh_query_aabb(mas.tree, down(wp.min(x, x0) - wide), up(wp.max(x, x0) + wide), root)
                 while wp.bvh_query_next(query, index):
                     if in_front(mas, t, world, index - world * mas.count, x, pad):
-                        best = -1  # beside a facet, and outside of the body
-        if best >= 0:
-            sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, best, place, shift, settling)
-            most = mas.limit[best] * wp.where(off > f64(OUTER), f64(LOST), f64(1.0))
+                        seat.facet = -1  # beside a facet, and outside of the body
+        if seat.facet >= 0:
+            sit(con, mas, facets, his, seats, clock, at, t, v_n, world, c, q, item, point, seat.facet, seat.spot, shift,
+                settling)  # fmt: skip
+            most = mas.limit[seat.facet] * wp.where(seat.off > f64(OUTER), f64(LOST), f64(1.0))
             if t.depth[world, point] > most:
                 t.seat[world, point] = THROUGH
         elif through:
