@@ -167,8 +167,9 @@ class PairTables(FacetTables[PairContact]):
             m.cache["pair masters"] = {
                 "of": put(self.of, wp.int32),
                 "sign": put([1.0 if c.slave is c.first else -1.0 for c in self.contacts], wp.float64),
-                "bodies": put([[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts],
-                              wp.vec2i),
+                "bodies": put(
+                    [[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts], wp.vec2i
+                ),
                 "conn": put(self.master_conn.T, wp.int32),
                 "shape": put(np.moveaxis(whole("shape"), 0, 2), m.types.T),
                 "rise": put(np.moveaxis(whole("rise"), 0, 2), m.types.T),
