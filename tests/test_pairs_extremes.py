@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import warpfea as wf
+from warpfea.model.contact_points import corner_points
+from warpfea.model.pairs import pair_points
 
 G, SIDE = 9.81, 0.1
 
@@ -179,3 +181,14 @@ def test_a_slender_block_tips_at_its_angle(ratio):
     sim.step(250)
     moved = sim.displacements(block)[0, :, 0].max()
     assert moved < 1e-3 if ratio < 1.0 else moved > 0.02
+
+
+@pytest.mark.parametrize("element", ["T4", "T10", "H3843"])
+def test_three_points_of_each_face_turn_outward(element):
+    b = wf.ModelBuilder()
+    body = box(b, "block", (0.1, 0.2, 0.3), (2, 1, 1), (0, 0, 0), element=element)
+    p = pair_points(body.surface("z-"))
+    a, c, d = (p.X[np.arange(len(p.X)), k] for k in corner_points(p).T)
+    n = np.cross(c - a, d - a)
+    assert np.einsum("fk,fk->f", n, p.normal[:, 0]) == pytest.approx(np.linalg.norm(n, axis=1))
+    assert np.linalg.norm(n, axis=1).min() > 0.0
