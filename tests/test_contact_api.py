@@ -247,7 +247,7 @@ def test_static_friction_follows_where_it_was_equal():
     ("pad.restitution", [1.0, 0.0], r"restitution = 0.0 in world 1 must be above 0 and at most 1"),
     ("pad.restitution", 1.1, r"restitution = 1.1"), ("pad.stiffness", 0, r"stiffness = 0.0 .* a positive factor"),
     ("floor.offset", np.inf, r"collider 'floor': offset = inf"),
-    ("pad.nu", 1, r"'pad.nu' is unknown; there are: 'pad.mu'.* 'floor.offset'; did you mean 'pad.mu'"),
+    ("pad.nu", 1, r"'pad.nu' is unknown; there are: 'pad.mu'.* 'floor.offset'.*; did you mean"),
     ("floor.mu", 1, r"'floor.mu' is unknown"), ("pad", 1, "'pad' is unknown"), (3, 1, "3 is unknown"),
 ])  # fmt: skip
 def test_bad_parameters_are_refused(name, value, text):

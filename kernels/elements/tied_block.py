@@ -23,7 +23,7 @@ def tied_struct(dtype: str):
         second: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
         X_first: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
         X_second: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
-        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A; k counts within the run of ties that it couples
+        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the run of ties that it couples; or world by world
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
         contribution_offset: wp.int32

@@ -89,7 +89,7 @@ class PairTables(FacetTables[PairContact]):
         """Upload; `pool`: the first entry of the term in the pool."""
         self.pool = self._build_facets(pool)
         self.data = contact_struct(False)()
-        self._put_laws(self.data, [self._numbers(c, region) for c, region in zip(self.contacts, self.regions)])
+        self._put_laws(self.data, [self.numbers(c) for c in self.contacts])
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
         )
@@ -98,9 +98,9 @@ class PairTables(FacetTables[PairContact]):
         self.master_conn = self._master_conn()
         self.size = self.model.size
 
-    def _numbers(self, contact: PairContact, region: float) -> dict[str, float]:
-        """Constants of a law, see `_put_laws`."""
-        row = pair_numbers(contact, region)
+    def numbers(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
+        region = self.regions[self.number[contact.index]]
+        row = pair_numbers(contact, region, self.model.parameters.modulus(world))
         return row | {"normal_damping": normal_damping(row["modulus"], row["mass"])}
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
