@@ -13,7 +13,7 @@ import warp as wp
 from ..common.types import kernel_module, precision
 from .load import load_functions, local_type
 from .matrix import UNROLL, panels_of, row_of, rows_type
-from .tied_block import tied_struct
+from .tied_block import coupling_function, tied_struct
 
 __all__ = ["tied_kernels"]
 
@@ -38,6 +38,7 @@ def tied_kernels(
     name = f"tied_{dtype}_{slots}_{ties}_{width}{'_midpoint' if midpoint else ''}{'_worlds' if worlds else ''}"
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
+    coupled = coupling_function(dtype, worlds)
     Local = local_type(dtype, slots)
     load, store = load_functions(dtype, slots, Block)
     Ties = wp.types.vector(length=ties, dtype=T)
@@ -97,14 +98,6 @@ def tied_kernels(
             return T(0.5) * x
         else:
             return x
-
-    @wp.func
-    def coupled(block: Block, tie: int, k: int, world: int, elem: int) -> T:
-        """An entry of A."""
-        if wp.static(worlds):
-            return block.coupling[tie, k, world * block.count + elem]
-        else:
-            return block.coupling[tie, k, elem]
 
     @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:

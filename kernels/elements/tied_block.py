@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["tied_struct"]
+__all__ = ["coupling_function", "tied_struct"]
 
 
 @functools.cache
@@ -32,3 +32,19 @@ def tied_struct(dtype: str):
         count: wp.int32
 
     return TiedBlock
+
+
+@functools.cache
+def coupling_function(dtype: str, worlds: bool) -> wp.Function:
+    """The device function of an entry of A; `worlds`: of a world's own."""
+    T, Block = precision(dtype).T, tied_struct(dtype)
+
+    @wp.func
+    def coupled(block: Block, tie: int, k: int, world: int, elem: int) -> T:
+        """Entry k of the run of ties that a tie is in."""
+        if wp.static(worlds):
+            return block.coupling[tie, k, world * block.count + elem]
+        else:
+            return block.coupling[tie, k, elem]
+
+    return coupled

@@ -14,11 +14,13 @@ __all__ = ["chosen_worlds", "on_host", "per_world", "refuse"]
 
 def on_host(values: Any) -> np.ndarray:
     """Values of the host or of a device, of Warp or of what shares its memory. TypeError, ValueError: neither."""
-    if hasattr(values, "__cuda_array_interface__"):
-        values = wp.array(values, copy=False)
-    elif hasattr(values, "detach"):  # of PyTorch, with a gradient
-        values = values.detach()
-    return np.asarray(values.numpy() if isinstance(values, wp.array) else values)
+    if isinstance(values, wp.array):
+        values = values.numpy()
+    elif hasattr(values, "detach"):  # of PyTorch
+        values = values.detach().cpu().numpy()
+    elif hasattr(values, "__cuda_array_interface__"):
+        values = wp.array(values, copy=False).numpy()
+    return np.asarray(values)
 
 
 def chosen_worlds(what: str, mask: Any, worlds: int) -> np.ndarray:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from .discretisation import Discretisation
     from .handles import SurfaceSet
-    from .model import Model
 
 __all__ = ["MaterialParameters"]
 
@@ -63,7 +62,7 @@ class MaterialParameters:
         changes: (worlds,) how often values of a world were written; `version`: how often any were.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Any) -> None:
         self.model = model
         self.values: dict[tuple[int, int, str], np.ndarray] = {}
         self.begun = False

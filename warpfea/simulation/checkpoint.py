@@ -80,7 +80,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "worlds": sim.model.worlds,
         "slots": sim.model.slots,
         "integrator": sim.integrator.label,
-        "gravity": sim.model.terms.dead.gravity_host.tolist(),
+        "gravity": sim.model.gravity.tolist(),
         "dt": sim.dt if sim.error is None else "auto",
         "steps": sim.steps,
         "max_residual": sim.max_residual,
@@ -95,6 +95,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         meta["instants"] = [instants.interval, instants.horizon, instants.origin] if instants.settled else None
     arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
     arrays |= {f"parameter.{name}": values for name, values in sim.model.parameters.numpy().items()}
+    arrays |= {f"set.{name}": array.numpy() for name, array in sim.model.terms.parameter_arrays().items()}
     arrays |= {f"total.{name}": values for name, values in sim.totals.items()}
     if sim._history:
         arrays["history"] = np.stack(sim._history)
@@ -136,8 +137,17 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         raise CheckpointError(f"{file}: iteration totals or probe records are damaged")
     try:
         sim.model.parameters.check(parameters)
+        set_arrays = sim.model.terms.parameter_arrays()
+        for name, array in set_arrays.items():
+            if f"set.{name}" in arrays and arrays[f"set.{name}"].shape != array.numpy().shape:
+                raise CheckpointError(f"the values of {name!r} are damaged")
         sim.state.load(state)
         sim.model.parameters.load(parameters)
+        for name, array in set_arrays.items():
+            if f"set.{name}" in arrays:  # not in files of before
+                array.assign(arrays[f"set.{name}"])
+        for term in sim.model.terms:
+            term.parameters_taken()
         sim.stepper.forget()
         sim.stepper.start_terms()
     except CheckpointError as error:
@@ -163,7 +173,7 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
         "slots": ("number of slots", sim.model.slots),
         "probes": ("probes", [probe.name for probe in sim.model.probes]),
         "fingerprint": ("model", sim.model.fingerprint()),
-        "gravity": ("gravity", sim.model.terms.dead.gravity_host.tolist()),
+        "gravity": ("gravity", sim.model.gravity.tolist()),
     }
     for key, (what, value) in expected.items():
         if meta.get(key) == value:

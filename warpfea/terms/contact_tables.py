@@ -79,6 +79,11 @@ class ContactTables(FacetTables[Contact]):
         """Upload; `pool`: the first entry of the term in the pool."""
         self._build_facets(pool)
         self.data = self._contacts(laws)
+        self.remember()
+
+    @property
+    def set_arrays(self) -> dict[str, wp.array]:
+        return super().set_arrays | {"grow": self.data.grow}
 
     def _contacts(self, laws: TimeLaws) -> Any:
         """The device struct."""
@@ -126,8 +131,7 @@ class ContactTables(FacetTables[Contact]):
             values = {k: v for k, v in vars(contact).items() if k not in fixed}
             h.update(f"{contact.collider.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes())
-        for name in (*PER_WORLD.values(), "beta", "grow"):
-            h.update(getattr(self.data, name).numpy().tobytes())
+        h.update(self.built)
 
 
 def law_numbers(contact: Contact, modulus_of: Modulus = effective_modulus) -> dict[str, float]:

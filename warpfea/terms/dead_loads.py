@@ -123,6 +123,13 @@ class DeadLoads(Term):
         self.gravity_host = values
         self.gravity.assign(values)
 
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return {} if self.gravity_law is not None else {"gravity": self.gravity}
+
+    def parameters_taken(self) -> None:
+        if self.gravity_law is None:
+            self.gravity_host = self.gravity.numpy().copy()
+
     def hash(self, h: Any) -> None:
         for values in self._defined_by:
             h.update(np.ascontiguousarray(values).tobytes())

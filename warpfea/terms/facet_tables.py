@@ -121,6 +121,7 @@ class FacetTables(Generic[AnyContact]):
     """
 
     data: Any
+    built: bytes
     first: np.ndarray
     row_start: np.ndarray
     shares: list[np.ndarray]
@@ -187,6 +188,15 @@ class FacetTables(Generic[AnyContact]):
     def numbers(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
         """The numbers `FROM_BODIES` of a contact, as built or in a world."""
         raise NotImplementedError
+
+    @property
+    def set_arrays(self) -> dict[str, wp.array]:
+        """What `Model.set_parameter` writes."""
+        return {name: getattr(self.data, name) for name in (*PER_WORLD.values(), "beta")}
+
+    def remember(self) -> None:
+        """Keep what was built, by which checkpoints tell whether a model is theirs."""
+        self.built = b"".join(array.numpy().tobytes() for array in self.set_arrays.values())
 
     def take_materials(self, mask: np.ndarray) -> None:
         """Constants of materials were set in the chosen worlds: so the numbers that follow from them."""

@@ -90,6 +90,7 @@ class PairTables(FacetTables[PairContact]):
         self.pool = self._build_facets(pool)
         self.data = contact_struct(False)()
         self._put_laws(self.data, [self.numbers(c) for c in self.contacts])
+        self.remember()
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
         )
@@ -193,5 +194,4 @@ class PairTables(FacetTables[PairContact]):
             values = {name: v for name, v in vars(contact).items() if name not in fixed}
             h.update(f"{contact.first.body.name} {contact.second.body.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())
-        for name in ("mu", "mu_static", "damping", "beta", "scale"):
-            h.update(getattr(self.data, name).numpy().tobytes())
+        h.update(self.built)

@@ -356,6 +356,9 @@ class Pairs(PairSolves):
         more = f" and {len(names) - 3} more" if len(names) > 3 else ""
         return f"; in touch: contact {', '.join(names[:3])}{more}" if names else ""
 
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return self.tables.set_arrays
+
     def take_materials(self, mask: np.ndarray) -> None:
         self.tables.take_materials(mask)
 

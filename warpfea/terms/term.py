@@ -368,6 +368,13 @@ class Term:
         """What else is to be told of the last attempt at a refused step of a world; "" for nothing."""
         return ""
 
+    def parameter_arrays(self) -> Mapping[str, wp.array]:
+        """What `parameters` write, by names of the term's own: arrays that checkpoints hold and a resumed run gets."""
+        return {}
+
+    def parameters_taken(self) -> None:
+        """`parameter_arrays` were written from a checkpoint."""
+
     def take_materials(self, mask: np.ndarray) -> None:
         """Constants of materials (see `model.parameters`) were set in the chosen worlds (worlds,): follow them in
         place; before the first simulation arrays may be replaced by longer ones."""

@@ -268,6 +268,10 @@ class TermSet:
         hint = did_you_mean(name, known)
         raise ModelError(f"set_parameter: parameter {name!r} is unknown; there are: {listing(known)}{hint}")
 
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        """What is set by `set_parameter` of terms, by "term name"."""
+        return {f"{term.name}.{name}": a for term in self.all for name, a in term.parameter_arrays().items()}
+
     # for one simulation
 
     def allocate(self, work: Workspace, at: At) -> None:
