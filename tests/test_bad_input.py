@@ -151,7 +151,6 @@ def test_bad_input(case, tmp_path, monkeypatch):
 
 LATER = {
     "add_contact": lambda b, s: b.add_contact(s),
-    "set_parameter": lambda b, s: b.finalize(device="cpu").set_parameter("bar.E", 1.0),
 }
 
 

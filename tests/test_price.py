@@ -63,6 +63,6 @@ def test_a_scene_is_priced_as_in_the_table(tmp_path, capfd):
 def test_what_is_forced_in_is_all_that_the_scene_leaves_out():
     (case,) = [case for case in cases() if case.label == "slider_crank"]
     row = measure(case, device="cpu", steps=1, repeat=1)
-    missing = set(case.scene().finalize(device="cpu").info()["left_out"]) - {"materials per world"}
+    missing = set(case.scene().finalize(device="cpu").info()["left_out"])
     assert set(row.forced) == missing
     assert row.left == []

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
@@ -19,6 +20,15 @@ FORMS = ("incremental", "rate", "explicit")
 """How damping is taken in a step."""
 
 Density = float | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
+
+
+LIMITS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "nu": (lambda v: (v > -1.0) & (v < 0.5), "between -1 and 0.5, both excluded"),
+    **dict.fromkeys(("E", "mu", "mu10", "k"), (lambda v: v > 0.0, "positive, Pa")),
+    "mu01": (lambda v: v >= 0.0, "0 or above, Pa"),
+    **dict.fromkeys(("eta", "lambda_v"), (lambda v: v >= 0.0, "0 or above, Pa s")),
+}
+"""Which finite values a constant may have, and what to say of others."""
 
 
 def _positive(owner: str, **values: float) -> None:
@@ -81,9 +91,16 @@ class KelvinVoigt:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Base of the laws: a density, which statics without gravity does without, and optional damping."""
+    """Base of the laws: a density, which statics without gravity does without, and optional damping.
+
+    `own` names the constants that worlds may have values of: numbers from which `coefficients` follow by operations
+    that arrays know as well.
+    """
 
     law: ClassVar[str]
+    own: ClassVar[tuple[str, ...]] = ()
+    _made_of: ClassVar[dict[str, Any]] = {}
+    _options: ClassVar[dict[str, Any]] = {}
     density: Any = field(default=None, kw_only=True)
     damping: KelvinVoigt | None = field(default=None, kw_only=True)
 
@@ -94,6 +111,39 @@ class Material:
             name = cls.__name__
             raise ModelError(f"{name}: E and nu are not its constants; {name}.from_E_nu(E=, nu=) takes them")
         return super().__new__(cls)
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """Numbers of the law and of the damping by name; a law made by `from_E_nu` has E and nu in place of its own."""
+        out = self._made_of or {name: getattr(self, name) for name in self.own}
+        return out | ({"eta": self.damping.eta, "lambda_v": self.damping.lambda_v} if self.damping else {})
+
+    def with_constants(self, values: Mapping[str, Any]) -> Self:
+        """The material with other `constants`, which are not checked; arrays stand for a value in each world."""
+        out = copy.copy(self)
+        rates = {name: values[name] for name in ("eta", "lambda_v") if name in values}
+        if rates:
+            damping = copy.copy(self.damping)
+            vars(damping).update(rates)
+            vars(out)["damping"] = damping
+        mine = {name: value for name, value in values.items() if name not in rates}
+        if self._made_of:
+            vars(out)["_made_of"] = self._made_of | mine
+            mine = self._from_E_nu(**out._made_of, **self._options)
+        vars(out).update(mine)
+        return out
+
+    @classmethod
+    def _made(cls, E: float, nu: float, *, density: Any, damping: KelvinVoigt | None, **options: float) -> Self:
+        """The material of E and nu at rest, which it remembers."""
+        out = cls(**cls._from_E_nu(E, nu, **options), density=density, damping=damping)
+        vars(out).update(_made_of={"E": E, "nu": nu}, _options=options)
+        return out
+
+    @staticmethod
+    def _from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
+        """A law's own constants."""
+        raise NotImplementedError
 
     def coefficients(self) -> tuple[float, float, float]:
         """Device coefficients of the law."""
@@ -128,6 +178,7 @@ class SVK(Material):
     E: float
     nu: float
     law: ClassVar[str] = "svk"
+    own: ClassVar[tuple[str, ...]] = ("E", "nu")
 
     def __post_init__(self) -> None:
         _positive("SVK", E=self.E)
@@ -168,6 +219,7 @@ class MooneyRivlin(Material):
     mu01: float
     k: float
     law: ClassVar[str] = "mooney_rivlin"
+    own: ClassVar[tuple[str, ...]] = ("mu10", "mu01", "k")
 
     def __post_init__(self) -> None:
         _positive("MooneyRivlin", k=self.k, mu10=self.mu10)
@@ -184,9 +236,12 @@ class MooneyRivlin(Material):
         _check_nu("MooneyRivlin", nu)
         if not 0.0 <= ratio < 1.0:
             raise ModelError(f"MooneyRivlin: ratio = {ratio!r} must lie in [0, 1)")
-        half = E / (4.0 * (1.0 + nu))
-        k = E / (3.0 * (1.0 - 2.0 * nu))
-        return cls(mu10=half * (1 - ratio), mu01=half * ratio, k=k, density=density, damping=damping)
+        return cls._made(E, nu, ratio=ratio, density=density, damping=damping)
+
+    @staticmethod
+    def _from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
+        ratio, half = options["ratio"], E / (4.0 * (1.0 + nu))
+        return {"mu10": half * (1 - ratio), "mu01": half * ratio, "k": E / (3.0 * (1.0 - 2.0 * nu))}
 
     @property
     def lame(self) -> tuple[float, float]:
@@ -213,6 +268,7 @@ class NeoHookean(Material):
     mu: float
     k: float
     law: ClassVar[str] = "neo_hookean"
+    own: ClassVar[tuple[str, ...]] = ("mu", "k")
 
     def __post_init__(self) -> None:
         _positive("NeoHookean", mu=self.mu, k=self.k)
@@ -224,7 +280,11 @@ class NeoHookean(Material):
         """From Young's modulus and Poisson's ratio at rest."""
         _positive("NeoHookean", E=E)
         _check_nu("NeoHookean", nu)
-        return cls(mu=E / (2.0 * (1.0 + nu)), k=E / (3.0 * (1.0 - 2.0 * nu)), density=density, damping=damping)
+        return cls._made(E, nu, density=density, damping=damping)
+
+    @staticmethod
+    def _from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
+        return {"mu": E / (2.0 * (1.0 + nu)), "k": E / (3.0 * (1.0 - 2.0 * nu))}
 
     @property
     def lame(self) -> tuple[float, float]:

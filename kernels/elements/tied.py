@@ -13,13 +13,15 @@ import warp as wp
 from ..common.types import kernel_module, precision
 from .load import load_functions, local_type
 from .matrix import UNROLL, panels_of, row_of, rows_type
-from .tied_block import tied_struct
+from .tied_block import coupling_function, tied_struct
 
 __all__ = ["tied_kernels"]
 
 
 @functools.cache
-def tied_kernels(dtype: str, slots: int, ties: int, width: int, midpoint: bool = False) -> _types.SimpleNamespace:
+def tied_kernels(
+    dtype: str, slots: int, ties: int, width: int, midpoint: bool = False, worlds: bool = False
+) -> _types.SimpleNamespace:
     """Kernels of tied elements; they take the arguments of `element_kernels`, so that one loop launches both.
 
     Args:
@@ -28,13 +30,15 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int, midpoint: bool =
         width: A couples the ties of each run of `width`.
         midpoint: of the conserving scheme: u is half-way through the step, v half of what u changes by; the shears in
             forces and products are the mean of those at both ends, and the energy is that at the end.
+        worlds: A of each world, those of one next to each other.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Block = tied_struct(dtype)
-    name = f"tied_{dtype}_{slots}_{ties}_{width}{'_midpoint' if midpoint else ''}"
+    name = f"tied_{dtype}_{slots}_{ties}_{width}{'_midpoint' if midpoint else ''}{'_worlds' if worlds else ''}"
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
+    coupled = coupling_function(dtype, worlds)
     Local = local_type(dtype, slots)
     load, store = load_functions(dtype, slots, Block)
     Ties = wp.types.vector(length=ties, dtype=T)
@@ -104,7 +108,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int, midpoint: bool =
             total = T(0.0)
             first = (t / W) * W
             for k in range(W):
-                total += block.coupling[t, k, elem] * e[first + k]
+                total += coupled(block, t, k, world, elem) * e[first + k]
             s[t] = mu * total
         return s
 
@@ -239,7 +243,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int, midpoint: bool =
                 row = vec3()
                 first = (t / W) * W
                 for k in range(W):
-                    row += block.coupling[t, k, elem] * b[first + k]
+                    row += coupled(block, t, k, world, elem) * b[first + k]
                 K += wp.outer(b[t], row)
             entry = block.contribution_offset + i * block.count + elem
             contribution[world, entry] = half(mu) * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
@@ -299,7 +303,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int, midpoint: bool =
         first = (tie / W) * W
         s = T(0.0)
         for k in range(W):
-            s += block.coupling[tie, k, elem] * lines[world, 2 * NT + first + k, elem][0]
+            s += coupled(block, tie, k, world, elem) * lines[world, 2 * NT + first + k, elem][0]
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         if mixed[world] == 2:
             mu = T(0.0)  # no geometric part
@@ -337,7 +341,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int, midpoint: bool =
             first = (t / W) * W
             s = T(0.0)
             for k in range(W):
-                s += block.coupling[t, k, elem] * change[first + k]
+                s += coupled(block, t, k, world, elem) * change[first + k]
             da = s * lines[world, t, elem]
             dd = s * lines[world, NT + t, elem]
             if form != 1:
@@ -404,7 +408,7 @@ def tied_kernels(dtype: str, slots: int, ties: int, width: int, midpoint: bool =
                 x, y, z = Row(), Row(), Row()
                 for k in range(W):
                     other = 3 * (NT * panel + (t / W) * W + k)
-                    c = mu * block.coupling[t, k, elem]
+                    c = mu * coupled(block, t, k, world, elem)
                     x = x + c * B[other]
                     y = y + c * B[other + 1]
                     z = z + c * B[other + 2]

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["tied_struct"]
+__all__ = ["coupling_function", "tied_struct"]
 
 
 @functools.cache
@@ -23,7 +23,7 @@ def tied_struct(dtype: str):
         second: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
         X_first: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
         X_second: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
-        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A; k counts within the run of ties that it couples
+        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the run of ties that it couples; or world by world
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
         contribution_offset: wp.int32
@@ -32,3 +32,19 @@ def tied_struct(dtype: str):
         count: wp.int32
 
     return TiedBlock
+
+
+@functools.cache
+def coupling_function(dtype: str, worlds: bool) -> wp.Function:
+    """The device function of an entry of A; `worlds`: of a world's own."""
+    T, Block = precision(dtype).T, tied_struct(dtype)
+
+    @wp.func
+    def coupled(block: Block, tie: int, k: int, world: int, elem: int) -> T:
+        """Entry k of the run of ties that a tie is in."""
+        if wp.static(worlds):
+            return block.coupling[tie, k, world * block.count + elem]
+        else:
+            return block.coupling[tie, k, elem]
+
+    return coupled

@@ -10,7 +10,7 @@ from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SMALL, kernel_module, precision
 from .contact import IDLE
 from .contact_colliders import MESHES, collider_functions
-from .contact_data import RECORD, attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
+from .contact_data import RECORD, attempt_struct, clock_struct, contact_struct, facet_struct, history_struct, of_world
 from .contact_laws import PAPER, SMOOTH, law_functions
 from .contact_touch import touch_functions
 
@@ -93,7 +93,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if con.dead[c] == 0:
             t = in_plane(t, at.plane[world, rec])
         change = t.depth - at.depth[world, point]
-        spring = elastic(con.lumped[c], con.scale[world, c] * con.normal[c], t.depth)
+        spring = elastic(con.lumped[c], con.scale[world, c] * of_world(con.normal, world, c), t.depth)
         normal = t.law[0]
         pulled = friction_force(con, world, c, t, held, inv_h)
         w = pull(con, world, c, t, held, inv_h)

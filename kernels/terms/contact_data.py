@@ -7,11 +7,18 @@ import warp as wp
 from ..common.types import precision
 from .contact_mesh import mesh_struct
 
-__all__ = ["RECORD", "attempt_struct", "clock_struct", "contact_struct", "facet_struct", "history_struct"]
+__all__ = ["RECORD", "attempt_struct", "clock_struct", "contact_struct", "facet_struct", "history_struct",
+           "of_world"]  # fmt: skip
 
 RECORD = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "normal_force", "slip", "area",
           "stick", "stored", "loss", "friction", "collider_work", "penetration")  # fmt: skip
 """What is summed per contact over its points; of the last the largest. Slip and stick are weighted by area."""
+
+
+@wp.func
+def of_world(table: wp.array2d(dtype=wp.float64), world: int, contact: int) -> wp.float64:
+    """A number of a contact in a world, from a table [world, contact], or [0, contact] where it is the same in all."""
+    return table[world % table.shape[0], contact]
 
 
 @functools.cache
@@ -24,10 +31,10 @@ def contact_struct(meshes: bool):
         lumped: wp.array(dtype=wp.int32)  # one contact at the deepest point
         dead: wp.array(dtype=wp.int32)  # the force of the last state
         first: wp.array(dtype=wp.int32)  # [contact + 1] its first point
-        normal: wp.array(dtype=wp.float64)  # k_n; of lumped contacts over sqrt(delta)
-        tangent: wp.array(dtype=wp.float64)  # k_t, likewise
-        normal_damping: wp.array(dtype=wp.float64)  # gamma_n over -beta; of lumped contacts over delta^(1/4)
-        mass: wp.array(dtype=wp.float64)  # m_eff, kg
+        normal: wp.array2d(dtype=wp.float64)  # [world or 0, contact] k_n; of lumped contacts over sqrt(delta)
+        tangent: wp.array2d(dtype=wp.float64)  # k_t, likewise
+        normal_damping: wp.array2d(dtype=wp.float64)  # gamma_n over -beta; of lumped contacts over delta^(1/4)
+        mass: wp.array2d(dtype=wp.float64)  # m_eff, kg
         ramp: wp.array(dtype=wp.float64)  # m
         force_eps: wp.array(dtype=wp.float64)  # N
         speed_eps: wp.array(dtype=wp.float64)  # m/s

@@ -8,7 +8,7 @@ import warp as wp
 
 from ..common.types import precision
 from .contact_colliders import collider_functions
-from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct
+from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct, of_world
 from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
 from .contact_mesh import MESH
 
@@ -136,12 +136,12 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         """Damping per depth of the normal law: chi/h, or gamma_n/h."""
         if con.law[c] == DEFAULT:
             return con.damping[world, c] * inv_h / at.speed[world, point]
-        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * con.normal_damping[c] * inv_h
+        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * of_world(con.normal_damping, world, c) * inv_h
 
     @wp.func
     def tangent_damping(con: Contacts, world: int, c: int, stiffness: f64) -> f64:
         """gamma_t of Eq. (80), N s/m."""
-        return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(con.mass[c] * stiffness)
+        return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(of_world(con.mass, world, c) * stiffness)
 
     @wp.func
     def in_plane(t: Touch, m: vec3d) -> Touch:
@@ -189,7 +189,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if change[1] != f64(0.0):
             out.depth = before + change[0] + (begins - at.reach[world, point])
         rate = rate_of(con, at, world, c, point, inv_h)
-        k_n = con.scale[world, c] * con.normal[c]
+        k_n = con.scale[world, c] * of_world(con.normal, world, c)
         led = depth_before(con, facets, his, at, world, c, point)
         out.law = normal_law(con.law[c], con.lumped[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
                              led)  # fmt: skip
@@ -222,9 +222,9 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         v_t = v - v_n_rel * n
         beta = con.beta[world, c]
         scale = con.scale[world, c]
-        spring = elastic(con.lumped[c], scale * con.normal[c], delta)[0]
-        gamma = beta * wp.sqrt(scale) * con.normal_damping[c]
-        k_t = scale * con.tangent[c]
+        spring = elastic(con.lumped[c], scale * of_world(con.normal, world, c), delta)[0]
+        gamma = beta * wp.sqrt(scale) * of_world(con.normal_damping, world, c)
+        k_t = scale * of_world(con.tangent, world, c)
         if con.lumped[c] != 0:
             gamma *= wp.sqrt(wp.sqrt(delta))
             k_t *= wp.sqrt(delta)
@@ -246,7 +246,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         rec = record_of(con, c, point)
         mu = coefficient(con, his, world, c, rec)
         live = his.speed[world, rec] > f64(0.0)
-        stiffness = con.scale[world, c] * con.tangent[c]
+        stiffness = con.scale[world, c] * of_world(con.tangent, world, c)
         shrink = f64(1.0)
         if con.lumped[c] != 0:
             depth = wp.max(t.depth, f64(0.0))

@@ -9,7 +9,7 @@ from ..common.types import SMALL, kernel_module
 from .contact import IDLE
 from .contact_books import BOOKED, SUMS
 from .contact_colliders import SLIPS
-from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
+from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct, of_world
 from .contact_laws import PAPER, law_functions
 from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
@@ -143,12 +143,12 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
                 normal = wp.dot(force, s.m)
                 pulled = normal * s.m - force
                 kept = at.dead_spring[world, point]
-                held = vec3d(coefficient(con, his, world, c, point) * normal, con.scale[world, c] * con.tangent[c],
-                             f64(1.0))  # fmt: skip
+                k_t = con.scale[world, c] * of_world(con.tangent, world, c)
+                held = vec3d(coefficient(con, his, world, c, point) * normal, k_t, f64(1.0))
                 slips = wp.where(wp.length(pulled) >= f64(0.999999) * held[0], 1, 0)
             elif normal > f64(0.0) and held[1] > f64(0.0):
                 kept = spring_after(law, s, held, w, pulled)
-            spring = elastic(0, con.scale[world, c] * con.normal[c], s.depth)
+            spring = elastic(0, con.scale[world, c] * of_world(con.normal, world, c), s.depth)
             stored = spring[1] + f64(0.5) * held[1] * wp.dot(kept, kept)
             slid = s.slip - (kept - base)
             rubbed = wp.dot(pulled - held[1] * kept, kept - base) + wp.dot(pulled, slid)

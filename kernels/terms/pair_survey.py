@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import SMALL, kernel_module
-from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct
+from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct, of_world
 from .contact_laws import PAPER, law_functions
 from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
@@ -107,7 +107,7 @@ def survey_kernels(dtype: str) -> _types.SimpleNamespace:
         s.n = foot.n
         begins = reach(con, his, world, c, point, time[world], f64(0.0))
         s.depth = begins - (place[2] * foot.rise + foot.rest)
-        k_n = con.scale[world, c] * con.normal[c]
+        k_n = con.scale[world, c] * of_world(con.normal, world, c)
         s.law = normal_law(con.law[c], 0, k_n, f64(0.0), con.ramp[c], con.force_eps[c], s.depth, s.depth)
         if live:
             s.whole = his.spring[world, point]

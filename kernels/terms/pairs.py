@@ -14,7 +14,7 @@ import warp as wp
 from ..common.lanes import lane_functions
 from ..common.types import SMALL, kernel_module, precision
 from .contact import IDLE, LOADED, STIFF
-from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
+from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct, of_world
 from .contact_laws import law_functions
 from .contact_touch import touch_functions
 from .pair_data import master_struct, seat_struct, touching_struct
@@ -39,7 +39,7 @@ def pair_functions(dtype: str) -> _types.SimpleNamespace:
         out.n = t.normal[world, point]
         out.depth = t.depth[world, point]
         out.rise = out.depth - t.before[world, point]
-        k_n = con.scale[world, c] * con.normal[c]
+        k_n = con.scale[world, c] * of_world(con.normal, world, c)
         rate = rate_of(con, at, world, c, point, inv_h)
         out.law = normal_law(con.law[c], 0, k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
                              t.before[world, point])  # fmt: skip

@@ -178,7 +178,7 @@ def _shear_coupling(
 
 
 STATIONS = [(x, y, z) for y, z in GAUSS for x in (0.0, 0.5, 1.0)]
-SHEAR = Tying(np.array(2 * STATIONS), np.repeat([(0, 1), (0, 2)], 12, axis=0), _shear_coupling, width=12)
+SHEAR = Tying(np.array(2 * STATIONS), np.repeat([(0, 1), (0, 2)], 12, axis=0), _shear_coupling, width=12, uses=("nu",))
 
 
 def at_ends(rule: Rule) -> Rule:

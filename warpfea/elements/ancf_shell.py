@@ -69,7 +69,7 @@ def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
     """The part integrated through the thickness: plane stress, without strain across it and transverse shear."""
     m = svk_only(material)
     _, mu = m.lame
-    c = m.E / (1.0 - m.nu**2)
+    c = m.E / (1.0 - m.nu * m.nu)
     return "orthotropic", (c, c, 0.0, 0.0, 0.0, m.nu * c, 0.0, 0.0, mu)
 
 
@@ -83,7 +83,7 @@ def _thickness_stress(material: Material) -> tuple[str, tuple[float, ...]]:
     """The law of `_thickness_part` at points, for stress output."""
     m = svk_only(material)
     lam, mu = m.lame
-    c = m.E / (1.0 - m.nu**2)
+    c = m.E / (1.0 - m.nu * m.nu)
     d = lam + 2.0 * mu
     return "orthotropic", (d - c, d - c, d, lam, lam, lam - m.nu * c, 0.0, 0.0, 0.0)
 
@@ -154,6 +154,7 @@ THICKNESS = Tying(
     pairs=np.array([(2, 2)] * 4 + [(0, 0), (1, 1)] * 4),
     coupling=_thickness_coupling,
     width=12,
+    uses=("nu",),
 )
 _SIDES = box_corners(LOW, HIGH)
 

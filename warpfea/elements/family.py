@@ -26,12 +26,14 @@ class Tying:
         coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q), the
             rule, the material, the body's section) -> A (E, n, width).
         width: A couples the points of each run of `width` points.
+        uses: constants of the material that A depends on.
     """
 
     points: np.ndarray
     pairs: np.ndarray
     coupling: Callable[[np.ndarray, np.ndarray, np.ndarray, Rule, Any, Any], np.ndarray]
     width: int
+    uses: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

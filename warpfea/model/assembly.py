@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from ..base.errors import MeshError, ModelError
 from ..elements import Part, Rule
 from ..elements.family import Tying
 from ..elements.quadrature import composite
+from ..kernels.elements.materials import NCOEF
 from ..materials import Material
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
@@ -234,19 +235,34 @@ def body_mass(body: Discretisation) -> sp.csr_matrix:
     return total
 
 
+def law_of(integral: Part, material: Material) -> tuple[str, tuple[Any, ...]]:
+    """The device law of a part of the energy, and its coefficients; arrays where those of the material are."""
+    law, values = integral.law(material) if integral.law else (material.law, material.coefficients())
+    assert law is not None
+    return law, values
+
+
+def coefficient_rows(values: Sequence[Any], material: Material, worlds: int = 1) -> np.ndarray:
+    """(worlds, NCOEF) coefficients as the device reads them, those of the damping last."""
+    rows = np.zeros((worlds, NCOEF))
+    for k, value in enumerate(values):
+        rows[:, k] = value
+    if material.damping:
+        rows[:, -2], rows[:, -1] = material.damping.eta, material.damping.lambda_v
+    return rows
+
+
 def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
     """The elements of a body by key; `tables`: straight elements get tables of h_i as well, like curved ones."""
     flat = straight(body)
     for k, (_, material) in enumerate(body.materials):
         damping = material.damping.form if material.damping else None
-        if material.damping and material.damping.eta == 0.0 and material.damping.lambda_v == 0.0:
-            damping = None
         for is_flat, rule in ((True, body.rule), (False, body.curved_rule)):
             chosen = (body.material_of == k) & (flat == is_flat)
             members = body.element_order[chosen[body.element_order]]
             if len(members):
                 for part, integral in enumerate(body.family.scheme(rule)):
-                    law, values = integral.law(material) if integral.law else (material.law, material.coefficients())
+                    law, values = law_of(integral, material)
                     key = BlockKey(
                         body.family.name,
                         rule,
@@ -265,42 +281,6 @@ def element_volumes(body: Discretisation) -> np.ndarray:
     every = np.arange(len(body.mesh.cells))
     parts = [geometry(body, part, rule.points)[3] @ rule.weights for part in chunks(body, every, len(rule.weights))]
     return np.concatenate(parts)
-
-
-@dataclass(eq=False)
-class TiedTables:
-    """Tables of elements with tied strains e_t = x_a . x_b - X_a . X_b (see kernels/elements/tied.py).
-
-    Attributes:
-        first, second: (E, n, S) derivatives of s_i along a and b at the tying points.
-        X_first, X_second: (E, n, 3) X_a and X_b.
-        coupling: (E, n, width) A of the energy (mu/2) e.A e.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    X_first: np.ndarray
-    X_second: np.ndarray
-    coupling: np.ndarray
-
-
-def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
-    """Tables of the tied part of some elements of a block."""
-    part, body = host.key.integral, host.body
-    tying = part.tying
-    assert tying is not None
-    _, ds, J, _ = geometry(body, elements, tying.points)
-    along = J
-    if part.framed:
-        along = orthonormal(J)
-        ds = gradients(ds, J) @ along
-    t = np.arange(len(tying.points))
-    a, b = tying.pairs.T
-    _, _, J_rule, det = geometry(body, elements, part.rule.points)
-    coupling = tying.coupling(J, J_rule, det, part.rule, body.materials[host.material][1], body.section)
-    first, second = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
-    X_first, X_second = (np.moveaxis(along[:, t, :, k], 0, 1) for k in (a, b))
-    return TiedTables(first, second, X_first, X_second, coupling)
 
 
 def orthonormal(J0: np.ndarray) -> np.ndarray:

@@ -11,20 +11,24 @@ import warp as wp
 from .. import elements
 from ..kernels.elements.cluster import cluster_size
 from ..kernels.elements.element import element_kernels
-from ..kernels.elements.materials import ANY_J, NCOEF
+from ..kernels.elements.materials import ANY_J
 from ..kernels.elements.mixed import mixed_product
 from ..kernels.elements.points import block_struct
 from ..kernels.elements.tied import tied_kernels
 from ..kernels.elements.tied_block import tied_struct
 from ..kernels.elements.with_mass import with_mass_kernel
 from . import assembly
+from .tied_tables import tied_tables
 
-__all__ = ["Block", "build_block", "output_block"]
+__all__ = ["Block", "build_block", "output_block", "output_rows"]
 
 
 @dataclass(eq=False)
 class Block:
-    """Elements that one kernel does: their kind, device data, and where they came from."""
+    """Elements that one kernel does: their kind, device data, and where they came from.
+
+    `coupled`: each world has its own couplings of assumed strains.
+    """
 
     key: assembly.BlockKey
     data: Any
@@ -38,6 +42,7 @@ class Block:
     cluster: int
     field_rule: Any = None
     output: Any = None
+    coupled: bool = False
 
     @property
     def connectivity(self) -> np.ndarray:
@@ -53,7 +58,7 @@ class Block:
         """The kernels of this kind of element with another form of damping; `midpoint`: of the conserving scheme."""
         k = self.key
         if k.tying and midpoint:
-            return tied_kernels(dtype, self.slots, self.points, k.tying.width, midpoint)
+            return tied_kernels(dtype, self.slots, self.points, k.tying.width, midpoint, self.coupled)
         if k.tying:
             return self.kernels
         if midpoint:
@@ -61,6 +66,12 @@ class Block:
                 dtype, k.law, self.slots, self.points, k.affine, mean_damping(damping), k.framed, midpoint
             )
         return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
+
+    def take_couplings(self, dtype: str) -> None:
+        """Use the kernels that read couplings of each world."""
+        assert self.key.tying is not None
+        self.coupled = True
+        self.kernels = tied_kernels(dtype, self.slots, self.points, self.key.tying.width, False, True)
 
     def mixed_product(self, dtype: str) -> wp.Kernel:
         """The kernel of K p with the stress of the linear prediction, without viscosity."""
@@ -113,16 +124,10 @@ def build_block(
 def output_block(model: Any, block: Block, scheme: str) -> Block:
     """Elements of a tied block with their strains at the points of an output scheme."""
     key = replace(block.key, scheme=scheme, part=0, law="orthotropic", framed=True)
-    part = key.integral
-    assert part.law is not None
-    parts, rows = [], []
-    for host in block.parts:
-        _, values = part.law(host.body.materials[host.material][1])
-        parts.append(assembly.HostBlock(key, host.body, host.elements, host.material, values))
-        rows.append(np.pad(values, (0, NCOEF - len(values))))
+    parts = [assembly.HostBlock(key, host.body, host.elements, host.material, ()) for host in block.parts]
     data = block_struct(model.dtype)()
     data.conn, data.is_position, data.count = block.data.conn, block.data.is_position, block.count
-    data.coefficients = model.array("output", np.array(rows)[None], model.types.T)
+    data.coefficients = model.array("output", output_rows(model, block), model.types.T)
     index = np.concatenate([np.full(len(p.elements), k) for k, p in enumerate(parts)])
     data.material = model.array("output", index, wp.int32)
     _point_tables(model, data, key, parts)
@@ -131,11 +136,25 @@ def output_block(model: Any, block: Block, scheme: str) -> Block:
     return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster)
 
 
+def output_rows(model: Any, block: Block) -> np.ndarray:
+    """(worlds or 1, parts, NCOEF) coefficients of the elements of an output block."""
+    scheme = block.key.output_scheme
+    assert scheme is not None
+    integral = replace(block.key, scheme=scheme, part=0).integral
+    worlds = model.coefficients.shape[0]
+    rows = []
+    for host in block.parts:
+        material = model.parameters.of_worlds(host.body, host.material)
+        _, values = assembly.law_of(integral, material)
+        rows.append(assembly.coefficient_rows(values, material, worlds))
+    return np.stack(rows, axis=1)
+
+
 def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
     """Tables of elements with tied strains."""
     T, vec3 = model.types.T, model.types.vec3
     tables = [
-        assembly.tied_tables(part, members)
+        tied_tables(part, members)
         for part in parts
         for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from ..base.checks import is_count
 from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_3, triangle_7
+from ..materials import Material
 from . import assembly
 from .discretisation import Discretisation
 from .handles import SurfaceSet
@@ -20,6 +21,7 @@ from .handles import SurfaceSet
 __all__ = [
     "RULES",
     "ContactPoints",
+    "Modulus",
     "body_mass_total",
     "check_points",
     "contact_points",
@@ -29,6 +31,8 @@ __all__ = [
     "points_by_rules",
 ]
 
+Modulus = Callable[[Discretisation, SurfaceSet | None], tuple[float, float]]
+"""Young's modulus, Pa, and Poisson's ratio of a body at a surface."""
 RULES: Mapping[int, Mapping[int, Rule]] = {
     3: {3: triangle_3(), 7: triangle_7()},
     4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
@@ -151,16 +155,19 @@ def check_points(surface: SurfaceSet, points: Any) -> None:
             )
 
 
-def effective_modulus(body: Discretisation, surface: SurfaceSet | None = None) -> tuple[float, float]:
+def effective_modulus(
+    body: Discretisation, surface: SurfaceSet | None = None, materials: Sequence[Material] = ()
+) -> tuple[float, float]:
     """Young's modulus, Pa, and Poisson's ratio at small strain, whatever the law.
 
     Of several materials at the faces of the surface (None: in the body) that with the largest Young's modulus counts:
-    the stiffness of a contact is one number.
+    the stiffness of a contact is one number. `materials`: those of the body in a world, by default as it was built.
     """
+    materials = materials or [material for _, material in body.materials]
     elements = slice(None) if surface is None else surface.faces[:, 0]
     pairs = []
     for k in np.unique(body.material_of[elements]):
-        lam, mu = body.materials[int(k)][1].lame
+        lam, mu = materials[int(k)].lame
         pairs.append((mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))))
     return max(pairs)
 

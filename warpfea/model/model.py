@@ -17,6 +17,7 @@ from . import assembly
 from .blocks import Block, build_block
 from .bodies import Body
 from .description import Description
+from .parameters import MaterialParameters
 from .state import State
 from .topology import free_groups, label_components, make_topology
 
@@ -79,6 +80,7 @@ class Model:
         self.types = precision(dtype)
         self._memory: dict[str, int] = {}
         self.cache: dict[str, Any] = {}
+        self.parameters = MaterialParameters(self)
         with enough_memory(f"a model with {self.worlds} worlds", self.device):
             self._build(builder, tables)
 
@@ -124,6 +126,11 @@ class Model:
         """Count the bytes of arrays made on the device under `name`."""
         for array in arrays:
             self._memory[name] = self._memory.get(name, 0) + array.size * wp.types.type_size_in_bytes(array.dtype)
+
+    def forget(self, name: str, *arrays: wp.array) -> None:
+        """Take arrays that are let go of off what is counted under `name`."""
+        for array in arrays:
+            self._memory[name] -= array.size * wp.types.type_size_in_bytes(array.dtype)
 
     def element_array(self, values: np.ndarray, dtype: Any) -> wp.array:
         """Upload a constant of elements, [..., element]: neighbours stand side by side on a GPU, where threads do
@@ -178,14 +185,11 @@ class Model:
         for body in self.bodies:
             for host in assembly.host_blocks(body, tables=tables):
                 groups.setdefault(host.key, []).append(host)
-                row = np.zeros(NCOEF)
-                row[: len(host.coefficients)] = host.coefficients
-                damping = body.materials[host.material][1].damping
-                if damping:
-                    row[-2:] = damping.eta, damping.lambda_v
                 host.row = len(rows)
-                rows.append(row)
-        self.coefficients = self.array("materials", np.array(rows)[None], self.types.T)
+                rows.append(assembly.coefficient_rows(host.coefficients, body.materials[host.material][1]))
+        self.coefficient_table = np.array(rows).reshape(1, -1, NCOEF)
+        self.coefficients = self.array("materials", self.coefficient_table, self.types.T)
+        self._built_of = self.coefficients.numpy().tobytes()
         self.blocks: list[Block] = []
         contribution, element, history = 0, 0, 0
         for key, parts in groups.items():
@@ -363,16 +367,14 @@ class Model:
         """sum multipliers_i d2c_i/dq2 times a direction (slots, 3), [world, slot, 3]; multipliers (rows,), N."""
         return self.evaluation.constraint_curvature(state, np.asarray(multipliers), np.asarray(direction))
 
-    def set_gravity(self, gravity: Any) -> None:
-        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2.
+    def set_gravity(self, gravity: Any, *, mask: Any = None) -> None:
+        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2; of the worlds that `mask` (worlds,) chooses.
 
         Raises:
             ModelError: wrong shape, a value that is not finite, a material without a density, or a model built without
                 gravity.
         """
-        if np.any(np.asarray(gravity, dtype=float)):
-            assembly.require_density(self.bodies, "gravity")
-        self.terms.dead.set_gravity(gravity)
+        self.set_parameter("gravity", gravity, mask=mask)
 
     def contact_force(self, state: State) -> np.ndarray:
         """Elastic part of the forces of contact at a state, without damping, [world, slot, 3], N; on the bodies.
@@ -386,20 +388,24 @@ class Model:
                 out += term.nodal_force(state)
         return out
 
-    def set_parameter(self, name: str, values: Any) -> None:
-        """Set a parameter in all worlds; simulations take the new values from their next step on.
+    def set_parameter(self, name: str, values: Any, *, mask: Any = None) -> None:
+        """Set a parameter in all worlds or some; simulations take the new values from their next step on.
 
         Args:
-            name: "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
+            name: "B.E" with the name B of a body, or "B.G.E" with a group G that has a material of its own: a constant
+                of the material (E and nu where it was made of them, else those of the law), or eta and lambda_v of its
+                damping, which a value of 0 leaves in. The first value of such a name precedes the simulations.
+                "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
                 ModelBuilder.add_contact; where mu_static equals mu, it follows mu. "K.offset" with the name K of a
                 collider: of a HalfSpace the offset of its plane, m; of other shapes by how much the surface lies
-                further out, m. A surface that comes to lie in a body pushes it out.
-            values: a number, or (worlds,).
+                further out, m. A surface that comes to lie in a body pushes it out. "gravity", as set_gravity.
+            values: a number, or (worlds,), on the host or on a device; of gravity (3,) or (worlds, 3).
+            mask: (worlds,), on the host or on a device: the worlds to set. None: all.
 
         Raises:
-            ModelError: an unknown name, a wrong shape, or a value out of range.
+            ModelError: an unknown name or what all worlds share, a wrong shape, or a value out of range.
         """
-        self.terms.set_parameter(name, values)
+        self.terms.set_parameter(name, values, mask)
 
     def fingerprint(self) -> str:
         """Hash of all that a checkpoint must agree with: topology, geometry, laws, precision, supports, worlds."""
@@ -415,7 +421,7 @@ class Model:
         h.update(self.reference.tobytes())
         h.update(self.free_host.tobytes())
         h.update(self.mass_host.data.tobytes())
-        h.update(self.coefficients.numpy().tobytes())
+        h.update(self._built_of)
         self.terms.hash(h)
         return h.hexdigest()
 

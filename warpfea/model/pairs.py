@@ -10,7 +10,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
-from .contact_points import ContactPoints, body_mass_total, effective_modulus, points_by_rules
+from .contact_points import ContactPoints, Modulus, body_mass_total, effective_modulus, points_by_rules
 from .contacts import ContactOptions
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
@@ -230,11 +230,11 @@ def thickness(surface: SurfaceSet) -> np.ndarray:
         return np.asarray(out.numpy(), dtype=float) * size
 
 
-def pair_numbers(contact: PairContact, area: float) -> dict[str, float]:
+def pair_numbers(contact: PairContact, area: float, modulus_of: Modulus = effective_modulus) -> dict[str, float]:
     """Constants of Eqs. (74)-(76), (79) and (80) of two bodies whose region has an area, m^2."""
     compliance = shear = mass = 0.0
     for surface in (contact.slave, contact.master):
-        E, nu = effective_modulus(surface.body, surface)
+        E, nu = modulus_of(surface.body, surface)
         compliance += (1.0 - nu**2) / E
         shear += 2.0 * (2.0 - nu) * (1.0 + nu) / E
         total = body_mass_total(surface.body)

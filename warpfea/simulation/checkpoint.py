@@ -72,6 +72,7 @@ class Checkpoint(Output):
 def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     """Write the simulation's state to `path` (.npz). OutputError if that can't be done."""
     target = check_target(path, SUFFIXES)
+    sim.stepper.take_parameters()
     meta = {
         "schema": SCHEMA,
         "fingerprint": sim.model.fingerprint(),
@@ -79,7 +80,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "worlds": sim.model.worlds,
         "slots": sim.model.slots,
         "integrator": sim.integrator.label,
-        "gravity": sim.model.terms.dead.gravity_host.tolist(),
+        "gravity": sim.model.gravity.tolist(),
         "dt": sim.dt if sim.error is None else "auto",
         "steps": sim.steps,
         "max_residual": sim.max_residual,
@@ -93,6 +94,8 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         meta["error"] = sim.error
         meta["instants"] = [instants.interval, instants.horizon, instants.origin] if instants.settled else None
     arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
+    arrays |= {f"parameter.{name}": values for name, values in sim.model.parameters.numpy().items()}
+    arrays |= {f"set.{name}": array.numpy() for name, array in sim.model.terms.parameter_arrays().items()}
     arrays |= {f"total.{name}": values for name, values in sim.totals.items()}
     if sim._history:
         arrays["history"] = np.stack(sim._history)
@@ -127,12 +130,24 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     for name in ("rough", "floored"):  # of files before they were counted
         arrays.setdefault(f"total.{name}", np.zeros(sim.model.worlds, int))
     totals = {name: arrays.get(f"total.{name}") for name in sim.totals}
+    parameters = {name.removeprefix("parameter."): a for name, a in arrays.items() if name.startswith("parameter.")}
     history = arrays.get("history", np.zeros((0, 0, 0)))
     shape = {name: None if a is None else a.shape for name, a in totals.items()}
     if any(s != (sim.model.worlds,) for s in shape.values()) or history.ndim != 3:
         raise CheckpointError(f"{file}: iteration totals or probe records are damaged")
     try:
+        sim.model.parameters.check(parameters)
+        set_arrays = sim.model.terms.parameter_arrays()
+        for name, array in set_arrays.items():
+            if f"set.{name}" in arrays and arrays[f"set.{name}"].shape != array.numpy().shape:
+                raise CheckpointError(f"the values of {name!r} are damaged")
         sim.state.load(state)
+        sim.model.parameters.load(parameters)
+        for name, array in set_arrays.items():
+            if f"set.{name}" in arrays:  # not in files of before
+                array.assign(arrays[f"set.{name}"])
+        for term in sim.model.terms:
+            term.parameters_taken()
         sim.stepper.forget()
         sim.stepper.start_terms()
     except CheckpointError as error:
@@ -158,7 +173,7 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
         "slots": ("number of slots", sim.model.slots),
         "probes": ("probes", [probe.name for probe in sim.model.probes]),
         "fingerprint": ("model", sim.model.fingerprint()),
-        "gravity": ("gravity", sim.model.terms.dead.gravity_host.tolist()),
+        "gravity": ("gravity", sim.model.gravity.tolist()),
     }
     for key, (what, value) in expected.items():
         if meta.get(key) == value:

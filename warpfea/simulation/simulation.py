@@ -117,6 +117,7 @@ class Simulation(Records):
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
                 adapt=adapt, on_compile=on_compile or bar,
             )  # fmt: skip
+        model.parameters.begun = True
         self.controls = Controls(model, self.state)
         self.compile_s = clock.perf_counter() - began
         self.error = adapt.error if adapt else None
@@ -189,6 +190,7 @@ class Simulation(Records):
         for _ in range(count):
             if self.stepper.adaptive:
                 self.stepper.adaptive.aim(self.time)
+            self.stepper.take_parameters()
             self.stepper.run()
             report = self.stepper.work.report.numpy()
             self._digest(report)

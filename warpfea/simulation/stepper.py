@@ -117,6 +117,7 @@ class Stepper:
         self._load_modules()
         self.start_terms()
         self._measure_potential(None)
+        self._version, self._changes = model.parameters.version, model.parameters.changes.copy()
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -188,6 +189,29 @@ class Stepper:
         flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
         self.newton.forget(wp.array(flags, dtype=wp.int32, device=m.device))
         self._measure_potential(flags)
+        self._changes[flags != 0] = m.parameters.changes[flags != 0]
+
+    def take_parameters(self) -> None:
+        """Follow constants of materials that were set since the last step: kept matrices, the energy of the state.
+
+        The ledger has the jump of that energy as the work of who set them, among that of fields.
+        """
+        parameters = self.model.parameters
+        if self._version == parameters.version:
+            return
+        self._version = parameters.version
+        mask = parameters.changes > self._changes
+        if not mask.any():
+            return
+        self.forget(mask)
+        if self.ledger:
+            ledger = self.state.ledger.numpy()
+            columns = list(self.model.terms.ledger)
+            strain, fields = columns.index("strain"), columns.index("work_fields")
+            energy = self.model.strain_energy(self.state)
+            ledger[mask, fields] += (energy - ledger[:, strain])[mask]
+            ledger[mask, strain] = energy[mask]
+            self.state.ledger.assign(ledger)
 
     def _measure_potential(self, flags: np.ndarray | None) -> None:
         """Strain energy of the state in the chosen worlds, by which first iterates are judged."""

@@ -357,7 +357,13 @@ class Contact(Term):
         more = f" and {len(pairs) - 3} more" if len(pairs) > 3 else ""
         return f"; in touch: contact {', '.join(pairs[:3])}{more}" if pairs else ""
 
-    def parameters(self) -> dict[str, Callable[[Any], None]]:
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return self.tables.set_arrays
+
+    def take_materials(self, mask: np.ndarray) -> None:
+        self.tables.take_materials(mask)
+
+    def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         return contact_parameters(self.tables) | collider_parameters(self.tables)
 
     def facts(self) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.terms.contact_data import contact_struct
-from ..model.contact_points import ContactPoints, body_mass_total, contact_points, effective_modulus
+from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
 from ..model.contacts import Collider, Contact
 from ..model.triangle_mesh import TriMesh
 from .collider_meshes import mesh_tables, sizes
@@ -79,6 +79,11 @@ class ContactTables(FacetTables[Contact]):
         """Upload; `pool`: the first entry of the term in the pool."""
         self._build_facets(pool)
         self.data = self._contacts(laws)
+        self.remember()
+
+    @property
+    def set_arrays(self) -> dict[str, wp.array]:
+        return super().set_arrays | {"grow": self.data.grow}
 
     def _contacts(self, laws: TimeLaws) -> Any:
         """The device struct."""
@@ -88,7 +93,7 @@ class ContactTables(FacetTables[Contact]):
         def put(name: str, values: Any, dtype: Any) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
 
-        self._put_laws(out, [law_numbers(c) for c in C])
+        self._put_laws(out, [self.numbers(c) for c in C])
         put("collider", [K.index(c.collider) for c in C], wp.int32)
         put("grow", np.zeros((m.worlds, len(K))), wp.float64)
         frames = [k.shape.frame() for k in K]
@@ -103,6 +108,9 @@ class ContactTables(FacetTables[Contact]):
         if self.meshes:
             out.mesh = mesh_tables(m, [k.shape for k in K])
         return out
+
+    def numbers(self, contact: Contact, world: int | None = None) -> dict[str, float]:
+        return law_numbers(contact, self.model.parameters.modulus(world))
 
     def _touching(self, collider: Collider) -> list[np.ndarray]:
         """Points of the surfaces that may touch a collider, (n, 3), m."""
@@ -123,13 +131,12 @@ class ContactTables(FacetTables[Contact]):
             values = {k: v for k, v in vars(contact).items() if k not in fixed}
             h.update(f"{contact.collider.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes())
-        for name in (*PER_WORLD.values(), "beta", "grow"):
-            h.update(getattr(self.data, name).numpy().tobytes())
+        h.update(self.built)
 
 
-def law_numbers(contact: Contact) -> dict[str, float]:
+def law_numbers(contact: Contact, modulus_of: Modulus = effective_modulus) -> dict[str, float]:
     """Constants of Eqs. (74)-(76), (79) and (80) with a rigid obstacle; of lumped contacts over powers of the depth."""
-    E, nu = effective_modulus(contact.body, contact.surface)
+    E, nu = modulus_of(contact.body, contact.surface)
     modulus = E / (1.0 - nu**2)
     shear = E / (2.0 * (1.0 + nu)) / (2.0 - nu)
     mass = body_mass_total(contact.body)

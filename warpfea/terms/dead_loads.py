@@ -9,7 +9,9 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
+from ..base.worlds import per_world, refuse
 from ..kernels.terms.loads import load_kernels
+from ..model.assembly import require_density
 from .term import At, Term, part
 from .time_laws import TimeLaws
 
@@ -99,27 +101,34 @@ class DeadLoads(Term):
         args = [self.start_of_slot, self.law, self.weight, w.law_stage, m.lumped, self.constant, w.step.ramp, active]
         at.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])
 
-    def set_gravity(self, gravity: Any) -> None:
-        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2.
+    def set_gravity(self, gravity: Any, mask: np.ndarray) -> None:
+        """Gravity of all chosen worlds (3,) or per world (worlds, 3), m/s^2.
 
         Raises:
-            ModelError: wrong shape, a value that is not finite, or a model built without gravity or with a law of it.
+            ModelError: wrong shape, a value that is not finite, a material without a density, or a model built without
+                gravity or with a law of it.
         """
         if self.gravity_law is not None:
             raise ModelError("the model was built with a time law of gravity, which set_gravity can't replace")
-        values = np.asarray(gravity, dtype=float)
-        shape = (self.model.worlds, 3)
-        if values.shape == (3,):
-            values = np.broadcast_to(values, shape)
-        if values.shape != shape or not np.all(np.isfinite(values)):
-            raise ModelError(f"gravity has shape {values.shape}, expected finite values of shape (3,) or {shape}")
+        values = per_world("set_gravity", "gravity", gravity, self.model.worlds, (3,))
+        refuse("set_gravity", "gravity", values, ~mask | np.isfinite(values).all(axis=1), "finite")
+        values = np.where(mask[:, None], values, self.gravity_host)
+        if np.any(values):
+            require_density(self.model.bodies, "gravity")
         if not self.present and np.any(values):
             raise ModelError(
                 "the model was built without gravity or dead loads, so their kernels were left out: build it with a "
                 "gravity that is not zero"
             )
-        self.gravity_host = values.copy()
+        self.gravity_host = values
         self.gravity.assign(values)
+
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return {} if self.gravity_law is not None else {"gravity": self.gravity}
+
+    def parameters_taken(self) -> None:
+        if self.gravity_law is None:
+            self.gravity_host = self.gravity.numpy().copy()
 
     def hash(self, h: Any) -> None:
         for values in self._defined_by:

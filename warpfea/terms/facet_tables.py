@@ -30,6 +30,8 @@ SMOOTHING = (1e-3, 1e-4)
 """Of the smooth law where none is given: eps, N, and v_eps, m/s."""
 PER_WORLD = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
 """What Model.set_parameter sets of a contact, and the arrays with it; the restitution is in `beta` too."""
+FROM_BODIES = ("normal", "tangent", "normal_damping", "mass")
+"""Numbers of a contact that follow from its bodies."""
 LISTED = 8
 """Threads that share a sum over the points of a facet on CUDA."""
 PATCH, LUMPED, MOVING = range(3)
@@ -120,6 +122,8 @@ class FacetTables(Generic[AnyContact]):
         shares: (F, P) of each contact: area of each point over that of the region; 0: no contact.
     """
 
+    data: Any
+    built: bytes
     first: np.ndarray
     row_start: np.ndarray
     shares: list[np.ndarray]
@@ -183,6 +187,41 @@ class FacetTables(Generic[AnyContact]):
             put("power", power, wp.vec2i)
         return FacetGroup(conn, data, acts != PATCH, chosen)
 
+    def numbers(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
+        """The numbers `FROM_BODIES` of a contact, as built or in a world."""
+        raise NotImplementedError
+
+    @property
+    def set_arrays(self) -> dict[str, wp.array]:
+        """What `Model.set_parameter` writes."""
+        return {name: getattr(self.data, name) for name in (*PER_WORLD.values(), "beta")}
+
+    def remember(self) -> None:
+        """Keep what was built, by which checkpoints tell whether a model is theirs."""
+        self.built = b"".join(array.numpy().tobytes() for array in self.set_arrays.values())
+
+    def take_materials(self, mask: np.ndarray) -> None:
+        """Constants of materials were set in the chosen worlds: so the numbers that follow from them."""
+        m, data = self.model, self.data
+        touched = [
+            k for k, contact in enumerate(self.contacts) if any(m.parameters.varies(b) for b in bodies_of(contact))
+        ]
+        if not touched:
+            return
+        for name in FROM_BODIES:
+            if getattr(data, name).shape[0] != m.worlds:
+                old = getattr(data, name)
+                m.forget("contact", old)
+                setattr(data, name, m.array("contact", np.tile(old.numpy(), (m.worlds, 1)), wp.float64))
+        host = {name: getattr(data, name).numpy() for name in FROM_BODIES}
+        for world in np.flatnonzero(mask).tolist():
+            for k in touched:
+                for name, value in self.numbers(self.contacts[k], world).items():
+                    if name in host:
+                        host[name][world, k] = value
+        for name, values in host.items():
+            getattr(data, name).assign(values)
+
     def _put_laws(self, out: Any, numbers: list[dict[str, float]]) -> None:
         """Upload what a law has; `numbers` of each contact: normal, tangent, normal_damping, mass."""
         m, C = self.model, self.contacts
@@ -194,8 +233,8 @@ class FacetTables(Generic[AnyContact]):
         put("lumped", [int(c.model == "sphere") for c in C], wp.int32)
         put("dead", [int(c.treatment == "explicit") for c in C], wp.int32)
         put("first", self.first, wp.int32)
-        for name in ("normal", "tangent", "normal_damping", "mass"):
-            put(name, [row[name] for row in numbers])
+        for name in FROM_BODIES:
+            put(name, [[row[name] for row in numbers]])
         smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else SMOOTHING for c in C]
         put("ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
         put("force_eps", [pair[0] for pair in smoothing])
@@ -211,6 +250,11 @@ class FacetTables(Generic[AnyContact]):
         }
         for name, values in per_world.items():
             put(name, np.tile(values, (m.worlds, 1)))
+
+
+def bodies_of(contact: Contact | PairContact) -> list[Any]:
+    """The bodies that a contact is of."""
+    return [contact.body] if isinstance(contact, Contact) else [contact.first.body, contact.second.body]
 
 
 def _kind(contact: Contact | PairContact, p: ContactPoints) -> tuple[int, int, int]:

@@ -95,7 +95,8 @@ class PairTables(FacetTables[PairContact]):
             corners = np.concatenate([corner_points(self.host[k]) for k in group.contacts])
             self.corners.append(self.model.array("contact", corners, wp.vec3i))
         self.data = contact_struct(False)()
-        self._put_laws(self.data, [self._numbers(c, region) for c, region in zip(self.contacts, self.regions)])
+        self._put_laws(self.data, [self.numbers(c) for c in self.contacts])
+        self.remember()
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
         )
@@ -104,9 +105,9 @@ class PairTables(FacetTables[PairContact]):
         self.master_conn = self._master_conn()
         self.size = self.model.size
 
-    def _numbers(self, contact: PairContact, region: float) -> dict[str, float]:
-        """Constants of a law, see `_put_laws`."""
-        row = pair_numbers(contact, region)
+    def numbers(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
+        region = self.regions[self.number[contact.index]]
+        row = pair_numbers(contact, region, self.model.parameters.modulus(world))
         return row | {"normal_damping": normal_damping(row["modulus"], row["mass"])}
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -202,5 +203,4 @@ class PairTables(FacetTables[PairContact]):
             values = {name: v for name, v in vars(contact).items() if name not in fixed}
             h.update(f"{contact.first.body.name} {contact.second.body.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())
-        for name in ("mu", "mu_static", "damping", "beta", "scale"):
-            h.update(getattr(self.data, name).numpy().tobytes())
+        h.update(self.built)

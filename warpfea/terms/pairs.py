@@ -356,7 +356,13 @@ class Pairs(PairSolves):
         more = f" and {len(names) - 3} more" if len(names) > 3 else ""
         return f"; in touch: contact {', '.join(names[:3])}{more}" if names else ""
 
-    def parameters(self) -> dict[str, Callable[[Any], None]]:
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return self.tables.set_arrays
+
+    def take_materials(self, mask: np.ndarray) -> None:
+        self.tables.take_materials(mask)
+
+    def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         return contact_parameters(self.tables)
 
     def facts(self) -> list[dict[str, Any]]:

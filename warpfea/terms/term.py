@@ -368,8 +368,20 @@ class Term:
         """What else is to be told of the last attempt at a refused step of a world; "" for nothing."""
         return ""
 
-    def parameters(self) -> Mapping[str, Callable[[Any], None]]:
-        """What `Model.set_parameter` may set, by name, with what sets it: a scalar or (worlds,), checked there."""
+    def parameter_arrays(self) -> Mapping[str, wp.array]:
+        """What `parameters` write, by names of the term's own: arrays that checkpoints hold and a resumed run gets."""
+        return {}
+
+    def parameters_taken(self) -> None:
+        """`parameter_arrays` were written from a checkpoint."""
+
+    def take_materials(self, mask: np.ndarray) -> None:
+        """Constants of materials (see `model.parameters`) were set in the chosen worlds (worlds,): follow them in
+        place; before the first simulation arrays may be replaced by longer ones."""
+
+    def parameters(self) -> Mapping[str, Callable[[Any, np.ndarray], None]]:
+        """What `Model.set_parameter` may set, by name, with what sets it: it gets the value as the user gave it, which
+        it checks, and the mask (worlds,) of the worlds to set; the others stay."""
         return {}
 
     def sample(self, field: str, body: Any, state: State) -> np.ndarray:

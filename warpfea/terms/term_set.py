@@ -12,6 +12,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import PARTS
 from ..base.names import did_you_mean, listing
+from ..base.worlds import chosen_worlds
 from ..kernels.common.traits import Traits
 from ..kernels.step.control import REPORT
 from ..kernels.step.ledger import LEDGER, booked_struct
@@ -39,7 +40,7 @@ __all__ = ["KINDS", "TermSet", "all_parts"]
 
 KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Pairs, Constraints)
 """The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
-LATER = ("materials per world",)
+LATER: tuple[str, ...] = ()
 """Features of later versions, which `info` lists as left out."""
 STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end")  # fmt: skip
@@ -250,16 +251,26 @@ class TermSet:
         """The term of contact between bodies, or None."""
         return self.find(Pairs)
 
-    def set_parameter(self, name: Any, values: Any) -> None:
+    def set_parameter(self, name: Any, values: Any, mask: Any) -> None:
         """See Model.set_parameter."""
-        known = {key: put for term in self.all for key, put in term.parameters().items()}
-        if name in known:
-            known[name](values)
+        materials = self.model.parameters
+        owners = [term.parameters() for term in self.all] + [materials.setters(), {"gravity": self.dead.set_gravity}]
+        found = [known[name] for known in owners if name in known]
+        if len(found) == 1:
+            found[0](values, chosen_worlds("set_parameter", mask, self.model.worlds))
             return
-        if isinstance(name, str) and any(name.startswith(f"{body.name}.") for body in self.model.bodies):
-            raise NotImplementedError(f"set_parameter({name!r}): materials per world are not part of this version")
+        if found:
+            raise ModelError(f"set_parameter: {name!r} is a parameter of {len(found)} things of that name; rename one")
+        known = [key for those in owners for key in those]
+        told = materials.explain(name)
+        if told:
+            raise ModelError(f"set_parameter: {name!r} can't be set: {told}")
         hint = did_you_mean(name, known)
         raise ModelError(f"set_parameter: parameter {name!r} is unknown; there are: {listing(known)}{hint}")
+
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        """What is set by `set_parameter` of terms, by "term name"."""
+        return {f"{term.name}.{name}": a for term in self.all for name, a in term.parameter_arrays().items()}
 
     # for one simulation
 

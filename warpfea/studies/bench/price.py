@@ -35,13 +35,11 @@ from ...simulation.simulation import Simulation
 from ...solvers import NewtonPCG
 from .measure import by_label, write
 
-__all__ = ["LEFT", "PriceCase", "PriceRow", "cases", "force_in", "measure", "price"]
+__all__ = ["PriceCase", "PriceRow", "cases", "force_in", "measure", "price"]
 
 STEPS, REPEAT, WARM_UP = 5, 3, 2
-LEFT = ("materials per world",)
-"""What no version has."""
 NEXT_TO_NONE = 1e-30
-"""Of viscosities, Pa s, and gravity, m/s^2: with 0 they are left out."""
+"""Of viscosities, Pa s, and gravity, m/s^2: with 0 gravity is left out."""
 STILL = 1e-3
 """Probes that travel less than this part of the model's size are judged by that."""
 FAR = 1e3
@@ -201,14 +199,14 @@ class _Runner:
 def measure(case: PriceCase, *, device: Any, steps: int, repeat: int) -> PriceRow:
     """Both simulations of a scene, in turns."""
     shipped = _Runner(case.scene(), case.scene, device)
-    missing = [name for name in shipped.model.info()["left_out"] if name not in LEFT]
+    missing = list(shipped.model.info()["left_out"])
     b = case.scene()
     force_in(b, missing)
     full = _Runner(b, case.scene, device)
     for _ in range(repeat):
         for runner in (shipped, full):
             runner.step(steps)
-    left = [name for name in full.model.info()["left_out"] if name not in LEFT]
+    left = list(full.model.info()["left_out"])
     own, everything = shipped.side(), full.side()
     ratio = everything.ms_per_step / own.ms_per_step
     names = [probe.name for probe in shipped.model.probes]
@@ -229,7 +227,7 @@ def price(options: argparse.Namespace) -> None:
     """Do `warpfea bench --price`: a line per scene, and the file after each."""
     chosen = cases() if options.rows is None else by_label(options.rows, cases())
     steps, repeat = options.steps or STEPS, options.repeat or REPEAT
-    settings = {"steps": steps, "repeat": repeat, "warm_up_steps": WARM_UP, "time": "median step", "not_forced": LEFT}
+    settings = {"steps": steps, "repeat": repeat, "warm_up_steps": WARM_UP, "time": "median step"}
     rows: list[PriceRow] = []
     print(HEADER, flush=True)
     for case in chosen:

@@ -1,0 +1,55 @@
+"""Numbers that may differ between worlds, as users give them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .errors import ModelError
+
+__all__ = ["chosen_worlds", "on_host", "per_world", "refuse"]
+
+
+def on_host(values: Any) -> np.ndarray:
+    """Values of the host or of a device, of Warp or of what shares its memory. TypeError, ValueError: neither."""
+    if isinstance(values, wp.array):
+        values = values.numpy()
+    elif hasattr(values, "detach"):  # of PyTorch
+        values = values.detach().cpu().numpy()
+    elif hasattr(values, "__cuda_array_interface__"):
+        values = wp.array(values, copy=False).numpy()
+    return np.asarray(values)
+
+
+def chosen_worlds(what: str, mask: Any, worlds: int) -> np.ndarray:
+    """(worlds,) which worlds a mask means, by default all. ModelError for another shape or other values."""
+    if mask is None:
+        return np.ones(worlds, dtype=bool)
+    try:
+        out = on_host(mask)
+        good = out.shape == (worlds,) and out.dtype.kind in "biu" and bool(np.isin(out, (0, 1)).all())
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise ModelError(f"{what}: mask = {mask!r} must be ({worlds},) of True and False, one per world")
+    return out.astype(bool)
+
+
+def per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ...] = ()) -> np.ndarray:
+    """(worlds, *row) numbers of one value for all worlds, or of one per world. ModelError for another shape."""
+    one, each = f"{row}" if row else "a number", (worlds, *row)
+    try:
+        out = np.asarray(on_host(values), dtype=float)
+    except (TypeError, ValueError):
+        raise ModelError(f"{what}: {name} = {values!r} must be {one}, or one per world") from None
+    if out.shape not in (row, each):
+        raise ModelError(f"{what}: {name} has shape {out.shape}, expected {one} or {each}, one per world")
+    return np.broadcast_to(out, each).astype(float)
+
+
+def refuse(what: str, name: str, values: np.ndarray, good: np.ndarray, wanted: str) -> None:
+    """Raise ModelError for the first world whose value is not good; `wanted`: what it must be."""
+    for world in np.flatnonzero(~good)[:1]:
+        raise ModelError(f"{what}: {name} = {values[world].tolist()!r} in world {world} must be {wanted}")

@@ -1,0 +1,275 @@
+"""Constants of materials that differ between worlds: what Model.set_parameter sets of bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import contextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..base.errors import CheckpointError, ModelError
+from ..base.names import listing
+from ..base.worlds import per_world, refuse
+from ..materials import LIMITS, Material
+from . import assembly
+from .blocks import Block, output_rows
+from .contact_points import Modulus, effective_modulus
+from .tied_tables import couplings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from .discretisation import Discretisation
+    from .handles import SurfaceSet
+
+__all__ = ["MaterialParameters"]
+
+Owner = tuple["Discretisation", int]
+"""A body and the number of one of its materials."""
+RATES = ("eta", "lambda_v")
+SHARED = {
+    "cells": "the mesh",
+    "density": "the mass matrix",
+    "elements": "the mesh",
+    "form": "the kernels of damping",
+    "frames": "the reference geometry",
+    "height": "the reference geometry",
+    "integration": "the element's kernels",
+    "law": "the element's kernels",
+    "mesh": "the mesh",
+    "points": "the mesh",
+    "quadrature": "the element's kernels",
+    "scale": "the reference geometry",
+    "section": "the reference geometry",
+    "thickness": "the reference geometry",
+    "width": "the reference geometry",
+}
+"""What users may want to set of a body and what all worlds share because of it."""
+
+
+class MaterialParameters:
+    """Values of constants of materials in each world.
+
+    Until the first is set, all worlds read the one table of coefficients that the model was built with. It is replaced
+    by a table with a row of each world, and so are the couplings of assumed strains that depend on the constant: the
+    kernels' arrays are others then, which is why a first value precedes the simulations.
+
+    Attributes:
+        values: (worlds,) of what was set, by (index of the body, number of the material, name).
+        begun: a simulation of the model was made.
+        changes: (worlds,) how often values of a world were written; `version`: how often any were.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.values: dict[tuple[int, int, str], np.ndarray] = {}
+        self.begun = False
+        self.version = 0
+        self.changes = np.zeros(model.worlds, dtype=np.int64)
+        self._couplings: dict[int, np.ndarray] = {}
+
+    # names
+
+    def owners(self) -> dict[str, list[Owner]]:
+        """Materials by the name of their group, "hook.arm", and all of a body by that of the body, "hook"."""
+        out: dict[str, list[Owner]] = {}
+        for body in self.model.bodies:
+            out[body.name] = [(body, k) for k in range(len(body.materials))]
+            out |= {f"{body.name}.{group}": [(body, k)] for k, (group, _) in enumerate(body.materials) if group}
+        return out
+
+    def setters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
+        """What sets a constant in the chosen worlds, by its name; of a body those that all of its materials have."""
+        out: dict[str, Callable[[Any, np.ndarray], None]] = {}
+        for owner, members in self.owners().items():
+            every = [body.materials[k][1].constants for body, k in members]
+            for name in every[0]:
+                if all(name in constants for constants in every):
+                    out[f"{owner}.{name}"] = partial(self._set, owner, members, name)
+        return out
+
+    def explain(self, name: Any) -> str | None:
+        """Why something of a body is none of the parameters, where there is more to say than their names."""
+        owners = self.owners()
+        owner, _, what = str(name).rpartition(".")
+        if owner not in owners:
+            return None
+        laws = [body.materials[k][1] for body, k in owners[owner]]
+        kinds = " and ".join(dict.fromkeys(type(law).__name__ for law in laws))
+        if what in SHARED:
+            return f"all worlds share {SHARED[what]}, of which {what!r} is a part; build a model of its own for another"
+        if what in RATES:
+            return f"the material {kinds} has no damping, so its kernels were left out; give it KelvinVoigt(eta=0)"
+        for law in laws:
+            if what in {"E", "nu", *law.own} - set(law.constants):
+                other = "from_E_nu" if what in ("E", "nu") else "its constructor"
+                return f"the material {type(law).__name__} was made of {listing(law.constants)}; {other} takes {what!r}"
+        return None
+
+    # values
+
+    def in_world(self, body: Discretisation, k: int, world: int) -> Material:
+        """A material of a body as one world has it."""
+        return self._material((body, k), self.values, world)
+
+    def varies(self, body: Discretisation) -> bool:
+        """Whether constants of a body's materials were set."""
+        return any(index == self._index(body) for index, _, _ in self.values)
+
+    def modulus(self, world: int | None) -> Modulus:
+        """`effective_modulus` as a world has it, or as the bodies were built."""
+        if world is None:
+            return effective_modulus
+
+        def of(body: Discretisation, surface: SurfaceSet | None) -> tuple[float, float]:
+            return effective_modulus(body, surface, [self.in_world(body, k, world) for k in range(len(body.materials))])
+
+        return of
+
+    def of_worlds(self, body: Discretisation, k: int) -> Material:
+        """A material of a body, with arrays of what differs between worlds."""
+        return self._material((body, k), self.values)
+
+    def _material(self, owner: Owner, values: Mapping[Any, np.ndarray], world: int | None = None) -> Material:
+        body, k = owner
+        material: Material = body.materials[k][1]
+        mine = {name: v for (index, j, name), v in values.items() if (index, j) == (self._index(body), k)}
+        if world is not None:
+            mine = {name: float(v[world]) for name, v in mine.items()}  # type: ignore[misc]
+        return material.with_constants(mine) if mine else material
+
+    def _index(self, body: Discretisation) -> int:
+        return self.model.bodies.index(body)  # type: ignore[arg-type]
+
+    def _set(self, owner: str, members: list[Owner], name: str, values: Any, mask: np.ndarray) -> None:
+        """Take values (worlds,), of which those of the chosen worlds count, as a constant of some materials."""
+        wanted = per_world(owner, name, values, self.model.worlds)
+        good, text = LIMITS.get(name, (np.isfinite, "finite"))
+        refuse(owner, name, wanted, ~mask | (np.isfinite(wanted) & good(wanted)), text)
+        keys = [(self._index(body), k, name) for body, k in members]
+        if self.begun and any(key not in self.values for key in keys):
+            raise ModelError(
+                f"set_parameter: a Simulation of this model was made with one value of '{owner}.{name}' for all "
+                "worlds; call this once before the first Simulation, and later as often as wanted"
+            )
+        fresh = dict(self.values)
+        for key, (body, k) in zip(keys, members):
+            before = fresh.get(key, np.full(self.model.worlds, body.materials[k][1].constants[name]))
+            fresh[key] = np.where(mask, wanted, before)
+        self.values = fresh
+        self._write(members, name, mask)
+        for term in self.model.terms:
+            term.take_materials(mask)
+        self.changes[mask] += 1
+        self.version += 1
+
+    # tables
+
+    def _write(self, members: list[Owner], name: str, mask: np.ndarray) -> None:
+        """Bring the tables on the device up to date with the values of some materials."""
+        m = self.model
+        if len(m.coefficient_table) != m.worlds:
+            m.coefficient_table = np.tile(m.coefficient_table, (m.worlds, 1, 1))
+        chosen = {(self._index(body), k) for body, k in members}
+        for block in m.blocks:
+            mine = [part for part in block.parts if (self._index(part.body), part.material) in chosen]
+            for part in mine:
+                material = self.of_worlds(part.body, part.material)
+                _, values = assembly.law_of(part.key.integral, material)
+                m.coefficient_table[:, part.row] = assembly.coefficient_rows(values, material, m.worlds)
+            tying = block.key.tying
+            if mine and tying and name in tying.uses:
+                self._couple(block, mask)
+            if mine and block.output:
+                block.output.data.coefficients = m.array("output", output_rows(m, block), m.types.T)
+        if m.coefficients.shape[0] == m.worlds:
+            m.coefficients.assign(m.coefficient_table)
+            return
+        m.forget("materials", m.coefficients)
+        m.coefficients = m.array("materials", m.coefficient_table, m.types.T)
+        for block in m.blocks:
+            block.data.coefficients = m.coefficients
+
+    def _couple(self, block: Block, mask: np.ndarray) -> None:
+        """The couplings of assumed strains of a block in the chosen worlds, in each of which they are of that world.
+
+        What they do not depend on is as the bodies were built: E/mu, which is a function of nu, then rounds the same.
+        """
+        m, tying = self.model, block.key.tying
+        assert tying is not None
+        first = not block.coupled
+        every = [
+            [self.values.get((self._index(part.body), part.material, name)) for name in tying.uses]
+            for part in block.parts
+        ]
+        table = self._couplings.get(block.contribution_offset)
+        made: dict[Any, np.ndarray] = {}
+        for world in range(m.worlds) if first else np.flatnonzero(mask).tolist():
+            numbers = [[None if v is None else float(v[world]) for v in row] for row in every]
+            key = tuple(map(tuple, numbers))
+            if key not in made:
+                tables = []
+                for part, row in zip(block.parts, numbers):
+                    changed = {name: v for name, v in zip(tying.uses, row) if v is not None}
+                    material = part.body.materials[part.material][1].with_constants(changed)
+                    tables.append(couplings(part, material))
+                made[key] = np.concatenate(tables)
+            if table is None:
+                table = np.empty((m.worlds, *made[key].shape))
+            table[world] = made[key]
+        assert table is not None
+        self._couplings[block.contribution_offset] = table
+        values = np.moveaxis(table.reshape(-1, *table.shape[2:]), 0, 2)
+        if not first:
+            block.data.coupling.assign(np.ascontiguousarray(values))
+            return
+        m.forget("elements", block.data.coupling)
+        block.data.coupling = m.element_array(values, m.types.T)
+        block.take_couplings(m.dtype)
+
+    @contextmanager
+    def alone(self, world: int) -> Iterator[None]:
+        """For a while the tables are those of one world, for an evaluation of it alone."""
+        blocks = self.model.blocks if self.values else []
+        kept: list[tuple[Block, Any, Any]]
+        kept = [(block, block.data.coefficients, getattr(block.data, "coupling", None)) for block in blocks]
+        try:
+            for block, coefficients, coupling in kept:
+                block.data.coefficients = coefficients[world : world + 1]
+                if block.coupled:
+                    block.data.coupling = coupling[:, :, world * block.count : (world + 1) * block.count]
+            yield
+        finally:
+            for block, coefficients, coupling in kept:
+                block.data.coefficients = coefficients
+                if block.coupled:
+                    block.data.coupling = coupling
+
+    # checkpoints
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """What was set, by names "body.number.constant"."""
+        return {f"{self.model.bodies[b].name}.{k}.{name}": v for (b, k, name), v in self.values.items()}
+
+    def check(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Raise CheckpointError where `numpy` of another model gave other constants than were set here."""
+        here = set(self.numpy())
+        for name in sorted(here ^ set(saved)):
+            owner, number, constant = name.rsplit(".", 2)
+            of = {body.name: body for body in self.model.bodies}[owner]
+            group = of.materials[int(number)][0]
+            full = f"{owner}.{group}.{constant}" if group else f"{owner}.{constant}"
+            first, second = ("model", "checkpoint") if name in here else ("checkpoint", "model")
+            raise CheckpointError(
+                f"the {first} has values of {full!r} set, the {second} has not; call set_parameter({full!r}, ...) "
+                "before the Simulation of both or of none"
+            )
+
+    def load(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Take what `numpy` gave."""
+        every = np.ones(self.model.worlds, dtype=bool)
+        for (b, k, name), key in zip(list(self.values), self.numpy()):
+            body = self.model.bodies[b]
+            self._set(body.name, [(body, k)], name, saved[key], every)

@@ -1,0 +1,62 @@
+"""Host tables of elements with tied strains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..materials import Material
+from .assembly import HostBlock, chunks, geometry, gradients, orthonormal
+
+__all__ = ["TiedTables", "couplings", "tied_tables"]
+
+
+@dataclass(eq=False)
+class TiedTables:
+    """Tables of elements with tied strains e_t = x_a . x_b - X_a . X_b (see kernels/elements/tied.py).
+
+    Attributes:
+        first, second: (E, n, S) derivatives of s_i along a and b at the tying points.
+        X_first, X_second: (E, n, 3) X_a and X_b.
+        coupling: (E, n, width) A of the energy (mu/2) e.A e.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    X_first: np.ndarray
+    X_second: np.ndarray
+    coupling: np.ndarray
+
+
+def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
+    """Tables of the tied part of some elements of a block."""
+    part, body = host.key.integral, host.body
+    tying = part.tying
+    assert tying is not None
+    _, ds, J, _ = geometry(body, elements, tying.points)
+    along = J
+    if part.framed:
+        along = orthonormal(J)
+        ds = gradients(ds, J) @ along
+    t = np.arange(len(tying.points))
+    a, b = tying.pairs.T
+    coupling = _coupling(host, elements, J, body.materials[host.material][1])
+    first, second = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
+    X_first, X_second = (np.moveaxis(along[:, t, :, k], 0, 1) for k in (a, b))
+    return TiedTables(first, second, X_first, X_second, coupling)
+
+
+def couplings(host: HostBlock, material: Material) -> np.ndarray:
+    """(E, n, width) A of the tied elements of a block, were they of another material."""
+    tying, rule = host.key.tying, host.key.rule
+    assert tying is not None
+    members = chunks(host.body, host.elements, len(rule.weights))
+    return np.concatenate([_coupling(host, e, geometry(host.body, e, tying.points)[2], material) for e in members])
+
+
+def _coupling(host: HostBlock, elements: np.ndarray, J: np.ndarray, material: Material) -> np.ndarray:
+    part, body = host.key.integral, host.body
+    assert part.tying is not None
+    _, _, J_rule, det = geometry(body, elements, part.rule.points)
+    return part.tying.coupling(J, J_rule, det, part.rule, material, body.section)
