@@ -108,6 +108,11 @@ class PairTables(FacetTables[PairContact]):
         row = pair_numbers(contact, region, self.mass[contact.index], self.model.parameters.modulus(world))
         return row | {"normal_damping": normal_damping(row["modulus"], row["mass"])}
 
+    @property
+    def set_arrays(self) -> dict[str, wp.array]:
+        found = super().set_arrays
+        return {name: found[name] for name in ("mu", "mu_static", "damping", "beta", "scale")}  # as files are hashed
+
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corners (facets, 3) of the facets in the reference."""
         nodes = [np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X) for mas in self.masters]
