@@ -230,19 +230,26 @@ def thickness(surface: SurfaceSet) -> np.ndarray:
         return np.asarray(out.numpy(), dtype=float) * size
 
 
-def pair_numbers(contact: PairContact, area: float, modulus_of: Modulus = effective_modulus) -> dict[str, float]:
-    """Constants of Eqs. (74)-(76), (79) and (80) of two bodies whose region has an area, m^2."""
-    compliance = shear = mass = 0.0
+def pair_mass(contact: PairContact) -> float:
+    """Effective mass of two bodies, kg."""
+    mass = 0.0
+    for surface in (contact.slave, contact.master):
+        total = body_mass_total(surface.body)
+        mass += 1.0 / total if total > 0.0 else math.inf
+    return 1.0 / mass
+
+
+def pair_numbers(contact: PairContact, area: float, mass: float, modulus_of: Modulus) -> dict[str, float]:
+    """Constants of Eqs. (74)-(76), (79) and (80) of two bodies whose region has an area, m^2, of an effective mass."""
+    compliance = shear = 0.0
     for surface in (contact.slave, contact.master):
         E, nu = modulus_of(surface.body, surface)
         compliance += (1.0 - nu**2) / E
         shear += 2.0 * (2.0 - nu) * (1.0 + nu) / E
-        total = body_mass_total(surface.body)
-        mass += 1.0 / total if total > 0.0 else math.inf
     a = contact.radius or math.sqrt(area / math.pi)
     return {
         "normal": 4.0 / 3.0 * a / compliance,
         "tangent": 8.0 * a / shear,
         "modulus": 2.0 * a / compliance,
-        "mass": 1.0 / mass,
+        "mass": mass,
     }

@@ -200,25 +200,22 @@ class MaterialParameters:
         m, tying = self.model, block.key.tying
         assert tying is not None
         first = not block.coupled
-        every = [
-            [self.values.get((self._index(part.body), part.material, name)) for name in tying.uses]
-            for part in block.parts
-        ]
+        worlds = range(m.worlds) if first else np.flatnonzero(mask).tolist()
         table = self._couplings.get(block.contribution_offset)
-        made: dict[Any, np.ndarray] = {}
-        for world in range(m.worlds) if first else np.flatnonzero(mask).tolist():
-            numbers = [[None if v is None else float(v[world]) for v in row] for row in every]
-            key = tuple(map(tuple, numbers))
-            if key not in made:
-                tables = []
-                for part, row in zip(block.parts, numbers):
-                    changed = {name: v for name, v in zip(tying.uses, row) if v is not None}
-                    material = part.body.materials[part.material][1].with_constants(changed)
-                    tables.append(couplings(part, material))
-                made[key] = np.concatenate(tables)
+        row = 0
+        for part in block.parts:
+            owner = self._index(part.body), part.material
+            own = {name: self.values[(*owner, name)] for name in tying.uses if (*owner, name) in self.values}
+            numbers = [tuple(float(values[world]) for values in own.values()) for world in worlds]
+            distinct = {key: k for k, key in enumerate(dict.fromkeys(numbers))}
+            material = part.body.materials[part.material][1]
+            made = couplings(part, [material.with_constants(dict(zip(own, key))) for key in distinct])
             if table is None:
-                table = np.empty((m.worlds, *made[key].shape))
-            table[world] = made[key]
+                table = np.empty((m.worlds, block.count, *made.shape[2:]))
+            rows = slice(row, row + made.shape[1])
+            for world, key in zip(worlds, numbers):
+                table[world, rows] = made[distinct[key]]
+            row = rows.stop
         assert table is not None
         self._couplings[block.contribution_offset] = table
         values = np.moveaxis(table.reshape(-1, *table.shape[2:]), 0, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,22 +42,24 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
         ds = gradients(ds, J) @ along
     t = np.arange(len(tying.points))
     a, b = tying.pairs.T
-    coupling = _coupling(host, elements, J, body.materials[host.material][1])
+    coupling = _coupling(host, elements, J, [body.materials[host.material][1]])[0]
     first, second = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
     X_first, X_second = (np.moveaxis(along[:, t, :, k], 0, 1) for k in (a, b))
     return TiedTables(first, second, X_first, X_second, coupling)
 
 
-def couplings(host: HostBlock, material: Material) -> np.ndarray:
-    """(E, n, width) A of the tied elements of a block, were they of another material."""
+def couplings(host: HostBlock, materials: Sequence[Material]) -> np.ndarray:
+    """(materials, E, n, width) A of the tied elements of a block, were they of other materials."""
     tying, rule = host.key.tying, host.key.rule
     assert tying is not None
     members = chunks(host.body, host.elements, len(rule.weights))
-    return np.concatenate([_coupling(host, e, geometry(host.body, e, tying.points)[2], material) for e in members])
+    tables = [_coupling(host, e, geometry(host.body, e, tying.points)[2], materials) for e in members]
+    return np.concatenate(tables, axis=1)
 
 
-def _coupling(host: HostBlock, elements: np.ndarray, J: np.ndarray, material: Material) -> np.ndarray:
+def _coupling(host: HostBlock, elements: np.ndarray, J: np.ndarray, materials: Sequence[Material]) -> np.ndarray:
     part, body = host.key.integral, host.body
-    assert part.tying is not None
+    tying = part.tying
+    assert tying is not None
     _, _, J_rule, det = geometry(body, elements, part.rule.points)
-    return part.tying.coupling(J, J_rule, det, part.rule, material, body.section)
+    return np.stack([tying.coupling(J, J_rule, det, part.rule, material, body.section) for material in materials])

@@ -19,6 +19,7 @@ from ..model.pairs import (
     bernstein,
     exponents,
     master_facets,
+    pair_mass,
     pair_numbers,
     pair_points,
 )
@@ -38,7 +39,7 @@ class PairTables(FacetTables[PairContact]):
 
     Attributes:
         surfaces, masters: master surfaces, each once, and their facets; of: that of each contact.
-        regions: area of each contact, m^2.
+        regions: area of each contact, m^2. mass: effective, kg, by the index of a contact.
         facets: master facets in all. bodies: that are in a pair. corners: of the slave facets of each group.
         far: how far off a gap is told, m. deepest: overlap that is looked for at the start, m.
     """
@@ -46,6 +47,7 @@ class PairTables(FacetTables[PairContact]):
     def __init__(self, model: Model) -> None:
         contacts = list(model.description.pairs)
         super().__init__(model, contacts, [pair_points(contact.slave, contact.points) for contact in contacts])
+        self.mass: dict[int, float] = {}
         self.surfaces: list[SurfaceSet] = []
         self.of: list[int] = []
         for contact in self.contacts:
@@ -107,8 +109,15 @@ class PairTables(FacetTables[PairContact]):
 
     def numbers(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
         region = self.regions[self.number[contact.index]]
-        row = pair_numbers(contact, region, self.model.parameters.modulus(world))
+        if contact.index not in self.mass:
+            self.mass[contact.index] = pair_mass(contact)
+        row = pair_numbers(contact, region, self.mass[contact.index], self.model.parameters.modulus(world))
         return row | {"normal_damping": normal_damping(row["modulus"], row["mass"])}
+
+    @property
+    def set_arrays(self) -> dict[str, wp.array]:
+        found = super().set_arrays
+        return {name: found[name] for name in ("mu", "mu_static", "damping", "beta", "scale")}  # as files are hashed
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corners (facets, 3) of the facets in the reference."""
