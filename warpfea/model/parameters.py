@@ -251,7 +251,7 @@ class MaterialParameters:
         return {f"{self.model.bodies[b].name}.{k}.{name}": v for (b, k, name), v in self.values.items()}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Raise CheckpointError where `numpy` of another model gave other constants than were set here, or no numbers."""
+        """Raise CheckpointError where `numpy` of another model gave other constants than were set here, or bad ones."""
         here = set(self.numpy())
         for name in sorted(here ^ set(saved)):
             owner, number, constant = name.rsplit(".", 2)
