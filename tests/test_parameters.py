@@ -403,6 +403,14 @@ def test_a_checkpoint_holds_the_values(tmp_path):
     for world in range(3):
         assert rows(sim, world) == rows(other, world)
     assert np.array_equal(other.model.parameters.numpy()["body.0.nu"], [0.41, 0.45, 0.2])
+    with np.load(path) as file:
+        damaged = dict(file)
+    damaged["parameter.body.0.nu"] = np.array([0.3, 0.6, 0.3])
+    np.savez(tmp_path / "d.npz", **damaged)
+    before = rows(other, 0)
+    with pytest.raises(wf.CheckpointError, match=r"'body.0.nu' are damaged"):
+        other.resume(tmp_path / "d.npz")
+    assert rows(other, 0) == before
     for names in ((), ("E", "eta")):
         without = wf.Simulation(varied(add, names=names, **law), dt=2e-3)
         before = rows(without, 0)

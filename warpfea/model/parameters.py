@@ -251,7 +251,7 @@ class MaterialParameters:
         return {f"{self.model.bodies[b].name}.{k}.{name}": v for (b, k, name), v in self.values.items()}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Raise CheckpointError where `numpy` of another model gave other constants than were set here."""
+        """Raise CheckpointError where `numpy` of another model gave other constants than were set here, or bad ones."""
         here = set(self.numpy())
         for name in sorted(here ^ set(saved)):
             owner, number, constant = name.rsplit(".", 2)
@@ -263,6 +263,10 @@ class MaterialParameters:
                 f"the {first} has values of {full!r} set, the {second} has not; call set_parameter({full!r}, ...) "
                 "before the Simulation of both or of none"
             )
+        for name, values in saved.items():
+            good, _ = LIMITS.get(name.rsplit(".", 1)[1], (np.isfinite, ""))
+            if values.shape != (self.model.worlds,) or not np.all(np.isfinite(values) & good(values)):
+                raise CheckpointError(f"the values of {name!r} are damaged")
 
     def load(self, saved: Mapping[str, np.ndarray]) -> None:
         """Take what `numpy` gave."""
