@@ -59,7 +59,7 @@ class MaterialParameters:
     Attributes:
         values: (worlds,) of what was set, by (index of the body, number of the material, name).
         begun: a simulation of the model was made.
-        changes: (worlds,) how often values of a world were written; `version`: how often any were.
+        version: how often values were written.
     """
 
     def __init__(self, model: Any) -> None:
@@ -67,8 +67,16 @@ class MaterialParameters:
         self.values: dict[tuple[int, int, str], np.ndarray] = {}
         self.begun = False
         self.version = 0
-        self.changes = np.zeros(model.worlds, dtype=np.int64)
+        # made when it is read: a model may ask for more worlds than there is room
+        self._changes: np.ndarray | None = None
         self._couplings: dict[int, np.ndarray] = {}
+
+    @property
+    def changes(self) -> np.ndarray:
+        """(worlds,) how often values of a world were written."""
+        if self._changes is None:
+            self._changes = np.zeros(self.model.worlds, dtype=np.int64)
+        return self._changes
 
     # names
 
