@@ -61,7 +61,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
         facet: wp.int32  # -1: nowhere
         spot: vec3d
-        off: f64  # beyond the sides of the facet
+        off: f64  # beyond the sides of the facet; 0 within its `lean`
+        beyond: f64  # likewise, without that
         height: f64  # beside it
         rank: wp.int32  # see `admits`
         entered: wp.bool  # the point passed a side of the body
@@ -345,12 +346,14 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         beside = rank == 2 or rank == 3
         near = beside and o > f64(0.0)
         out.entered = out.entered or (rank >= 0 and not beside)
+        beyond = o
         if rank > 1 and o <= slack:
             o = f64(0.0)
         closer = wp.abs(spot[2]) < seat.height or (wp.abs(spot[2]) == seat.height and f < seat.facet)
+        closer = beyond < seat.beyond or (closer and beyond == seat.beyond)
         closer = rank > seat.rank or (closer and rank == seat.rank)
         if rank >= 0 and (o < seat.off or seat.facet < 0 or (o == seat.off and closer)):
-            out = Seat(f, spot, o, wp.abs(spot[2]), rank, out.entered, near)
+            out = Seat(f, spot, o, beyond, wp.abs(spot[2]), rank, out.entered, near)
         return out
 
     @wp.kernel(module=module)
@@ -374,7 +377,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         shift = along(facets, u, world, q, item)
         x = facets.X[q, item] + shift
         x0 = t.x0[world, point]
-        seat = Seat(-1, vec3d(), f64(OUTER), f64(1.0e300), -1, False, False)
+        seat = Seat(-1, vec3d(), f64(OUTER), f64(OUTER), f64(1.0e300), -1, False, False)
         if settling > f64(0.0):
             seat.off = f64(0.0)  # what lies before one face of a body is beside another
         inside = allowance(con, his, world, c, point, clock.time[world])
@@ -392,7 +395,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             spot = vec3d(found[0], found[1], found[2])
             o = outside(mas.corners[mas.kind[f]], spot)
             if found[3] != f64(0.0) and (o <= seat.off or (o <= f64(HOLD) and his.speed[world, point] > f64(0.0))):
-                seat = Seat(f, spot, o, wp.abs(spot[2]), -1, False, False)
+                seat = Seat(f, spot, o, o, wp.abs(spot[2]), -1, False, False)
             pad += f64(2.0) * wp.abs(from0[2])
         if seat.facet < 0 or seat.off > f64(OUTER):
             facing = vec3d()
