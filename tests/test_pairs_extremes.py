@@ -109,6 +109,14 @@ def test_a_block_that_glides_is_slowed_by_friction_alone():
     assert np.abs(change[1:]).max() < 1e-4
 
 
+@pytest.mark.parametrize("mu", [0.0, 0.5])
+def test_a_block_that_glides_in_touch_without_load_goes_on(mu):
+    """All forces are rounding of gaps, of which no iterate has less."""
+    change, most = glide(gap=0.0, gravity=0.0, mu=mu, cells=(2, 3), steps=60, named=True)
+    assert np.abs(change).max() < 1e-12
+    assert most <= 10
+
+
 def test_an_offset_takes_no_more_iterations():
     """With offset 0 the same block takes at most 10 iterations in a step."""
     b = wf.ModelBuilder(gravity=(0, 0, -G))

@@ -17,7 +17,7 @@ from .control import (
     control_struct,
 )
 
-__all__ = ["judging_functions"]
+__all__ = ["COARSE", "SWIFT", "TRIES", "judging_functions"]
 
 FLOOR = 16.0
 PREDICTED = 1.0e-3
@@ -38,16 +38,18 @@ DROWNED = 32.0
 """Roundings of the positions up to which a residual as large as the forces says nothing of the equilibrium."""
 COARSE = 1.0e-10
 """Rounding above which the precision is single."""
+SWIFT = 1.0e4
+"""Roundings of its speed below which, in double precision, an error of a body's velocities is none."""
 TRIES = 3
 """Solves that may find the error of a stalled iterate too large before the step is given up."""
 
 
 @functools.cache
 def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """The functions; of the traits "stored", "gated" and "midpoint" count."""
+    """The functions; of the traits "stored", "gated", "midpoint" and "walls" count."""
     f64 = wp.float64
     Control = control_struct()
-    stored, gated, midpoint = traits.stored, traits.gated, traits.midpoint
+    stored, gated, midpoint, walls = traits.stored, traits.gated, traits.midpoint, traits.walls
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
@@ -219,6 +221,12 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         near = ctl.floor_excess[world] <= f64(NEAR)
         if not near and ctl.floor_excess[world] < f64(1.0e300):
             near = step <= alike * alike * energy
+        if wp.static(walls):
+            # gaps of bodies that glide are rounded as places are, and there may be no other force
+            fine = f64(SWIFT) * ctl.eps
+            if ctl.eps < f64(COARSE) and step <= fine * fine * ctl.dq_dv[world] * ctl.slot_sums[10, world]:
+                near = True
+                settling = True
         near = near and ctl.strict_count[world] < TRIES
         still = ctl.reduction[world] > f64(STALLED) and ctl.reused[world] == 0
         if ctl.excess[world] <= f64(1.0):

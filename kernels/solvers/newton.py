@@ -18,7 +18,7 @@ from .control import (
     FLOOR_LANES,
     control_struct,
 )
-from .judging import TRIES, judging_functions
+from .judging import COARSE, SWIFT, TRIES, judging_functions
 from .outer import outer_kernels
 from .pcg import pcg_struct
 from .searching import NOISE, TURN, search_kernels
@@ -28,7 +28,6 @@ __all__ = ["newton_kernels"]
 
 ROUNDS = 3
 """Linear solves of an attempt, over its iterations: those that lead to no step are bounded too."""
-SWIFT, FINE = 1.0e4, 1.0e-10  # roundings of its speed below which an error of a body's velocities is none; if so fine
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1  # of the first solve of a step that begins far from its end: what it is solved to is lost
@@ -211,7 +210,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                     eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
                     if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * largest:
                         eta = dq * step / wp.max(largest, f64(1.0e-300))
-                    if eta > ctl.floor_bound and step <= f64(SWIFT) * ctl.eps * speed and ctl.eps < f64(FINE):
+                    if eta > ctl.floor_bound and step <= f64(SWIFT) * ctl.eps * speed and ctl.eps < f64(COARSE):
                         eta = step / speed
                 worst = wp.max(worst, eta)
         ctl.eta[world] = worst
