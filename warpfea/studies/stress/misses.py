@@ -16,7 +16,6 @@ MISSES: dict[tuple[str, str, str], str] = {
     ("soft-dolphin", "float32", ""): "refused by name: float32 can't hold it",
     ("soft-thin-limbs", "float32", ""): "refused by name: float32 can't hold it",
     ("thin-static/T10-500", "float32", "cuda"): _THIN,
-    ("contact-graze/1e-12", "float64", ""): "a touch within rounding takes up to 150 iterations and halvings",
 }
 """Reasons by row, precision and kind of device ("": any)."""
 
