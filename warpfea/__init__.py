@@ -68,6 +68,7 @@ from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
 from .simulation.checkpoint import Checkpoint  # noqa: E402
 from .simulation.integrators import GeneralizedAlpha  # noqa: E402
+from .simulation.observations import Observations  # noqa: E402
 from .simulation.simulation import Simulation, StepReport  # noqa: E402
 from .simulation.statics import solve_static  # noqa: E402
 from .solvers import Jacobi, NewtonPCG  # noqa: E402
@@ -103,6 +104,7 @@ __all__ = [
     "NeoHookean",
     "NewtonPCG",
     "NodeSet",
+    "Observations",
     "OutputError",
     "PNGWriter",
     "PenetrationError",

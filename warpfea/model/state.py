@@ -54,6 +54,7 @@ class State:
         self.device = device
         self.specs: dict[str, ArraySpec] = {}
         self._arrays: dict[str, wp.array] = {}
+        self._words: dict[str, wp.array] = {}
         self.sealed = False
         self.asked: list[str] = []  # names in the order of `register`
 
@@ -116,12 +117,18 @@ class State:
     def copy_rows(self, launch: Launcher, flags: wp.array, source: State, skip: tuple[str, ...] = ()) -> None:
         """Copy the rows of the worlds with flag 1 from another state, bit for bit."""
         kernel = state_kernels().copy_rows
-        for name, target in self._arrays.items():
+        for name in self._arrays:
             if name in skip:
                 continue
-            a, b = words_of(source._arrays[name]), words_of(target)
+            a, b = source.words(name), self.words(name)
             if b.shape[1]:
                 launch(kernel, b.shape, [flags, a, b])
+
+    def words(self, name: str) -> wp.array:
+        """An array seen as [world, 32-bit word]."""
+        if name not in self._words:
+            self._words[name] = words_of(self._arrays[name])
+        return self._words[name]
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Copies of all arrays on the host."""

@@ -81,7 +81,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "slots": sim.model.slots,
         "integrator": sim.integrator.label,
         "gravity": sim.model.gravity.tolist(),
-        "dt": sim.dt if sim.error is None else "auto",
+        "dt": np.asarray(sim.dt).tolist() if sim.error is None else "auto",
         "steps": sim.steps,
         "max_residual": sim.max_residual,
         "max_floor": sim.max_floor,
@@ -148,7 +148,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
                 array.assign(arrays[f"set.{name}"])
         for term in sim.model.terms:
             term.parameters_taken()
-        sim.stepper.forget()
+        sim.stepper.forget(potential="predictor_potential" not in state)
         sim.stepper.start_terms()
     except CheckpointError as error:
         raise CheckpointError(f"{file}: {error}") from None

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from ..base.errors import ModelError
 from ..model.model import Model
 from ..model.state import State
 
-__all__ = ["check_choice", "check_constraint_tol", "check_dt", "check_model", "check_state", "check_steps"]
+__all__ = ["check_choice", "check_constraint_tol", "check_mask", "check_model", "check_state", "check_steps",
+           "check_times", "write_times"]  # fmt: skip
 
 
 def check_model(model: Any) -> None:
@@ -20,10 +21,55 @@ def check_model(model: Any) -> None:
         raise ModelError(f"expected a Model, got {type(model).__name__}; builder.finalize() makes one")
 
 
-def check_dt(value: Any) -> None:
-    """Raise ModelError for what is not a time step, s."""
-    if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
-        raise ModelError(f"dt = {value!r} must be a positive finite time (s)")
+def check_times(name: str, value: Any, model: Model, *, positive: bool = False) -> None:
+    """Raise ModelError for what is neither a time, s, nor one of each world; device arrays are looked at by shape."""
+    what = "positive finite time (s)" if positive else "finite time (s)"
+    if isinstance(value, wp.array):
+        if value.shape != (model.worlds,) or value.dtype != wp.float64 or value.device != model.device:
+            raise ModelError(
+                f"{name} = {value.dtype.__name__}{value.shape} on {value.device} must be a Warp array "
+                f"float64({model.worlds},) on {model.device}"
+            )
+        return
+    one = isinstance(value, (int, float, np.floating)) and not isinstance(value, bool)
+    if not one and not isinstance(value, (np.ndarray, list, tuple)):
+        raise ModelError(f"{name} = {value!r} must be a {what}, or one of each world")
+    try:
+        values = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        values = np.full((1, 1), np.nan)
+    if not one and values.shape != (model.worlds,):
+        raise ModelError(f"{name} = {value!r} must be a {what}, or {model.worlds} of them, one of each world")
+    bad = ~np.isfinite(values) | (positive & ~(values > 0.0))
+    if bad.any():
+        where = "" if one else f" of world {int(np.flatnonzero(bad)[0])}"
+        first = value if one else float(values[bad][0])
+        raise ModelError(f"{name} = {first!r}{where} must be a {what}")
+
+
+def write_times(target: wp.array, value: Any) -> None:
+    """Write a time, s, or one of each world to an array [world]."""
+    if isinstance(value, wp.array):
+        wp.copy(target, value)
+    elif isinstance(value, (int, float, np.floating)):
+        target.fill_(float(value))
+    else:
+        target.assign(np.asarray(value, dtype=float))
+
+
+def check_mask(mask: wp.array, model: Model) -> wp.array:
+    """A mask of worlds on the device as int32; ModelError for another shape, kind or device."""
+    known = mask.dtype in (wp.int32, wp.bool)
+    if mask.shape != (model.worlds,) or not known or mask.device != model.device:
+        raise ModelError(
+            f"reset: the mask is {mask.dtype.__name__}{mask.shape} on {mask.device}, expected int32 or bool "
+            f"({model.worlds},) on {model.device}"
+        )
+    if mask.dtype == wp.int32:
+        return mask
+    flags: wp.array = wp.empty(model.worlds, dtype=wp.int32, device=model.device)
+    wp.utils.array_cast(mask, flags)
+    return flags
 
 
 def check_choice(name: str, value: Any, first: str, second: str) -> None:

@@ -80,7 +80,7 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         else:
             hint += term.remark(sim.stepper.at, world)
     return kind(
-        f"{_step_from(sim, time)} was not accepted in world {world}: "
+        f"{_step_from(sim, time, world)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
         f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}{jumps}",
         time=time, world=world, residuals=history, element=element, state=sim.state,
@@ -120,11 +120,12 @@ def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
     return REASONS.get(code, "unknown reason"), smaller
 
 
-def _step_from(sim: Any, time: float) -> str:
+def _step_from(sim: Any, time: float, world: int) -> str:
     """The refused step, by its time (s) or part of the load."""
     if sim.integrator.static:
         return f"load step from {100.0 * time:.4g} % to {100.0 * (time + sim.dt):.4g} % of the load"
-    dt = f"{sim.dt:g} s" if sim.error is None else f"'auto', error = {sim.error:g}"
+    own = np.broadcast_to(sim.dt, sim.model.worlds)[world]
+    dt = f"{own:g} s" if sim.error is None else f"'auto', error = {sim.error:g}"
     return f"step from t = {time:.6g} s with dt = {dt}"
 
 
@@ -153,7 +154,7 @@ def _unsatisfied(sim: Any, world: int, time: float, halvings: int) -> Constraint
     listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
     few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
     return ConstraintError(
-        f"{_step_from(sim, time)}: constraints could not be satisfied in world {world} after "
+        f"{_step_from(sim, time, world)}: constraints could not be satisfied in world {world} after "
         f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or with "
         f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}{jumping_drives(sim, world)}",
         joints=names, violations=values, time=time, world=world, state=sim.state,

@@ -27,8 +27,9 @@ class Records(Results):
     """Results over time of probes, joints and contacts, and those of the last step."""
 
     stepper: Stepper
-    _history: list[np.ndarray]
-    _stepped: np.ndarray
+    _history: Any
+    _stepped: Any
+    _own_times: bool
 
     def probe(self, name: str) -> ProbeRecord:
         """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""
@@ -38,7 +39,7 @@ class Records(Results):
         k = names.index(name)
         table = self._table([0, *range(1 + 6 * k, 7 + 6 * k)])
         d, v = table[:, :, 1:4], table[:, :, 4:7]
-        return ProbeRecord(table[:, :, 0].max(axis=0), self.model.probes[k].X + d, d, v)
+        return ProbeRecord(self._times(table), self.model.probes[k].X + d, d, v)
 
     def _table(self, columns: list[int]) -> np.ndarray:
         """(B, steps, columns) of what was recorded: time, then the columns of the report from the probes on."""
@@ -46,12 +47,16 @@ class Records(Results):
             return np.stack([rows[:, columns] for rows in self._history], axis=1)
         return np.zeros((self.model.worlds, 0, len(columns)))
 
+    def _times(self, table: np.ndarray) -> np.ndarray:
+        """(steps,) s, or (B, steps) where worlds have times of their own."""
+        return table[:, :, 0] if self._own_times else table[:, :, 0].max(axis=0)
+
     def joint_record(self, joint: Joint | str) -> JointRecord:
         """What has been recorded of a joint (handle or name), one entry per step."""
         first = 1 + self._joint_column(joint) - len(REPORT)
         columns = [0, *range(first, first + JOINT_COLUMNS)]
         table = self._table(columns)
-        return JointRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
+        return JointRecord(self._times(table), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
 
     def joint_force(self, joint: Joint | str) -> np.ndarray:
         """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
@@ -108,7 +113,7 @@ class Records(Results):
         table = self._table([0, *range(first, first + len(RECORD))])
         names = ("normal_force", "penetration", "slip", "area", "stick", "stored", "loss", "friction", "collider_work")
         scalars = {name: table[:, :, 1 + RECORD.index(name)] for name in names}
-        return ContactRecord(table[:, :, 0].max(axis=0), table[:, :, 1:4], table[:, :, 4:7], **scalars)
+        return ContactRecord(self._times(table), table[:, :, 1:4], table[:, :, 4:7], **scalars)
 
     def contact_force(self, contact: Contact | PairContact | str) -> np.ndarray:
         """Force (N) and moment about the origin (N m) of a contact on its body over the last accepted step.

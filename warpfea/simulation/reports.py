@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
-__all__ = ["ContactRecord", "JointRecord", "ProbeRecord", "StepReport", "describe", "idle_report"]
+from ..base.errors import ModelError
+
+__all__ = ["ContactRecord", "JointRecord", "PendingReport", "ProbeRecord", "StepReport", "describe", "idle_report",
+           "step_text"]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +55,35 @@ class StepReport:
     largest_h: np.ndarray | None = None
 
 
+class PendingReport(StepReport):
+    """A report that is read from the device when one of its arrays is asked for.
+
+    Raises:
+        ModelError: the simulation has gone on since, and the report was not read before.
+    """
+
+    def __init__(self, sim: Any, number: int) -> None:
+        object.__setattr__(self, "_source", (sim, number))
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        sim, number = self._source
+        if sim.steps != number:
+            raise ModelError(f"the report of step {number} was not read before the simulation went on to {sim.steps}")
+        report = sim.last
+        for entry in fields(StepReport):
+            object.__setattr__(self, entry.name, getattr(report, entry.name))
+        return object.__getattribute__(self, name)
+
+    def __repr__(self) -> str:
+        return f"PendingReport(step {self._source[1]})"
+
+
 @dataclass(frozen=True, eq=False)
 class JointRecord:
-    """A joint over time: time (steps,); force (worlds, steps, 3), N, and moment about its anchor, N m, on the child in
+    """A joint over time: time (steps,), or (worlds, steps) where worlds have times of their own; force
+    (worlds, steps, 3), N, and moment about its anchor, N m, on the child in
     world axes; violation (worlds, steps), m, the largest of its rows."""
 
     time: np.ndarray
@@ -65,7 +94,8 @@ class JointRecord:
 
 @dataclass(frozen=True, eq=False)
 class ContactRecord:
-    """A contact over time, each (worlds, steps) but time (steps,).
+    """A contact over time, each (worlds, steps) but time (steps,), which is (worlds, steps) too where worlds have
+    times of their own.
 
     Attributes:
         time: s.
@@ -96,7 +126,8 @@ class ContactRecord:
 
 @dataclass(frozen=True, eq=False)
 class ProbeRecord:
-    """A probe over time: time (steps,), position, displacement and velocity (worlds, steps, 3), in m and m/s."""
+    """A probe over time: time (steps,), or (worlds, steps) where worlds have times of their own, s; position,
+    displacement and velocity (worlds, steps, 3), in m and m/s."""
 
     time: np.ndarray
     position: np.ndarray
@@ -111,10 +142,16 @@ def idle_report(sim: Any) -> StepReport:
     return StepReport(sim.status == 0, zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero, none, none)
 
 
+def step_text(dt: Any) -> str:
+    """A step of all worlds, s, or the range of those of each."""
+    low, high = float(np.min(dt)), float(np.max(dt))
+    return f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
+
+
 def describe(sim: Any) -> str:
     """A simulation in one line."""
     m, steps = sim.model, sim.steps
-    dt = f"{sim.dt:g} s" if sim.error is None else f"auto, error = {sim.error:g}"
+    dt = step_text(sim.dt) if sim.error is None else f"auto, error = {sim.error:g}"
     at = f"t = {float(sim.time.max()):.6g} s, {steps} steps, dt = {dt}, {sim.integrator.name}"
     if sim.load is not None:
         at = f"static, load {100.0 * float(sim.load.max()):.4g} %, {steps} load step{'s' * (steps != 1)}"

@@ -8,23 +8,35 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from .. import solvers
 from ..base.console import compile_bar, quiet_warp
-from ..base.errors import ConstraintError, ConvergenceError, ModelError
+from ..base.errors import ModelError
 from ..base.memory import enough_memory
-from ..kernels.step.control import REPORT, STATUS
+from ..base.names import listing
+from ..kernels.step.control import STATUS
 from ..model.assembly import require_density
 from ..model.handles import NodeSet
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
 from .adaptive import adapt_of
-from .checks import check_choice, check_constraint_tol, check_dt, check_model, check_state, check_steps
+from .checks import (
+    check_choice,
+    check_constraint_tol,
+    check_mask,
+    check_model,
+    check_state,
+    check_steps,
+    check_times,
+    write_times,
+)
 from .controls import Controls
-from .failures import check_closed, step_error
-from .records import Records
-from .reports import ContactRecord, JointRecord, ProbeRecord, StepReport, describe, idle_report
+from .digests import Digests
+from .failures import check_closed
+from .observations import Observations
+from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, describe, idle_report
 from .run_loop import run_steps
 from .stepper import Stepper
 
@@ -34,14 +46,16 @@ if TYPE_CHECKING:
 __all__ = ["ContactRecord", "JointRecord", "ProbeRecord", "Simulation", "StepReport"]
 
 
-class Simulation(Records):
+class Simulation(Digests):
     """Steps a model through time.
 
     Args:
         model: from ModelBuilder.finalize.
         state: where it starts; by default model.state(). It is advanced in place.
-        dt: step, s, which may be set later; or "auto": each world takes the steps that keep its error to `error`, and
-            all meet at common instants, to which `step` goes.
+        dt: step, s, of all worlds or of each (worlds,), which may be set later; or "auto": each world takes the steps
+            that keep its error to `error`, and all meet at common instants, to which `step` goes.
+        t_end: s, of all worlds or of each (worlds,), which may be set later: on the device worlds are frozen within
+            half a step of it, until they are reset. None: no end.
         error: of dt="auto": largest error of a position at the end, over the model's size (`model.size`).
         interval: of dt="auto": s between common instants at most; they are multiples of it, times of outputs, kinks of
             time laws and the ends of runs. None: a 64th of the first run, 1/60 s of steps without one.
@@ -75,7 +89,8 @@ class Simulation(Records):
         model: Model,
         state: State | None = None,
         *,
-        dt: float | str,
+        dt: float | str | np.ndarray | wp.array,
+        t_end: float | np.ndarray | wp.array | None = None,
         error: float | None = None,
         interval: float | None = None,
         horizon: float | None = None,
@@ -99,7 +114,15 @@ class Simulation(Records):
         given = {"error": error, "interval": interval, "horizon": horizon}
         adapt = adapt_of(dt, **given, model=model, scheme=scheme, solver=options)
         if adapt is None:
-            check_dt(dt)
+            check_times("dt", dt, model, positive=True)
+        if t_end is not None:
+            if adapt or scheme.static:
+                raise ModelError(
+                    f"t_end = {t_end!r}: only steps of a fixed size end there; run(t_end) does with others"
+                )
+            check_times("t_end", t_end, model)
+        # accelerations at the start are found on the host
+        quiet = on_failure == "freeze" and not record and not (adapt or scheme.accelerated or scheme.static)
         if constraint_tol is None:
             constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
         check_constraint_tol(constraint_tol)
@@ -115,27 +138,20 @@ class Simulation(Records):
             self.stepper = Stepper(
                 model, self.state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
-                adapt=adapt, on_compile=on_compile or bar,
+                adapt=adapt, quiet=quiet, ends=t_end is not None, on_compile=on_compile or bar,
             )  # fmt: skip
         model.parameters.begun = True
         self.controls = Controls(model, self.state)
         self.compile_s = clock.perf_counter() - began
         self.error = adapt.error if adapt else None
+        self._open_digest(quiet)
+        self._start: State | None = None
         if not isinstance(dt, str):
             self.dt = dt
+        if t_end is not None:
+            self.t_end = t_end
         check_closed(self)
-        self.steps = 0
-        self.last: StepReport | None = None
-        self.totals = {name: np.zeros(model.worlds, int) for name in ("newton", "pcg", "rough", "floored")}
-        if adapt:
-            self.totals |= {name: np.zeros(model.worlds, int) for name in ("substeps", "rejected")}
-        self.max_residual = 0.0
-        self.max_floor = 0.0
-        self.min_J = math.inf
-        self.max_violation = 0.0
         self._load: np.ndarray | None = None
-        self._stepped = np.zeros(model.worlds, dtype=bool)
-        self._history: list[np.ndarray] = []
 
     def __repr__(self) -> str:
         return describe(self)
@@ -143,17 +159,39 @@ class Simulation(Records):
     # stepping
 
     @property
-    def dt(self) -> float:
-        """Step, s; of dt="auto" the interval between common instants, NaN before the first run or step settles it."""
-        return self.stepper.adaptive.instants.interval if self.stepper.adaptive else self._dt
+    def dt(self) -> Any:
+        """Step, s, or (worlds,) where each has its own; of dt="auto" the interval between common instants, NaN before
+        the first run or step settles it."""
+        if self.stepper.adaptive:
+            return self.stepper.adaptive.instants.interval
+        return self.stepper.work.step.dt.numpy().copy() if self._dt is None else self._dt
 
     @dt.setter
-    def dt(self, value: float) -> None:
+    def dt(self, value: Any) -> None:
         if self.stepper.adaptive:
             raise ModelError(f"dt = {value!r}: this simulation was made with dt = 'auto'")
-        check_dt(value)
-        self._dt = float(value)
-        self.stepper.set_dt(self._dt)
+        check_times("dt", value, self.model, positive=True)
+        one = isinstance(value, (int, float, np.floating))
+        if not one and (self.integrator.static or self.integrator.accelerated):
+            raise ModelError(f"dt = {value!r}: integrator {self.integrator.name!r} takes one step for all worlds")
+        self._dt = float(value) if one else None
+        self._own_times |= not one
+        self.stepper.set_dt(self._dt if one else value)
+
+    @property
+    def t_end(self) -> np.ndarray | None:
+        """(worlds,), s: where worlds are frozen; None without."""
+        ends = self.stepper.loops.ends
+        return None if ends is None else ends.numpy().copy()
+
+    @t_end.setter
+    def t_end(self, value: Any) -> None:
+        ends = self.stepper.loops.ends
+        if ends is None:
+            raise ModelError(f"t_end = {value!r}: this simulation was made without; give t_end to Simulation")
+        check_times("t_end", value, self.model)
+        self._own_times |= not isinstance(value, (int, float, np.floating))
+        write_times(ends, value)
 
     @property
     def time(self) -> np.ndarray:
@@ -180,6 +218,9 @@ class Simulation(Records):
     def step(self, count: int = 1) -> StepReport:
         """Advance `count` steps of dt, or to the next common instants; the report is that of the last.
 
+        With record=False and on_failure="freeze" nothing is read back from the device (except with dt="auto" and
+        generalized-alpha): the report reads when an array of it is asked for, until the next call.
+
         Raises:
             ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
             ConstraintError: the same, and it is the constraints that can't be satisfied; it names them.
@@ -192,80 +233,15 @@ class Simulation(Records):
                 self.stepper.adaptive.aim(self.time)
             self.stepper.take_parameters()
             self.stepper.run()
-            report = self.stepper.work.report.numpy()
-            self._digest(report)
+            if self.quiet:
+                self.steps += 1
+                self._unread = True
+            else:
+                self._digest(self.stepper.work.report.numpy())
+        if self.quiet:
+            return PendingReport(self, self.steps)
         assert self.last is not None
         return self.last
-
-    def _digest(self, rows: np.ndarray) -> None:
-        column = {name: rows[:, k] for k, name in enumerate(REPORT)}
-        status = column["status"].astype(int)
-        before = self.last.status if self.last is not None else np.zeros(len(rows), int)
-        fresh = (status == STATUS["failed"]) & (before != STATUS["failed"])
-        self.last = StepReport(
-            converged=(status == STATUS["running"]) & (column["rough"] == 0.0),
-            newton=column["newton"].astype(int),
-            pcg=column["pcg"].astype(int),
-            residual=column["residual"].copy(),
-            halvings=column["halvings"].astype(int),
-            status=status,
-            min_J=column["min_J"].copy(),
-            time=column["time"].copy(),
-            failure=column["failure"].astype(int),
-            violation=column["violation"].copy(),
-            outer=column["outer"].astype(int),
-            residual_force=column["residual_force"].copy(),
-            floor=column["floor"].copy(),
-            **(self.stepper.adaptive.counts() if self.stepper.adaptive else {}),
-        )
-        self.steps += 1
-        good = status == STATUS["running"]
-        self._stepped |= good
-        self._stepped &= status != STATUS["failed"]
-        if self.stepper.adaptive:
-            self.totals["substeps"] += self.last.substeps
-            self.totals["rejected"] += self.last.rejected
-        self.totals["newton"] += self.last.newton
-        self.totals["pcg"] += self.last.pcg
-        self.totals["rough"] += good & ~self.last.converged
-        self.totals["floored"] += good & (self.last.floor > 0.0)
-        if good.any():
-            self.max_residual = max(self.max_residual, float(self.last.residual[good].max()))
-            self.max_floor = max(self.max_floor, float(self.last.floor[good].max()))
-            self.max_violation = max(self.max_violation, float(self.last.violation[good].max()))
-            self.min_J = min(self.min_J, float(self.last.min_J[good].min()))
-        if self._recorded:
-            if not self.record:
-                self._history.clear()
-            self._history.append(self._row(rows))
-        if fresh.any():
-            fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
-            if fatal:
-                if not good.any():  # no world advanced
-                    self.steps -= 1
-                    if self._recorded:
-                        self._history.pop()
-                raise self._failure(int(np.flatnonzero(fresh)[0]))
-
-    def _row(self, rows: np.ndarray) -> np.ndarray:
-        """What is kept of a report: time, probes, and what of terms a world that did not step does not tell."""
-        row = rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy()
-        row[~self._stepped, 1 + 6 * len(self.model.probes) :] = np.nan
-        return row
-
-    @property
-    def _recorded(self) -> bool:
-        """Whether there is anything to record of each step."""
-        return self.model.terms.report_width > len(REPORT)
-
-    def _failure(self, world: int) -> ConvergenceError | ConstraintError:
-        """The error for a failed world; its status is cleared so that a caller may try again with another dt."""
-        error = step_error(self, world)
-        status = self.state.status.numpy()
-        status[status == STATUS["failed"]] = STATUS["running"]
-        self.state.status.assign(status)
-        self.last = None
-        return error
 
     def run(
         self,
@@ -293,10 +269,12 @@ class Simulation(Records):
             raise ModelError(f"t_end = {t_end!r} must be finite")
         if not isinstance(outputs, (list, tuple)) or not all(hasattr(out, "write") for out in outputs):
             raise ModelError(f"run: outputs must be a list of writers such as USDWriter(path), got {outputs!r}")
+        if self._own_times:
+            raise ModelError("run: worlds have times of their own; take step(count), and t_end of Simulation")
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
         adaptive = self.stepper.adaptive
-        total = adaptive.steps_to(now, t_end, outputs) if adaptive else round((t_end - now) / self._dt)
+        total = adaptive.steps_to(now, t_end, outputs) if adaptive else round((t_end - now) / self.dt)
         if total < 0:
             raise ModelError(f"t_end = {t_end:g} s lies in the past: the simulation is at t = {now:.6g} s")
         # who has stepped may be as close to t_end as whole steps come; a start is not
@@ -315,7 +293,21 @@ class Simulation(Records):
         self.state.status.assign(status)
 
     def reset(self, mask: Any = None, state: State | None = None) -> None:
-        """Set worlds back to a state, by default to the model's initial one; mask [world], by default all."""
+        """Set worlds back to a state, by default to the model's initial one.
+
+        Args:
+            mask: [world], by default all; or a Warp array of int32 or bool on the model's device: nothing is read back
+                then, joints and overlaps are not checked, and worlds end bit-equal to a run from that state.
+            state: where they go. With a Warp array as the mask one that a simulation of this model has had, such as
+                `sim.state.like()` keeps.
+
+        Raises:
+            ModelError: another shape or device, or a state that lacks what the simulation keeps.
+            ConstraintError: joints that are open there.
+        """
+        if isinstance(mask, wp.array):
+            self._reset_on_device(mask, state)
+            return
         B = self.model.worlds
         mask = np.ones(B, bool) if mask is None else np.asarray(mask, dtype=bool)
         if mask.shape != (B,):
@@ -328,12 +320,48 @@ class Simulation(Records):
             array[mask] = fresh[name][mask] if name in fresh else np.asarray(spec.initial)
         self.state.load(values)
         self.stepper.forget(mask)
-        self._stepped[mask] = False
+        self._unstep(mask)
         self.stepper.start_terms(mask)
         if self.model.constraints:
             check_closed(self, mask)
         if self.stepper.ledger:
             self.stepper.begin_ledger(mask)
+
+    def _reset_on_device(self, mask: wp.array, state: State | None) -> None:
+        flags = check_mask(mask, self.model)
+        if state is None:
+            if self._start is None:
+                self._start = self._initial()
+            state = self._start
+        check_state(self.model, state)
+        if lacks := [name for name in self.state.names if name not in state.names]:
+            raise ModelError(f"reset: the state lacks {listing(lacks)}; with a Warp array as the mask take one that "
+                             "a simulation of this model has had: sim.state.like()")  # fmt: skip
+        self._own_times = True
+        self.state.copy_rows(self.stepper.launch, flags, state)
+        self.stepper.set_on_device(flags)
+        if self.quiet:
+            self.stepper.loops.unstep(flags)
+            self._unread = True
+        else:
+            self._stepped[flags.numpy() != 0] = False
+
+    def _initial(self) -> State:
+        """The state that a simulation from the model's initial one begins with."""
+        now, stepped = self.state.like(), self._stepped.copy()
+        self.reset()
+        start = self.state.like()
+        everyone = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
+        self.state.copy_rows(self.stepper.launch, everyone, now)
+        self.stepper.set_on_device(everyone)
+        self._stepped = stepped
+        if self.stepper.loops.stepped is not None:
+            self.stepper.loops.stepped.assign(stepped.astype(np.int32))
+        return start
+
+    def observe(self, *names: str) -> Observations:
+        """Numbers of each world as one table on the device, see Observations."""
+        return Observations(self, names)
 
     # results of the whole run; more in Records, those of the present state in Results
 
@@ -372,7 +400,7 @@ class Simulation(Records):
         from .checkpoint import load_checkpoint
 
         load_checkpoint(self, path)
-        self._stepped[:] = False
+        self._unstep(np.ones(self.model.worlds, bool))
 
     def bytes(self) -> dict[str, int]:
         """Bytes on the device: constants, scratch, and each array of the state (twice where steps may be halved)."""

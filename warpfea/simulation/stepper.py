@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +21,10 @@ from ..terms.checks import check_measured
 from ..terms.term import At, Term
 from ..terms.workspace import Workspace
 from .adaptive import Adapt, Adaptive
+from .checks import write_times
+from .compiling import OnCompile, load_modules
 from .integrators import Integrator
+from .loops import Loops
 from .opening import Opening
 from .predictor import Predictor
 
@@ -35,7 +35,6 @@ __all__ = ["Stepper"]
 
 CANDIDATES = (0, 1, 2)
 """Other first iterates, see the kernel `candidate`."""
-OnCompile = Callable[[int, int, str], None]
 
 
 class Stepper:
@@ -56,6 +55,8 @@ class Stepper:
         constraint_tol: float = 0.0,
         inversion: str = "refuse",
         adapt: Adapt | None = None,
+        quiet: bool = False,
+        ends: bool = False,
         on_compile: OnCompile | None = None,
     ) -> None:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
@@ -95,6 +96,9 @@ class Stepper:
         self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
+        if model.terms.traits.walls:  # it has energies of contact, which nothing measures at rest
+            state.register("predictor_potential", wp.float64)
+            self.work.newton.potential = state.predictor_potential
         self.predictor: Predictor | None = None
         # single roundings would grow from step to step, and so would what Jacobi's steps leave
         if not integrator.static and model.dtype == "float64" and isinstance(solver, NewtonPCG):
@@ -111,6 +115,7 @@ class Stepper:
             tries = solver.max_halvings
             self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
+        self.loops = Loops(model, self.work, self.launch, quiet=quiet, ends=ends)
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
         self.backup = state.like() if solver.max_halvings > 0 or self.adaptive else None
@@ -150,9 +155,8 @@ class Stepper:
         following = [term for term in self.terms if type(term).start is not Term.start]
         if not following and self.terms.dead.gravity_law is None:
             return
-        m, w, state = self.model, self.work, self.state
-        flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
-        active: wp.array = wp.array(flags, dtype=wp.int32, device=m.device)
+        w, state = self.work, self.state
+        active = self._flags(mask)
         w.step.new_time.assign(state.time)
         w.stage_time.assign(state.time)
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
@@ -183,13 +187,16 @@ class Stepper:
         self.state.ledger.assign(ledger)
         self.state.ledger_time.assign(self.state.time)
 
-    def forget(self, mask: np.ndarray | None = None) -> None:
-        """The state of the chosen worlds was set from elsewhere: what follows it on the device is made anew."""
-        m = self.model
-        flags = np.ones(m.worlds, dtype=np.int32) if mask is None else np.asarray(mask).astype(np.int32)
-        self.newton.forget(wp.array(flags, dtype=wp.int32, device=m.device))
-        self._measure_potential(flags)
-        self._changes[flags != 0] = m.parameters.changes[flags != 0]
+    def forget(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:
+        """The state of the chosen worlds was set from elsewhere: what follows it on the device is made anew.
+
+        `potential`: also where the state keeps it.
+        """
+        self.newton.forget(self._flags(mask))
+        if potential or "predictor_potential" not in self.state.names:
+            self._measure_potential(mask)
+        chosen = slice(None) if mask is None else np.asarray(mask, dtype=bool)
+        self._changes[chosen] = self.model.parameters.changes[chosen]
 
     def take_parameters(self) -> None:
         """Follow constants of materials that were set since the last step: kept matrices, the energy of the state.
@@ -213,11 +220,16 @@ class Stepper:
             ledger[mask, strain] = energy[mask]
             self.state.ledger.assign(ledger)
 
-    def _measure_potential(self, flags: np.ndarray | None) -> None:
+    def set_on_device(self, flags: wp.array) -> None:
+        """The state of the flagged worlds was set to one that terms and the ledger have been brought up to."""
+        self.newton.forget(flags)
+        if "predictor_potential" not in self.state.names:
+            self._measure_potential(flags)
+
+    def _measure_potential(self, flags: np.ndarray | wp.array | None) -> None:
         """Strain energy of the state in the chosen worlds, by which first iterates are judged."""
-        m, w = self.model, self.work
-        flags = np.ones(m.worlds, dtype=np.int32) if flags is None else flags
-        active: wp.array = wp.array(flags, dtype=wp.int32, device=m.device)
+        w = self.work
+        active: wp.array = flags if isinstance(flags, wp.array) else self._flags(flags)
         w.u_stage.assign(self.state.displacement)
         if self.at.midpoint:
             w.v_stage.zero_()
@@ -225,10 +237,16 @@ class Stepper:
         with self.launch.rare():
             residual.elements.force(self.at, active)
             residual.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
-        energy = w.newton.potential.numpy()
-        chosen = flags != 0
-        energy[chosen] = w.newton.elem_sums.numpy()[0][chosen]
-        w.newton.potential.assign(energy)
+        measured = w.newton.elem_sums[0]
+        if isinstance(flags, wp.array):
+            self.loops.take_numbers(flags, measured, w.newton.potential)
+        else:
+            w.newton.potential.assign(np.where(active.numpy() != 0, measured.numpy(), w.newton.potential.numpy()))
+
+    def _flags(self, mask: np.ndarray | None) -> wp.array:
+        """A mask of worlds, by default all, on the device."""
+        flags = np.ones(self.model.worlds) if mask is None else np.asarray(mask)
+        return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
 
     def _record(self) -> wp.Graph:
         with wp.ScopedCapture(device=self.model.device) as capture:
@@ -246,10 +264,11 @@ class Stepper:
             out.add(state_kernels().module)
         if self.adaptive:
             out.add(self.adaptive.kernels.module)
+        out |= self.loops.modules()
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
-        """Compile what a step launches, and what starts the ledger, on several threads; loaded modules cost nothing."""
+        """Compile what a step launches, and what starts the ledger."""
         from ..kernels.step.gather import gather_kernels
 
         m = self.model
@@ -257,33 +276,12 @@ class Stepper:
         if self.ledger:
             extra = [b.kernels_for(m.dtype, None).module for b in m.blocks] + [gather_kernels(m.dtype).module]
             modules |= {module.name: module for module in extra}
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
-            load = partial(wp.force_load, m.device, max_workers=0)
-            waiting = {pool.submit(load, [module]): name for name, module in modules.items()}
-            for done, future in enumerate(as_completed(waiting)):
-                self._raise_of(future, waiting[future])
-                if self.on_compile:
-                    self.on_compile(done + 1, len(waiting), waiting[future])
+        load_modules(modules, m.device, self.on_compile)
 
-    @staticmethod
-    def _raise_of(future: Future[Any], name: str) -> None:
-        """Errors of compilation; those of a user's function as such."""
-        try:
-            future.result()
-        except Exception as error:
-            if ".law_" in name or ".field_" in name:
-                reason = str(error).strip().splitlines()[-1]
-                raise ModelError(
-                    f"Warp can't compile a wp.func given as a time law or field ({name.rpartition('.')[2]}): {reason}; "
-                    "write it in the precision of its annotations, such as def f(t: wp.float64) -> wp.float64: return "
-                    "wp.float64(2.0) * t"
-                ) from error
-            raise
-
-    def set_dt(self, dt: float) -> None:
-        """Step of all worlds, s."""
+    def set_dt(self, dt: Any) -> None:
+        """Step of all worlds, s, or of each [world]."""
         self._dt = dt
-        self.work.step.dt.fill_(dt)
+        write_times(self.work.step.dt, dt)
 
     def run(self) -> None:
         """Do one step of every running world."""
@@ -301,6 +299,7 @@ class Stepper:
         """All launches of a step."""
         m, w, launch = self.model, self.work, self.launch
         w.any_flag[2:5].zero_()
+        self.loops.open()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
         if self.adaptive:
             assert self.backup is not None
@@ -322,6 +321,7 @@ class Stepper:
             self._probe()
         for term in self.terms:
             term.report(self.at)
+        self.loops.close()
 
     @labelled("commit")
     def _undo(self) -> None:

@@ -328,29 +328,37 @@ class ConstraintTables:
 
     def measure(self, joint: Joint, what: str | None, state: Any) -> np.ndarray:
         """ "angle" (rad), "travel" or "length" (m) of a joint, (worlds,); ModelError where it has none."""
-        length = joint.rows[0].a if joint.rows[0].kind == DISTANCE else None
-        has = {"angle": joint.angle, "travel": joint.travel, "length": length}
-        known = [name for name, vectors in has.items() if vectors]
-        what = what or next(iter(known), None)
-        if what not in known:
+        has = self.vectors_of(joint)
+        what = what or next(iter(has), None)
+        if what not in has:
             raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no {what or 'angle, travel or length'}")
-        target = self.targets(state)
+        target, turn = self.targets(state), self.turn_of(joint)
         out = []
         for world, u in enumerate(state.displacement.numpy().astype(float)):
+            vectors = [self._present(v, u) for v in has[what]]
             if what == "length":
-                assert length is not None
-                out.append(np.linalg.norm(self._present(length, u)))
+                out.append(np.linalg.norm(vectors[0]))
             elif what == "travel":
-                gap, axis = (self._present(v, u) for v in joint.travel or ())
+                gap, axis = vectors
                 out.append(gap @ axis)
             else:
-                a, a2, b = (self._present(v, u) for v in joint.angle or ())
+                a, a2, b = vectors
                 angle = np.arctan2(b @ a2, b @ a)
-                driven = [k for k in self.rows_of[joint.index] if self.rows[k].kind == TURN]
-                if driven:
-                    angle += 2.0 * np.pi * np.round((target[world, driven[0]] - angle) / (2.0 * np.pi))
+                if turn >= 0:
+                    angle += 2.0 * np.pi * np.round((target[world, turn] - angle) / (2.0 * np.pi))
                 out.append(angle)
         return np.array(out)
+
+    @staticmethod
+    def vectors_of(joint: Joint) -> dict[str, list[Vector]]:
+        """Vectors that "angle" (three), "travel" (two) and "length" (one) of a joint are made of, where it has them."""
+        length = [joint.rows[0].a] if joint.rows[0].kind == DISTANCE else []
+        has = {"angle": list(joint.angle or ()), "travel": list(joint.travel or ()), "length": length}
+        return {name: vectors for name, vectors in has.items() if vectors}
+
+    def turn_of(self, joint: Joint) -> int:
+        """Row of the drive whose full turns the angle of a joint counts, or -1."""
+        return next((int(k) for k in self.rows_of[joint.index] if self.rows[k].kind == TURN), -1)
 
     def targets(self, state: Any) -> np.ndarray:
         """Right sides (worlds, rows) that the state was brought to; of a state that never stepped those of its time."""

@@ -1,0 +1,203 @@
+"""Numbers of each world in a table on the device, for loops that do not leave it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..base.names import did_you_mean, listing
+from ..kernels.step.loops import MOTION, VALUES, observation_kernels
+from ..kernels.terms.contact_data import RECORD
+
+__all__ = ["Observations"]
+
+JOINT_REPORT = {"force": (0, 3), "moment": (3, 3), "violation": (6, 1)}
+CONTACT_REPORT = {"force": (0, 3), "moment": (3, 3)} | {name: (k, 1) for k, name in enumerate(RECORD) if k > 5}
+FORMS = "'time', 'body.NAME.position', 'probe.NAME.velocity', 'joint.NAME.angle' or 'contact.NAME.force'"
+
+
+class Observations:
+    """A table [world, column] on the device that `update()` fills from the present state; made by `sim.observe(...)`.
+
+    Each name stands for columns side by side, in the order of the names:
+
+        time                                              1: s
+        body.NAME.position, .displacement, .velocity      3 per node of the mesh, in its order: m, m/s
+        probe.NAME.position, .displacement, .velocity     3: m, m/s
+        joint.NAME.angle, .travel, .length                1: rad, m; as `sim.joint_value`
+        joint.NAME.force, .moment, .violation             3, 3, 1: N, N m, m; as `sim.joint_force`
+        contact.NAME.force, .moment, .normal_force, ...   3, 3, 1: what `ContactRecord` has, over the last step
+
+    Forces are 0 in worlds that have not stepped since they were made or reset. Nothing is read back: `update()`
+    launches kernels, and `array` is always the same memory, which `wp.to_torch(obs.array)`, `torch.from_dlpack(obs)`
+    and, on the CPU, `obs.array.numpy()` share without a copy.
+
+    Attributes:
+        array: Warp array [world, column] in the model's precision.
+        columns: slice of the columns, by name.
+    """
+
+    def __init__(self, sim: Any, names: tuple[str, ...]) -> None:
+        self._sim, self._model = sim, sim.model
+        if not names:
+            raise ModelError(f"observe: name what to observe, such as {FORMS}")
+        self.columns: dict[str, slice] = {}
+        self._points: list[tuple[Any, Any, str, Any, int]] = []
+        self._values: list[tuple[list[Any], str, int, int]] = []
+        self._reports: list[tuple[int, int]] = []
+        self._times: list[int] = []
+        self._width = 0
+        for name in names:
+            first = self._width
+            self._add(name)
+            self.columns[name] = slice(first, self._width)
+        self.array: wp.array = wp.zeros((self._model.worlds, self._width), dtype=self._model.types.T,
+                                        device=self._model.device)  # fmt: skip
+        self._kernels = observation_kernels(self._model.dtype)
+        self._upload()
+
+    # names
+
+    def _add(self, name: Any) -> None:
+        if not isinstance(name, str) or name in self.columns:
+            twice = "is there twice" if isinstance(name, str) else "is no name"
+            raise ModelError(f"observe: {name!r} {twice}")
+        if name == "time":
+            self._times.append(self._width)
+            self._width += 1
+            return
+        kind, _, rest = name.partition(".")
+        owner, _, what = rest.rpartition(".")
+        makers = {"body": self._body, "probe": self._probe, "joint": self._joint, "contact": self._contact}
+        if kind not in makers or not owner:
+            raise ModelError(f"observe: {name!r} is unknown{did_you_mean(kind, list(makers))}; names are {FORMS}")
+        makers[kind](name, owner, what)
+
+    def _choose(self, name: str, what: str, known: Any) -> None:
+        if what not in known:
+            hint = did_you_mean(what, list(known))
+            raise ModelError(f"observe: {name!r} is unknown; of {name.rpartition('.')[0]!r} there are: "
+                             f"{listing(known)}{hint}")  # fmt: skip
+
+    def _body(self, name: str, owner: str, what: str) -> None:
+        bodies = {body.name: body for body in self._model.bodies}
+        if owner not in bodies:
+            raise ModelError(f"observe: body {owner!r} is unknown; there are: {listing(bodies)}"
+                             f"{did_you_mean(owner, list(bodies))}")  # fmt: skip
+        self._choose(name, what, MOTION)
+        body = bodies[owner]
+        for node, X in enumerate(body.mesh.points):
+            slot = int(body.node_slot[node])
+            slots = [body.slot_offset + slot] if slot >= 0 else []
+            self._points.append((slots, [1.0] * len(slots), what, X, self._width))
+            self._width += 3
+
+    def _probe(self, name: str, owner: str, what: str) -> None:
+        probes = {probe.name: probe for probe in self._model.probes}
+        if owner not in probes:
+            raise ModelError(f"observe: probe {owner!r} is unknown; there are: {listing(probes)}"
+                             f"{did_you_mean(owner, list(probes))}")  # fmt: skip
+        self._choose(name, what, MOTION)
+        probe = probes[owner]
+        self._points.append((probe.body.slot_offset + probe.slots, probe.weights, what, probe.X, self._width))
+        self._width += 3
+
+    def _joint(self, name: str, owner: str, what: str) -> None:
+        first = self._sim._joint_column(owner)
+        tables = self._model.constraints
+        assert tables is not None
+        joint = self._sim._joint(owner)
+        has = tables.vectors_of(joint)
+        self._choose(name, what, [*has, *JOINT_REPORT])
+        if what in has:
+            self._values.append((has[what], what, tables.turn_of(joint), self._width))
+            self._width += 1
+            return
+        self._report(first, JOINT_REPORT[what])
+
+    def _contact(self, name: str, owner: str, what: str) -> None:
+        first = self._sim._contact_column(owner)
+        self._choose(name, what, CONTACT_REPORT)
+        self._report(first, CONTACT_REPORT[what])
+
+    def _report(self, first: int, columns: tuple[int, int]) -> None:
+        begin, count = columns
+        for k in range(count):
+            self._reports.append((first + begin + k, self._width))
+            self._width += 1
+
+    # tables
+
+    def _upload(self) -> None:
+        m = self._model
+
+        def array(values: Any, dtype: Any) -> wp.array:
+            return wp.array(np.asarray(values), dtype=dtype, device=m.device)
+
+        def sums(entries: list[tuple[Any, Any]]) -> list[wp.array]:
+            start = np.concatenate([[0], np.cumsum([len(slots) for slots, _ in entries])])
+            slot = np.concatenate([*(np.asarray(slots, dtype=float) for slots, _ in entries), np.zeros(1)])
+            weight = np.concatenate([*(np.asarray(w, dtype=float) for _, w in entries), np.zeros(1)])
+            return [array(start, wp.int32), array(slot, wp.int32), array(weight, wp.float64)]
+
+        points = self._points
+        self._motion = [
+            *sums([(slots, weights) for slots, weights, *_ in points]), array([MOTION[p[2]] for p in points], wp.int32),
+            array(np.array([p[3] for p in points], dtype=float).reshape(-1, 3), wp.vec3d),
+            array([p[4] for p in points], wp.int32),
+        ] if points else []  # fmt: skip
+        vectors = [v for entry in self._values for v in (entry[0] + [entry[0][0]] * 2)[:3]]
+        entries = [vector.entries() for vector in vectors]
+        self._joint_values = [
+            *sums([(slots, weights) for slots, weights, _ in entries]),
+            array(np.array([v.value for v in vectors], dtype=float).reshape(-1, 3), wp.vec3d),
+            array([VALUES[v[1]] for v in self._values], wp.int32), array([v[2] for v in self._values], wp.int32),
+            array([v[3] for v in self._values], wp.int32),
+        ] if vectors else []  # fmt: skip
+        reports = np.array(self._reports, dtype=np.int32).reshape(-1, 2)
+        self._report_columns = [array(reports[:, k].copy(), wp.int32) for k in range(2)] if len(reports) else []
+        self._stepped: wp.array | None = None
+        if self._report_columns:
+            own = self._sim.stepper.loops.stepped
+            self._stepped = wp.zeros(m.worlds, dtype=wp.int32, device=m.device) if own is None else own
+
+    # use
+
+    def update(self) -> wp.array:
+        """Fill the table from the present state and the last step; returns `array`."""
+        sim, k, B = self._sim, self._kernels, self._model.worlds
+        state, launch = sim.state, sim.stepper.launch
+        if self._motion:
+            args = [*self._motion, state.displacement, state.velocity, self.array]
+            launch(k.motions, (B, len(self._points)), args)
+        if self._joint_values:
+            args = [*self._joint_values, state.displacement, state.constraint_target, self.array]
+            launch(k.joint_values, (B, len(self._values)), args)
+        if self._report_columns:
+            assert self._stepped is not None
+            if not sim.quiet:  # the host knows
+                self._stepped.assign(sim._stepped.astype(np.int32))
+            args = [*self._report_columns, sim.stepper.work.report, self._stepped, self.array]
+            launch(k.reports, (B, len(self._reports)), args)
+        for column in self._times:
+            launch(k.numbers, B, [state.time, column, self.array])
+        return self.array
+
+    def __getitem__(self, name: str) -> wp.array:
+        """The columns of a name [world, column], a view of `array`."""
+        if name not in self.columns:
+            hint = did_you_mean(name, list(self.columns))
+            raise ModelError(f"observations have no {name!r}; they have: {listing(self.columns)}{hint}")
+        return self.array[:, self.columns[name]]
+
+    def __dlpack__(self, stream: Any = None) -> Any:
+        return self.array.__dlpack__(stream)
+
+    def __dlpack_device__(self) -> Any:
+        return self.array.__dlpack_device__()
+
+    def __repr__(self) -> str:
+        return f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._width})"
