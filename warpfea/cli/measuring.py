@@ -90,6 +90,7 @@ def add_bench(commands: Any) -> None:
     kind.add_argument("--contact", action="store_true", help="a step with contact beside one without")
     kind.add_argument("--price", action="store_true", help="every scene beside itself with all that it leaves out")
     kind.add_argument("--pairs", action="store_true", help="contact between bodies: piles, solves, search, worlds")
+    kind.add_argument("--worlds", action="store_true", help="many worlds of small models: error beside run time")
     to.add_argument(
         "--problem",
         action="append",
@@ -119,7 +120,7 @@ def add_bench(commands: Any) -> None:
         metavar="N",
         help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
     )
-    group = to.add_argument_group("with --peer, --cpu, --scenes, --price or --pairs")
+    group = to.add_argument_group("with --peer, --cpu, --scenes, --price, --pairs or --worlds")
     group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
     group.add_argument(
         "--before", metavar="FILE", help="--scenes: an earlier file to stand beside (the `before` in it, if it has one)"

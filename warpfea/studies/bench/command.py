@@ -3,7 +3,7 @@
 Sizes are numbers of unknowns, met as closely as the problem allows. The error of the tip is measured against the same
 mesh and steps with a tolerance 100 times tighter in float64, over the largest tip displacement of the reference.
 The other kinds of measurement are in files of their own: peer.py, growth.py, product.py, cpu.py, scenes.py,
-contact.py, price.py, pairs.py.
+contact.py, price.py, pairs.py, worlds.py.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from .price import price
 from .problems import PROBLEMS
 from .product import product
 from .scenes import scenes
+from .worlds import worlds
 
 __all__ = ["OPTIONS", "bench", "table"]
 
@@ -38,6 +39,7 @@ OPTIONS = {
     "contact": {"unknowns", "dtype", "steps", "repeat", "tol"},
     "price": {"rows", "steps", "repeat"},
     "pairs": {"rows", "dtype", "steps"},
+    "worlds": {"rows", "dtype"},
 }
 """Options of each kind of measurement, besides those of all."""
 
@@ -56,7 +58,7 @@ def bench(options: argparse.Namespace) -> None:
         check_target(options.out, (".json",))
     do = {
         "table": table, "peer": peer, "growth": growth, "product": product, "cpu": cpu, "scenes": scenes,
-        "contact": contact, "price": price, "pairs": pairs,
+        "contact": contact, "price": price, "pairs": pairs, "worlds": worlds,
     }  # fmt: skip
     with quiet_warp():
         do[kind](options)

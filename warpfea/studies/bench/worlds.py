@@ -1,0 +1,239 @@
+"""`warpfea bench --worlds`: many worlds of small models, error beside run time.
+
+Scenes: `pendulum` with 16 elements, h = 2 ms; `slider` (slider_crank), 1 ms; `double` (double_pendulum), 4 ms; `finger`,
+a box 0.12 x 0.02 x 0.02 m with 20 x 2 x 2 cells of T10, neo-Hookean, E = 1 MPa, nu = 0.45, 1100 kg/m^3, eta = 300 Pa s,
+clamped, with a traction that rises to 2 kPa in 0.1 s, 2 ms; `tets`, the same box with 12 x 2 x 2 cells of five T4 under
+gravity alone, 2 ms.
+
+Three steps are not timed, then ten are; after 100 steps ten again. Steps read nothing back (record=False,
+on_failure="freeze", no ledger). The tip of world 0 is compared with that of one world in float64 with a tolerance of
+1e-11, over its travel. `equal`: all worlds have the bits of the first. Methods: `auto`; `banded`, factors of the band
+by a block of threads per world; `loose` and `rough`, the same with tolerances of 1e-3 and 1e-2. `goal`: world-steps per
+second that were asked for at 4096 worlds in float64.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ... import mesh
+from ...base.errors import CapacityError, ModelError
+from ...builder.builder import ModelBuilder
+from ...builder.scene import find
+from ...materials import KelvinVoigt, NeoHookean
+from ...simulation.simulation import Simulation
+from ...solvers import NewtonPCG
+from .measure import by_label
+from .measure import write as write_file
+
+__all__ = ["CASES", "GOALS", "WorldsRow", "five_tets", "worlds"]
+
+WORLDS = (1, 64, 1024, 4096, 16384)
+WARM, TIMED, LATER = 3, 10, 100
+GOALS = {"pendulum": 850_000, "slider": 200_000, "double": 100_000, "finger": 25_000, "tets": 1_638_400}
+"""World-steps/s at 4096 worlds; of `tets` 2.5 ms per step."""
+METHODS: dict[str, dict[str, Any]] = {
+    "auto": {}, "banded": {"preconditioner": "banded"}, "loose": {"preconditioner": "banded", "tol": 1e-3},
+    "rough": {"preconditioner": "banded", "tol": 1e-2},
+}  # fmt: skip
+TIGHT = 1e-11
+
+
+def five_tets(size: tuple[float, float, float], cells: tuple[int, int, int]) -> Any:
+    """A box of T4, five per cell, mirrored from cell to cell so that faces match."""
+    n = np.array(cells) + 1
+    grid = np.stack(np.meshgrid(*(np.linspace(0.0, s, k) for s, k in zip(size, n)), indexing="ij"), axis=-1)
+
+    def number(i: int, j: int, k: int) -> int:
+        return int((i * n[1] + j) * n[2] + k)
+
+    out = []
+    for i, j, k in np.ndindex(*cells):
+        odd = (i + j + k) % 2
+        c = [number(i + (a ^ odd), j + b, k + d) for a in (0, 1) for b in (0, 1) for d in (0, 1)]
+        out += [[c[p] for p in tet] for tet in ((0, 1, 2, 4), (3, 2, 1, 7), (5, 4, 7, 1), (6, 7, 4, 2), (1, 2, 4, 7))]
+    points, tets = grid.reshape(-1, 3), np.array(out)
+    edges = points[tets[:, 1:]] - points[tets[:, :1]]
+    flipped = np.linalg.det(edges) < 0.0
+    tets[flipped, 1], tets[flipped, 2] = tets[flipped, 2].copy(), tets[flipped, 1].copy()
+    ends = {"x-": np.flatnonzero(points[:, 0] == 0.0), "x+": np.flatnonzero(points[:, 0] == size[0])}
+    return mesh.Mesh(points, tets, "tetra", node_sets=ends)
+
+
+def _finger(points: Any, traction: bool) -> ModelBuilder:
+    b = ModelBuilder(gravity=(0, 0, -9.81))
+    law = NeoHookean.from_E_nu(E=1e6, nu=0.45, density=1100.0, damping=KelvinVoigt(eta=300.0) if traction else None)
+    body = b.add_solid(points, material=law, name="finger")
+    b.clamp(body.nodes("x-"))
+    if traction:
+        b.add_traction(body.surface("x+"), ((0.0, 0.1), ((0, 0, 0), (0, 2e3, 0))))
+    b.add_probe("tip", body.nodes("x+"))
+    return b
+
+
+def _scene(name: str, **given: Any) -> ModelBuilder:
+    return find(name)(**given)
+
+
+SCENES: dict[str, tuple[Callable[[], ModelBuilder], float]] = {
+    "pendulum": (partial(_scene, "pendulum", elements=16), 2e-3),
+    "slider": (partial(_scene, "slider_crank"), 1e-3),
+    "double": (partial(_scene, "double_pendulum"), 4e-3),
+    "finger": (lambda: _finger(mesh.box((0.12, 0.02, 0.02), cells=(20, 2, 2)), True), 2e-3),
+    "tets": (lambda: _finger(five_tets((0.12, 0.02, 0.02), (12, 2, 2)), False), 2e-3),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row by its label: scene, method, worlds."""
+
+    label: str
+    scene: str
+    method: str
+    worlds: int
+
+
+def _methods(scene: str) -> list[str]:
+    if scene in ("double", "finger"):
+        return ["auto"]
+    return ["auto", "banded"] if scene != "tets" else list(METHODS)
+
+
+CASES = [Case(f"{s}-{m}-{B}", s, m, B) for s in SCENES for m in _methods(s) for B in WORLDS]
+
+
+@dataclass(frozen=True)
+class WorldsRow:
+    """A measurement; times in ms, errors over the tip's travel.
+
+    Attributes:
+        later_ms, later_error: after `LATER` steps.
+        equal: every world has the bits of the first.
+        goal, reached: world-steps per second asked for, and whether they are.
+        note: why there are no numbers, such as too little memory.
+    """
+
+    label: str
+    dtype: str
+    worlds: int
+    unknowns: int
+    ms_per_step: float | None = None
+    world_steps_per_s: float | None = None
+    newton_per_step: float | None = None
+    pcg_per_step: float | None = None
+    tip_error: float | None = None
+    later_ms: float | None = None
+    later_error: float | None = None
+    bytes_per_world: float | None = None
+    equal: bool | None = None
+    goal: float | None = None
+    reached: bool | None = None
+    setup_s: float | None = None
+    methods: dict[str, str] | None = None
+    note: str | None = None
+
+
+class References:
+    """Tips of one world with a tight tolerance, by scene: after the timed steps, and after the later ones."""
+
+    def __init__(self, device: Any) -> None:
+        self.device = device
+        self.known: dict[str, list[np.ndarray]] = {}
+
+    def of(self, scene: str) -> list[np.ndarray]:
+        """Displacements (3,), m, after `WARM + TIMED` and `LATER + TIMED` steps, and the travel of both."""
+        if scene not in self.known:
+            build, dt = SCENES[scene]
+            sim = Simulation(build().finalize(device=self.device), dt=dt, solver=NewtonPCG(tol=TIGHT), ledger=False)
+            sim.step(LATER + TIMED)
+            moved = sim.probe(sim.model.probes[0].name).displacement[0]
+            self.known[scene] = [moved[WARM + TIMED - 1], moved[LATER + TIMED - 1]]
+        return self.known[scene]
+
+    def error(self, scene: str, which: int, tip: np.ndarray) -> float:
+        """Distance of a tip from the reference, over its travel."""
+        wanted = self.of(scene)[which]
+        return float(np.linalg.norm(tip - wanted) / np.linalg.norm(wanted))
+
+
+def _timed(sim: Simulation) -> float:
+    """ms per step of the next ones."""
+    wp.synchronize_device(sim.model.device)
+    began = clock.perf_counter()
+    sim.step(TIMED)
+    wp.synchronize_device(sim.model.device)
+    return 1e3 * (clock.perf_counter() - began) / TIMED
+
+
+def measure(case: Case, dtype: str, device: Any, references: References) -> WorldsRow:
+    """A row; where memory does not suffice, or a method does not serve, it says so."""
+    build, dt = SCENES[case.scene]
+    began = clock.perf_counter()
+    goal = GOALS[case.scene] if case.worlds == 4096 and dtype == "float64" else None
+    unknowns = 0
+    try:
+        model = build().finalize(device=device, dtype=dtype, worlds=case.worlds)
+        unknowns = model.info()["unknowns"]
+        method = NewtonPCG(**METHODS[case.method])
+        sim = Simulation(model, dt=dt, solver=method, ledger=False, record=False, on_failure="freeze")
+        sim.step(WARM)
+    except (CapacityError, ModelError) as error:
+        return WorldsRow(case.label, dtype, case.worlds, unknowns, goal=goal, note=str(error))
+    setup = clock.perf_counter() - began
+    before = {name: int(sim.totals[name][0]) for name in ("newton", "pcg")}
+    ms = _timed(sim)
+    spent = {name: (int(sim.totals[name][0]) - count) / TIMED for name, count in before.items()}
+    name = model.probes[0].name
+    error = references.error(case.scene, 0, sim.probe(name).displacement[0, -1])
+    sim.step(LATER - WARM - TIMED)
+    later = _timed(sim)
+    u = sim.state.displacement.numpy()
+    rate = 1e3 * case.worlds / ms
+    return WorldsRow(
+        case.label, dtype, case.worlds, unknowns, ms, rate, spent["newton"], spent["pcg"], error, later,
+        references.error(case.scene, 1, sim.probe(name).displacement[0, -1]), sum(sim.bytes().values()) / case.worlds,
+        bool((u == u[:1]).all()), goal, None if goal is None else rate >= goal, setup, sim.methods,
+    )  # fmt: skip
+
+
+HEADER = (f"{'worlds':22} {'dtype':8} {'unknowns':>8} {'ms/step':>9} {'world-steps/s':>13} {'Newton':>6} {'PCG':>6} "
+          f"{'tip error':>9} {'later, ms':>9} {'error':>8} {'MB/world':>8} {'equal':>5} {'goal':>9}")  # fmt: skip
+
+
+def _line(r: WorldsRow) -> str:
+    if r.ms_per_step is None:
+        return f"{r.label:22} {r.dtype:8} {r.unknowns:8d} {r.note}"
+    return (
+        f"{r.label:22} {r.dtype:8} {r.unknowns:8d} {r.ms_per_step:9.2f} {r.world_steps_per_s:13.1f} "
+        f"{r.newton_per_step:6.1f} {r.pcg_per_step:6.1f} {r.tip_error:9.1e} {r.later_ms:9.2f} {r.later_error:8.1e} "
+        f"{(r.bytes_per_world or 0.0) / 1e6:8.3f} {r.equal!s:>5} {'-' if r.goal is None else f'{r.goal:9.0f}'}"
+    )
+
+
+def worlds(options: argparse.Namespace) -> None:
+    """Do `warpfea bench --worlds`: a line per row, and the file after each."""
+    device = wp.get_device(options.device) if options.device else wp.get_preferred_device()
+    options.device = str(device)
+    cases = by_label(options.rows, CASES) if options.rows else CASES
+    dtypes = options.dtype or ["float64", "float32"]
+    settings = {
+        "rows": [case.label for case in cases], "dtypes": dtypes, "warm_up": WARM, "timed": TIMED, "later": LATER,
+        "reference_tol": TIGHT,
+    }  # fmt: skip
+    references = References(device)
+    rows: list[WorldsRow] = []
+    print(HEADER, flush=True)
+    for case in cases:
+        for dtype in dtypes:
+            rows.append(measure(case, dtype, device, references))
+            print(_line(rows[-1]), flush=True)
+            write_file(options, settings, rows)
