@@ -2,14 +2,14 @@
 
 Scenes: `pendulum` with 16 elements, h = 2 ms; `slider` (slider_crank), 1 ms; `double` (double_pendulum), 4 ms;
 `finger`, a box 0.12 x 0.02 x 0.02 m with 20 x 2 x 2 cells of T10, neo-Hookean, E = 1 MPa, nu = 0.45, 1100 kg/m^3,
-eta = 300 Pa s, clamped, with a traction that rises to 2 kPa in 0.1 s, 2 ms; `tets`, the same box with 12 x 2 x 2 cells of
-five T4 under gravity alone, 2 ms.
+eta = 300 Pa s, clamped, with a traction that rises to 2 kPa in 0.1 s, 2 ms; `tets`, the same box with 12 x 2 x 2 cells
+of five T4 under gravity alone, 2 ms.
 
 Three steps are not timed, then ten are; after 100 steps ten again. Steps read nothing back (record=False,
 on_failure="freeze", no ledger). The tip of world 0 is compared with that of one world in float64 with a tolerance of
-1e-11, over its travel. `equal`: all worlds have the bits of the first. Methods: `auto`, the defaults; `banded`, factors
-of a narrow band by a block of threads per world; `loose` and `rough`, with a tolerance of 1e-4 and 1e-2, and the factors
-where the band is narrow. `goal`: world-steps per second that were asked for at 4096 worlds in float64.
+1e-11, over its travel. `equal`: all worlds have the bits of the first. Methods: `auto`, the defaults; `banded`,
+factors of a narrow band by a block of threads per world; `loose` and `rough`, with a tolerance of 1e-4 and 1e-2, and
+the factors where the band is narrow. `goal`: world-steps per second that were asked for at 4096 worlds in float64.
 """
 
 from __future__ import annotations
