@@ -1,0 +1,36 @@
+"""`warpfea study identify`: stiffness and damping from a noisy record; tests/results/identify_cpu.json, made by it."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from warpfea.studies.reports.identify import NOISE, TRUTH, identify, record
+
+FILE = pathlib.Path(__file__).resolve().parent / "results" / "identify_cpu.json"
+
+
+def test_the_committed_search_finds_both():
+    assert FILE.exists(), f"{FILE} is missing: warpfea study identify --device cpu --out {FILE}"
+    found = json.loads(FILE.read_text())
+    (row,) = found["rows"]
+    assert found["settings"]["truth"] == TRUTH
+    assert row["noise"] == NOISE == 0.01
+    assert row["E_error"] < 0.02
+    assert row["eta_error"] < 0.02
+    assert row["misfit"] == pytest.approx(NOISE, rel=0.3)  # what is left is the noise
+    assert row["time_s"] > 0.0
+
+
+def test_a_small_search_gets_near():
+    found = identify(record("cpu"), device="cpu", worlds=8, generations=3)
+    assert (found.runs, found.unknowns) == (24, 216)
+    assert found.E_error < 0.5
+    assert found.misfit < 0.2
+
+
+def test_the_record_is_noisy():
+    one, other = record("cpu", t_end=0.02, seed=1), record("cpu", t_end=0.02, seed=2)
+    assert one.shape == (10, 3)
+    assert 0.0 < np.abs(one - other).max() < 0.1 * np.abs(one).max()
