@@ -193,8 +193,8 @@ def measure(case: Case, dtype: str, device: Any, references: References) -> Worl
         method = NewtonPCG(tol=TOLERANCES[case.method], preconditioner=kind)
         sim = Simulation(model, dt=dt, solver=method, ledger=False, record=False, on_failure="freeze")
         sim.step(WARM)
-    except (CapacityError, ModelError) as error:
-        return WorldsRow(case.label, dtype, case.worlds, unknowns, goal=goal, note=str(error))
+    except (CapacityError, ModelError) as refused:
+        return WorldsRow(case.label, dtype, case.worlds, unknowns, goal=goal, note=str(refused))
     setup = clock.perf_counter() - began
     before = {name: int(sim.totals[name][0]) for name in ("newton", "pcg")}
     ms = _timed(sim)
