@@ -146,6 +146,7 @@ class Simulation(Digests):
         self.error = adapt.error if adapt else None
         self._open_digest(quiet)
         self._start: State | None = None
+        self._start_of = -1
         if not isinstance(dt, str):
             self.dt = dt
         if t_end is not None:
@@ -328,16 +329,18 @@ class Simulation(Digests):
             self.stepper.begin_ledger(mask)
 
     def _reset_on_device(self, mask: wp.array, state: State | None) -> None:
-        flags = check_mask(mask, self.model)
+        check_mask(mask, self.model)
         if state is None:
-            if self._start is None:
-                self._start = self._initial()
+            written = self.model.terms.written
+            if self._start is None or self._start_of != written:
+                self._start, self._start_of = self._initial(), written
             state = self._start
         check_state(self.model, state)
         if lacks := [name for name in self.state.names if name not in state.names]:
             raise ModelError(f"reset: the state lacks {listing(lacks)}; with a Warp array as the mask take one that "
                              "a simulation of this model has had: sim.state.like()")  # fmt: skip
         self._own_times = True
+        flags = self.stepper.loops.flags(mask)
         self.state.copy_rows(self.stepper.launch, flags, state)
         self.stepper.set_on_device(flags)
         if self.quiet:
@@ -347,17 +350,19 @@ class Simulation(Digests):
             self._stepped[flags.numpy() != 0] = False
 
     def _initial(self) -> State:
-        """The state that a simulation from the model's initial one begins with."""
+        """The state that a simulation from the model's initial one begins with; the present one stays."""
+        self.stepper.take_parameters()
         now, stepped = self.state.like(), self._stepped.copy()
-        self.reset()
-        start = self.state.like()
         everyone = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
-        self.state.copy_rows(self.stepper.launch, everyone, now)
-        self.stepper.set_on_device(everyone)
-        self._stepped = stepped
-        if self.stepper.loops.stepped is not None:
-            self.stepper.loops.stepped.assign(stepped.astype(np.int32))
-        return start
+        try:
+            self.reset()
+            return self.state.like()
+        finally:
+            self.state.copy_rows(self.stepper.launch, everyone, now)
+            self.stepper.set_on_device(everyone, restart=False)
+            self._stepped = stepped
+            if self.stepper.loops.stepped is not None:
+                self.stepper.loops.stepped.assign(stepped.astype(np.int32))
 
     def observe(self, *names: str) -> Observations:
         """Numbers of each world as one table on the device, see Observations."""
@@ -400,6 +405,7 @@ class Simulation(Digests):
         from .checkpoint import load_checkpoint
 
         load_checkpoint(self, path)
+        self._start = None
         self._unstep(np.ones(self.model.worlds, bool))
 
     def bytes(self) -> dict[str, int]:
