@@ -283,12 +283,13 @@ def test_a_reset_to_a_state_that_was_kept():
     assert sim.time == pytest.approx(DT * np.array([30, 40, 40, 30]))
 
 
-def test_a_reset_with_a_ledger_and_records():
+@pytest.mark.parametrize("on_device", [False, True])
+def test_a_reset_with_a_ledger_and_records(on_device):
     """The ledger of the world begins anew; records tell the time of each world."""
     model = cubes(2)
     sim, fresh = wf.Simulation(model, dt=DT), wf.Simulation(cubes(), dt=DT)
     sim.step(25)
-    sim.reset(flags(1, of=2))
+    sim.reset(flags(1, of=2) if on_device else [False, True])
     sim.step(10)
     fresh.step(10)
     energies, own = sim.energies(), fresh.energies()
@@ -296,6 +297,8 @@ def test_a_reset_with_a_ledger_and_records():
     time = sim.probe("top").time
     assert time.shape == (2, 35)
     assert time[:, -1] == pytest.approx([35 * DT, 10 * DT])
+    sim.run(30 * DT)
+    assert sim.time == pytest.approx([55 * DT, 30 * DT])
 
 
 def test_each_world_has_its_own_step_and_end():
@@ -361,6 +364,30 @@ def test_worlds_of_every_kind_equal_their_own_runs(dtype, device):
         alone.step(25 if world == 4 else 40)
         assert same(values(sim, world), values(alone)), world
     assert np.isfinite(sim.state.displacement.numpy()[[0, 1, 3, 4, 5]]).all()
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_worlds_on_joints_with_controls_and_steps_of_their_own(dtype):
+    """Another step and rate of the drive in each, one that is given NaN, one reset."""
+    steps, rates = np.array([1e-3, 2e-3, 2e-3, 1.5e-3]), np.array([2.0, -1.0, np.nan, 0.5])
+
+    def run(worlds, count, reset_at=-1):
+        sim = wf.Simulation(arms(len(worlds), dtype), dt=steps[worlds], **QUIET)
+        taken = np.zeros(len(worlds))
+        for k in range(count):
+            if k == reset_at:
+                sim.reset(flags(3))
+                taken[3] = 0
+            taken += 1
+            angle = (steps * rates)[worlds] * taken
+            sim.controls["motor"].assign(wp.array(angle[:, None], dtype=wp.float64, device="cpu"))
+            sim.step()
+        return sim
+
+    sim = run(np.arange(4), 30, reset_at=12)
+    assert sim.status.tolist() == [0, 0, 1, 0]
+    for world in range(4):
+        assert same(values(sim, world), values(run(np.array([world]), 18 if world == 3 else 30))), world
 
 
 # observations
@@ -494,8 +521,11 @@ def test_resets_on_the_device_are_checked():
             sim.reset(mask)
     with pytest.raises(wf.ModelError, match="the state lacks 'status'"):
         sim.reset(flags(0, of=2), model.state())
-    with pytest.raises(wf.ModelError, match="of another model"):
-        sim.reset(flags(0, of=2), cubes(3).state())
+    for mask in (flags(0, of=2), [True, False]):
+        with pytest.raises(wf.ModelError, match="of another model"):
+            sim.reset(mask, cubes(3).state())
+        with pytest.raises(wf.ModelError, match="expected a State, got str"):
+            sim.reset(mask, "start")
     assert all(same(values(sim, world), before[world]) for world in range(2))
     with pytest.raises(wf.ModelError, match="made without; give t_end to Simulation"):
         sim.t_end = 1.0

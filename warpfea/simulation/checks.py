@@ -86,7 +86,9 @@ def check_steps(count: Any) -> None:
 
 
 def check_state(model: Model, state: State) -> None:
-    """Raise ModelError for a state of another model."""
+    """Raise ModelError for what is not a state, or one of another model."""
+    if not isinstance(state, State):
+        raise ModelError(f"expected a State, got {type(state).__name__}; model.state() makes one")
     got, expected = state.displacement, (model.worlds, model.slots)
     if got.shape != expected or got.dtype != model.types.vec3 or got.device != model.device:
         raise ModelError(

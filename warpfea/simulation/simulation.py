@@ -270,7 +270,7 @@ class Simulation(Digests):
             raise ModelError(f"t_end = {t_end!r} must be finite")
         if not isinstance(outputs, (list, tuple)) or not all(hasattr(out, "write") for out in outputs):
             raise ModelError(f"run: outputs must be a list of writers such as USDWriter(path), got {outputs!r}")
-        if self._own_times:
+        if np.ndim(self.dt) or len(set([] if self.t_end is None else self.t_end)) > 1:
             raise ModelError("run: worlds have times of their own; take step(count), and t_end of Simulation")
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
@@ -314,6 +314,8 @@ class Simulation(Digests):
         if mask.shape != (B,):
             raise ModelError(f"reset: mask has shape {mask.shape}, expected ({B},)")
         source = self.model.state() if state is None else state
+        check_state(self.model, source)
+        self._own_times |= bool(mask.any() and not mask.all())
         fresh = source.numpy()
         values = self.state.numpy()
         for name, array in values.items():
