@@ -46,14 +46,14 @@ def stacks(worlds=1, dtype="float64", device="cpu"):
     return b.finalize(device=device, worlds=worlds, dtype=dtype)
 
 
-def bent(worlds=1):
+def bent(worlds=1, dtype="float64", device="cpu"):
     """A bar that begins bent."""
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.4, density=1000.0)
     body = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(4, 1, 1)), material=law, name="bar")
     b.clamp(body.nodes("x-"))
     b.set_initial(body, displacement=lambda X: np.outer(X[:, 0] ** 2, (0.0, 0.0, 0.1)))
-    return b.finalize(device="cpu", worlds=worlds)
+    return b.finalize(device=device, worlds=worlds, dtype=dtype)
 
 
 def values(sim, world=0):
@@ -74,6 +74,11 @@ def flags(*worlds, of=4, dtype=wp.int32, device="cpu"):
 # steps that read nothing back
 
 
+def leaves(target, source):
+    """Whether a copy leaves the device."""
+    return source.device.is_cuda and not target.device.is_cuda
+
+
 @pytest.fixture
 def silent():
     """Refuse every reading of a device array and every allocation while it is entered."""
@@ -85,8 +90,12 @@ def silent():
             def refuse(*_, **__):
                 raise AssertionError("an array was read back or allocated")
 
-            self.patch.setattr(wp.array, "numpy", refuse)
-            self.patch.setattr(wp.array, "list", refuse)
+            for name in ("numpy", "list", "to"):
+                self.patch.setattr(wp.array, name, refuse)
+            copy = wp.copy
+            self.patch.setattr(
+                wp, "copy", lambda to, of, *a, **k: (refuse if leaves(to, of) else copy)(to, of, *a, **k)
+            )
             for device in wp.get_devices():
                 self.patch.setattr(type(device.get_allocator()), "allocate", refuse)
 
@@ -100,6 +109,8 @@ def test_the_guard_sees_readings_and_allocations(silent):
     array = wp.zeros(3, device="cpu")
     with silent, pytest.raises(AssertionError, match="read back"):
         array.numpy()
+    with silent, pytest.raises(AssertionError, match="read back"):
+        array.to("cpu")
     with silent, pytest.raises(AssertionError, match="allocated"):
         wp.zeros(3, device="cpu")
 
@@ -124,6 +135,28 @@ def test_a_thousand_steps_read_and_allocate_nothing(build, device, silent):
     assert last.converged.all()
     assert sim.steps == 1002
     assert last.time == pytest.approx([1002 * DT, DT])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum"])
+@pytest.mark.parametrize(
+    ("build", "solver"), [(stacks, None), (arms, "jacobi"), (bent, wf.NewtonPCG(preconditioner="two-level"))]
+)
+def test_steps_of_every_kind_read_and_allocate_nothing(build, solver, integrator, dtype, device, silent):
+    if solver == "jacobi" and integrator == "energy_momentum":
+        pytest.skip("refused")
+    options = {"integrator": integrator, "solver": solver, "ledger": build is not arms}
+    sim = wf.Simulation(build(2, dtype, device), dt=[DT, 0.5 * DT], t_end=10 * DT, **(QUIET | options))
+    mask = flags(1, of=2, device=device)
+    sim.step(2)
+    sim.reset(mask)
+    with silent:
+        sim.step(8)
+        sim.reset(mask)
+        sim.reset(sim.state.status)
+        sim.step()
+    assert sim.status.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

@@ -219,8 +219,9 @@ class Simulation(Digests):
     def step(self, count: int = 1) -> StepReport:
         """Advance `count` steps of dt, or to the next common instants; the report is that of the last.
 
-        With record=False and on_failure="freeze" nothing is read back from the device (except with dt="auto" and
-        generalized-alpha): the report reads when an array of it is asked for, until the next call.
+        With record=False and on_failure="freeze" nothing is read back from the device (except with dt="auto",
+        generalized-alpha, linear="direct" and capture=False): the report reads when an array of it is asked for, until
+        the next call.
 
         Raises:
             ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
