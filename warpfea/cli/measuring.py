@@ -140,6 +140,7 @@ STUDY_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "only": ("--only", {"action": "append", "metavar": "PART", "help": "parts; the others stay in --out as they are"}),
     "quick": ("--quick", {"action": "store_true", "help": "a trial: few and small rows, no result"}),
     "steps": ("--steps", {"type": count, "metavar": "N", "help": "steps of each run"}),
+    "worlds": ("--worlds", {"type": count, "metavar": "N", "help": "candidates at a time (default 64)"}),
     "joints": ("--joints", {"type": counts, "metavar": "N,N,...", "help": "joints per chain (default 10,100,1000)"}),
     "sizes": ("--sizes", {"type": counts, "metavar": "N,N,...", "help": "unknowns (default 100,300,1000,3000,10000)"}),
     "before": ("--before", {"metavar": "FOLDER", "help": "checkout of the other version"}),

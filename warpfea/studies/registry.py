@@ -196,6 +196,16 @@ _ENTRIES = (
         results=("jacobi_cpu.json",),
     ),
     Entry(
+        name="identify",
+        module="reports.identify",
+        summary="stiffness and damping from a recorded, noisy motion, over many worlds",
+        about="A finger of rubber is let go under gravity; scipy's differential evolution finds E and eta from its tip's "
+        "noisy record, a generation of candidates at a time, each a world of one model.",
+        options=("device", "worlds", "quick"),
+        example="--device cpu --out tests/results/identify_cpu.json",
+        results=("identify_cpu.json",),
+    ),
+    Entry(
         name="devices",
         module="reports.devices",
         summary="a CUDA device against the CPU, in both precisions",

@@ -1,0 +1,146 @@
+"""`warpfea study identify`: stiffness and damping from a recorded, noisy motion, over many worlds at once.
+
+A finger of rubber, 0.12 x 0.02 x 0.02 m of T10, is clamped at one end and let go under gravity; its tip is recorded for
+0.24 s with noise of 1 % of the largest deflection. The record comes from a run of four times as many steps with E and
+eta that the search does not know. scipy's differential evolution looks for both, a generation at a time: each candidate
+is a world of one model, `model.set_parameter` writes their constants in place, `sim.reset` begins anew on the device,
+and the recorded step is replayed. The misfit is the mean square of the differences of all samples.
+
+tests/results/identify_cpu.json is the committed result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time as clock
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from scipy.optimize import differential_evolution
+
+import warpfea as wf
+
+from .parts import check_out, run_tables
+
+__all__ = ["Found", "identify", "record", "rows", "run"]
+
+TRUTH = {"E": 1.27e6, "eta": 4300.0}
+BOUNDS = {"E": (4e5, 4e6), "eta": (4e2, 4e4)}
+NOISE = 0.01
+DT, T_END = 2e-3, 0.24
+FINER = 4
+GENERATIONS, WORLDS = 16, 64
+
+
+def finger(device: Any, worlds: int) -> Any:
+    """The model; its constants are set for each world."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.45, density=1100.0, damping=wf.KelvinVoigt(eta=1e3))
+    body = b.add_solid(wf.mesh.box((0.12, 0.02, 0.02), cells=(4, 1, 1)), material=law, name="finger")
+    b.clamp(body.nodes("x-"))
+    b.add_probe("tip", body.surface("x+"))
+    return b.finalize(device=device, worlds=worlds)
+
+
+def motion(model: Any, dt: float, **how: Any) -> wf.Simulation:
+    """A simulation of the model; the constants of all worlds have been set."""
+    return wf.Simulation(model, dt=dt, integrator="bdf2", solver=wf.NewtonPCG(tol=1e-6), ledger=False, **how)
+
+
+def record(device: Any, t_end: float = T_END, seed: int = 7) -> np.ndarray:
+    """The tip's deflection (steps, 3), m, every `DT`, of the true constants, with noise."""
+    model = finger(device, 1)
+    for name, value in TRUTH.items():
+        model.set_parameter(f"finger.{name}", value)
+    sim = motion(model, DT / FINER)
+    sim.step(FINER * round(t_end / DT))
+    samples = sim.probe("tip").displacement[0, FINER - 1 :: FINER]
+    noise = np.random.default_rng(seed).normal(size=samples.shape)
+    return samples + NOISE * np.abs(samples).max() * noise
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search found.
+
+    Attributes:
+        E, eta: Pa, Pa s; E_error, eta_error: over the truth.
+        misfit: root of the mean square of the differences, over the largest deflection.
+        runs: motions of a world; time_s: of the search, without compilation.
+    """
+
+    device: str
+    worlds: int
+    generations: int
+    steps: int
+    unknowns: int
+    noise: float
+    E: float
+    eta: float
+    E_error: float
+    eta_error: float
+    misfit: float
+    runs: int
+    setup_s: float
+    time_s: float
+
+
+def identify(
+    samples: np.ndarray, *, device: Any, worlds: int = WORLDS, generations: int = GENERATIONS, seed: int = 1
+) -> Found:
+    """Look for E and eta that give the recorded deflections (steps, 3), m; the worlds are the candidates."""
+    began = clock.perf_counter()
+    model = finger(device, worlds)
+    names = list(BOUNDS)
+    for name in names:  # the first values precede the simulation
+        model.set_parameter(f"finger.{name}", np.full(worlds, BOUNDS[name][0]))
+    sim = motion(model, DT, record=False, on_failure="freeze")
+    tip = sim.observe("probe.tip.displacement")
+    everyone = wp.ones(worlds, dtype=wp.int32, device=model.device)
+    sim.step()
+    ready = clock.perf_counter()
+    runs = 0
+
+    def misfits(logarithms: np.ndarray) -> np.ndarray:
+        """Mean square (candidates,), m^2, of candidates (constants, candidates)."""
+        nonlocal runs
+        count = logarithms.shape[1]
+        values = np.exp(logarithms[:, np.arange(worlds) % count])
+        for name, row in zip(names, values):
+            model.set_parameter(f"finger.{name}", row)
+        sim.reset(everyone)
+        sums = np.zeros(worlds)
+        for sample in samples:
+            sim.step()
+            sums += ((tip.update().numpy() - sample) ** 2).mean(axis=1)
+        runs += worlds
+        return np.where(sim.status == 0, sums / len(samples), 1e30)[:count]
+
+    found = differential_evolution(
+        misfits, [tuple(np.log(BOUNDS[name])) for name in names], vectorized=True, updating="deferred", polish=False,
+        popsize=worlds // len(names), maxiter=generations - 1, tol=0.0, init="sobol", rng=np.random.default_rng(seed),
+    )  # fmt: skip
+    E, eta = (float(x) for x in np.exp(found.x))
+    return Found(
+        str(model.device), worlds, generations, len(samples), model.info()["unknowns"], NOISE, E, eta,
+        abs(E / TRUTH["E"] - 1.0), abs(eta / TRUTH["eta"] - 1.0),
+        float(np.sqrt(found.fun) / np.abs(samples).max()), runs, ready - began, clock.perf_counter() - ready,
+    )  # fmt: skip
+
+
+def rows(device: Any, worlds: int, generations: int) -> Iterator[dict[str, Any]]:
+    """The search, as a table of one row."""
+    yield asdict(identify(record(device), device=device, worlds=worlds, generations=generations))
+
+
+def run(options: argparse.Namespace) -> None:
+    """Do `warpfea study identify`."""
+    check_out(options)
+    device = wp.get_device(options.device) if options.device else wp.get_preferred_device()
+    options.device = str(device)
+    given = {"worlds": options.worlds or WORLDS, "generations": 3 if options.quick else GENERATIONS}
+    settings = {**given, "truth": TRUTH, "bounds": BOUNDS, "noise": NOISE, "dt": DT, "t_end": T_END}
+    run_tables(options, {"rows": rows}, settings, device=device, **given)
