@@ -35,6 +35,27 @@ def arms(worlds=1, dtype="float64", device="cpu"):
     return b.finalize(device=device, worlds=worlds, dtype=dtype)
 
 
+def stacks(worlds=1, dtype="float64", device="cpu"):
+    """A cube that falls on a slab."""
+    b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    law = wf.NeoHookean.from_E_nu(E=1e5, nu=0.3, density=1000.0)
+    slab = b.add_solid(wf.mesh.box((0.2, 0.2, 0.05), cells=(2, 2, 1)), material=law, name="slab")
+    cube = b.add_solid(wf.mesh.box((0.1,) * 3, cells=(1, 1, 1), origin=(0.05, 0.05, 0.051)), material=law, name="cube")
+    b.clamp(slab.nodes("z-"))
+    b.add_contact(cube, slab, mu=0.3, name="pad")
+    return b.finalize(device=device, worlds=worlds, dtype=dtype)
+
+
+def bent(worlds=1, dtype="float64", device="cpu"):
+    """A bar that begins bent."""
+    b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.4, density=1000.0)
+    body = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(4, 1, 1)), material=law, name="bar")
+    b.clamp(body.nodes("x-"))
+    b.set_initial(body, displacement=lambda X: np.outer(X[:, 0] ** 2, (0.0, 0.0, 0.1)))
+    return b.finalize(device=device, worlds=worlds, dtype=dtype)
+
+
 def values(sim, world=0):
     """All that a world's state has."""
     return {name: array[world] for name, array in sim.state.numpy().items()}
@@ -53,6 +74,11 @@ def flags(*worlds, of=4, dtype=wp.int32, device="cpu"):
 # steps that read nothing back
 
 
+def leaves(target, source):
+    """Whether a copy leaves the device."""
+    return source.device.is_cuda and not target.device.is_cuda
+
+
 @pytest.fixture
 def silent():
     """Refuse every reading of a device array and every allocation while it is entered."""
@@ -64,8 +90,12 @@ def silent():
             def refuse(*_, **__):
                 raise AssertionError("an array was read back or allocated")
 
-            self.patch.setattr(wp.array, "numpy", refuse)
-            self.patch.setattr(wp.array, "list", refuse)
+            for name in ("numpy", "list", "to"):
+                self.patch.setattr(wp.array, name, refuse)
+            copy = wp.copy
+            self.patch.setattr(
+                wp, "copy", lambda to, of, *a, **k: (refuse if leaves(to, of) else copy)(to, of, *a, **k)
+            )
             for device in wp.get_devices():
                 self.patch.setattr(type(device.get_allocator()), "allocate", refuse)
 
@@ -79,6 +109,8 @@ def test_the_guard_sees_readings_and_allocations(silent):
     array = wp.zeros(3, device="cpu")
     with silent, pytest.raises(AssertionError, match="read back"):
         array.numpy()
+    with silent, pytest.raises(AssertionError, match="read back"):
+        array.to("cpu")
     with silent, pytest.raises(AssertionError, match="allocated"):
         wp.zeros(3, device="cpu")
 
@@ -92,16 +124,39 @@ def test_a_thousand_steps_read_and_allocate_nothing(build, device, silent):
     mask, graph = flags(1, of=2, device=device), sim.stepper.graph
     sim.step()
     sim.reset(mask)  # makes the state that worlds go back to
+    masks = (mask, flags(1, of=2, dtype=wp.bool, device=device))
     with silent:
-        for _ in range(10):
+        for k in range(10):
             sim.step(100)
             observed.update()
-            sim.reset(mask)
+            sim.reset(masks[k % 2])
         last = sim.step()
     assert sim.stepper.graph is graph
     assert last.converged.all()
     assert sim.steps == 1002
     assert last.time == pytest.approx([1002 * DT, DT])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum"])
+@pytest.mark.parametrize(
+    ("build", "solver"), [(stacks, None), (arms, "jacobi"), (bent, wf.NewtonPCG(preconditioner="two-level"))]
+)
+def test_steps_of_every_kind_read_and_allocate_nothing(build, solver, integrator, dtype, device, silent):
+    if solver == "jacobi" and integrator == "energy_momentum":
+        pytest.skip("refused")
+    options = {"integrator": integrator, "solver": solver, "ledger": build is not arms}
+    sim = wf.Simulation(build(2, dtype, device), dt=[DT, 0.5 * DT], t_end=10 * DT, **(QUIET | options))
+    mask = flags(1, of=2, device=device)
+    sim.step(2)
+    sim.reset(mask)
+    with silent:
+        sim.step(8)
+        sim.reset(mask)
+        sim.reset(sim.state.status)
+        sim.step()
+    assert sim.status.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -142,19 +197,110 @@ def test_a_report_reads_until_the_next_step():
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("kind", [wp.int32, wp.bool])
-@pytest.mark.parametrize("build", [cubes, arms])
+@pytest.mark.parametrize("build", [cubes, arms, stacks])
 def test_a_reset_world_begins_anew_and_others_go_on(build, kind, device):
-    model = build(4, device=device)
-    sim, plain = (wf.Simulation(model, dt=DT, **QUIET) for _ in range(2))
+    check_reset(build, kind, device=device)
+
+
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"])
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("build", [cubes, arms, stacks])
+def test_resets_with_every_integrator(build, dtype, integrator):
+    check_reset(build, wp.int32, dtype=dtype, integrator=integrator)
+
+
+@pytest.mark.parametrize("solver", ["direct", "jacobi", "two-level", "banded", "block-jacobi"])
+def test_resets_with_every_solver(solver):
+    how = solver if solver in ("direct", "jacobi") else wf.NewtonPCG(preconditioner=solver)
+    check_reset(arms, wp.int32, solver=how)
+
+
+def check_reset(build, kind, dtype="float64", device="cpu", **options):
+    """Worlds that are reset have the bits of a new run, and the others those of a run without resets."""
+    model, options = build(4, dtype, device), QUIET | options
+    sim, plain = (wf.Simulation(model, dt=DT, **options) for _ in range(2))
     for s in (sim, plain):
         s.step(25)
     sim.reset(flags(1, 2, dtype=kind, device=device))
-    fresh = wf.Simulation(build(device=device), dt=DT, **QUIET)
+    fresh = wf.Simulation(build(1, dtype, device), dt=DT, **options)
     assert same(values(sim, 1), values(fresh))
     for s in (sim, plain, fresh):
         s.step(25)
     for world in range(4):
         assert same(values(sim, world), values(fresh if world in (1, 2) else plain, 0 if world in (1, 2) else world))
+
+
+def test_what_is_done_is_reset_by_its_status():
+    """At an end worlds are frozen by the step that gets there; what is written may be the mask itself."""
+    sim = wf.Simulation(cubes(3), dt=DT, t_end=[0.02, 0.04, 0.04], **QUIET)
+    report = sim.step(10)
+    assert report.status.tolist() == [0, 0, 0]
+    assert report.converged.all()
+    assert sim.status.tolist() == [2, 0, 0]
+    sim.reset(sim.state.status)
+    assert sim.status.tolist() == [0, 0, 0]
+    fresh = wf.Simulation(cubes(), dt=DT, t_end=0.02, **QUIET)
+    assert same(values(sim, 0), values(fresh))
+    sim.step(5)
+    fresh.step(5)
+    assert same(values(sim, 0), values(fresh))
+
+
+@pytest.mark.parametrize("between", [0, 3])
+@pytest.mark.parametrize("ledger", [False, True])
+def test_a_reset_follows_parameters_that_were_set(ledger, between):
+    """A world that begins strained begins with the energy that its constants now give it; others are not disturbed."""
+    E, g = [1e6, 3e6, 1e6], [(0.0, 0.0, -9.81), (0.0, 0.0, -5.0), (0.0, 0.0, -9.81)]
+    options = QUIET | {"ledger": ledger}
+    models = [bent(3), bent(3), bent()]
+    for model in models:
+        model.set_parameter("bar.E", 1e6 if model.worlds == 3 else 3e6)
+    models[2].set_gravity(g[1])
+    sim, plain, fresh = (wf.Simulation(model, dt=DT, **options) for model in models)
+    for s, model in ((sim, models[0]), (plain, models[1])):
+        s.step(3)
+        if s is sim:
+            s.reset(flags(of=3))
+        model.set_parameter("bar.E", E)
+        model.set_gravity(g)
+        if between:
+            s.step(between)
+    sim.reset(flags(1, of=3))
+    assert same(values(sim, 1), values(fresh))
+    for s in (sim, plain, fresh):
+        s.step(10)
+    assert same(values(sim, 1), values(fresh))
+    for world in (0, 2):
+        assert same(values(sim, world), values(plain, world))
+
+
+def test_a_reset_that_is_refused_leaves_nothing_behind():
+    b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    section = wf.Rectangle(0.02, 0.02)
+    law = wf.SVK(E=1e9, nu=0.3, density=1000.0)
+    bar = b.add_beam([(0, 0, 0), (0.3, 0, 0)], elements=2, section=section, normal=(0, 0, 1), material=law)
+    b.add_joint("spherical", parent=wf.GROUND, child=bar.start, name="hook")
+    b.set_initial(bar, displacement=lambda X: np.full_like(X, 0.05))
+    model = b.finalize(device="cpu", worlds=2)
+    state = model.state()
+    state.displacement.zero_()
+    sim = wf.Simulation(model, state, dt=DT, **QUIET)
+    sim.step(5)
+    before = [values(sim, world) for world in range(2)]
+    with pytest.raises(wf.ConstraintError, match=r"'hook' is 0\.05 m off"):
+        sim.reset(flags(0, of=2))
+    assert all(same(values(sim, world), before[world]) for world in range(2))
+
+
+@pytest.mark.parametrize("bad", [0.0, -1e-3, np.nan, np.inf])
+def test_a_bad_step_on_the_device_fails_its_world_alone(bad):
+    sim, plain = wf.Simulation(cubes(2), dt=DT, **QUIET), wf.Simulation(cubes(), dt=DT, **QUIET)
+    sim.dt = wp.array([DT, bad], dtype=wp.float64, device="cpu")
+    for s in (sim, plain):
+        s.step(20)
+    assert sim.status.tolist() == [0, 1]
+    assert sim.time[1] == 0.0
+    assert same(values(sim, 0), values(plain))
 
 
 def test_a_reset_to_a_state_that_was_kept():
@@ -170,12 +316,13 @@ def test_a_reset_to_a_state_that_was_kept():
     assert sim.time == pytest.approx(DT * np.array([30, 40, 40, 30]))
 
 
-def test_a_reset_with_a_ledger_and_records():
+@pytest.mark.parametrize("on_device", [False, True])
+def test_a_reset_with_a_ledger_and_records(on_device):
     """The ledger of the world begins anew; records tell the time of each world."""
     model = cubes(2)
     sim, fresh = wf.Simulation(model, dt=DT), wf.Simulation(cubes(), dt=DT)
     sim.step(25)
-    sim.reset(flags(1, of=2))
+    sim.reset(flags(1, of=2) if on_device else [False, True])
     sim.step(10)
     fresh.step(10)
     energies, own = sim.energies(), fresh.energies()
@@ -183,6 +330,8 @@ def test_a_reset_with_a_ledger_and_records():
     time = sim.probe("top").time
     assert time.shape == (2, 35)
     assert time[:, -1] == pytest.approx([35 * DT, 10 * DT])
+    sim.run(30 * DT)
+    assert sim.time == pytest.approx([55 * DT, 30 * DT])
 
 
 def test_each_world_has_its_own_step_and_end():
@@ -215,7 +364,8 @@ def test_records_tell_the_time_of_each_world():
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_worlds_of_every_kind_equal_their_own_runs(device):
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_worlds_of_every_kind_equal_their_own_runs(dtype, device):
     """Other constants of material and contact, one that diverges, one that is given NaN, one at its end, one reset."""
     E, mu, ends = np.array([1e5, 2e5, 1e5, 1e5, 3e5, 1e5]), np.array([0.3, 0.0, 0.5, 0.3, 0.3, 0.1]), np.full(6, 1.0)
     ends[3] = 0.03
@@ -233,7 +383,7 @@ def test_worlds_of_every_kind_equal_their_own_runs(device):
         return wf.Simulation(model, state, dt=DT, t_end=ends[worlds], solver=wf.NewtonPCG(max_halvings=2), **QUIET)
 
     everyone = np.arange(6)
-    sim = start(cubes(6, device=device), everyone)
+    sim = start(cubes(6, dtype, device), everyone)
     graph = sim.stepper.graph
     sim.step(10)
     back = sim.state.like()
@@ -243,10 +393,34 @@ def test_worlds_of_every_kind_equal_their_own_runs(device):
     assert sim.stepper.graph is graph
     assert sim.status.tolist() == [0, 1, 1, 2, 0, 0]
     for world in everyone:
-        alone = start(cubes(device=device), np.array([world]))
+        alone = start(cubes(1, dtype, device), np.array([world]))
         alone.step(25 if world == 4 else 40)
         assert same(values(sim, world), values(alone)), world
     assert np.isfinite(sim.state.displacement.numpy()[[0, 1, 3, 4, 5]]).all()
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_worlds_on_joints_with_controls_and_steps_of_their_own(dtype):
+    """Another step and rate of the drive in each, one that is given NaN, one reset."""
+    steps, rates = np.array([1e-3, 2e-3, 2e-3, 1.5e-3]), np.array([2.0, -1.0, np.nan, 0.5])
+
+    def run(worlds, count, reset_at=-1):
+        sim = wf.Simulation(arms(len(worlds), dtype), dt=steps[worlds], **QUIET)
+        taken = np.zeros(len(worlds))
+        for k in range(count):
+            if k == reset_at:
+                sim.reset(flags(3))
+                taken[3] = 0
+            taken += 1
+            angle = (steps * rates)[worlds] * taken
+            sim.controls["motor"].assign(wp.array(angle[:, None], dtype=wp.float64, device="cpu"))
+            sim.step()
+        return sim
+
+    sim = run(np.arange(4), 30, reset_at=12)
+    assert sim.status.tolist() == [0, 0, 1, 0]
+    for world in range(4):
+        assert same(values(sim, world), values(run(np.array([world]), 18 if world == 3 else 30))), world
 
 
 # observations
@@ -380,8 +554,11 @@ def test_resets_on_the_device_are_checked():
             sim.reset(mask)
     with pytest.raises(wf.ModelError, match="the state lacks 'status'"):
         sim.reset(flags(0, of=2), model.state())
-    with pytest.raises(wf.ModelError, match="of another model"):
-        sim.reset(flags(0, of=2), cubes(3).state())
+    for mask in (flags(0, of=2), [True, False]):
+        with pytest.raises(wf.ModelError, match="of another model"):
+            sim.reset(mask, cubes(3).state())
+        with pytest.raises(wf.ModelError, match="expected a State, got str"):
+            sim.reset(mask, "start")
     assert all(same(values(sim, world), before[world]) for world in range(2))
     with pytest.raises(wf.ModelError, match="made without; give t_end to Simulation"):
         sim.t_end = 1.0

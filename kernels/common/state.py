@@ -24,4 +24,11 @@ def state_kernels() -> _types.SimpleNamespace:
         if flags[world] != 0:
             target[world, word] = source[world, word]
 
-    return _types.SimpleNamespace(module=module, copy_rows=copy_rows)
+    @wp.kernel(module=module)
+    def clear_rows(flags: wp.array(dtype=wp.int32), target: wp.array2d(dtype=wp.uint32)):
+        """Set the rows of the flagged worlds to zero."""
+        world, word = wp.tid()
+        if flags[world] != 0:
+            target[world, word] = wp.uint32(0)
+
+    return _types.SimpleNamespace(module=module, copy_rows=copy_rows, clear_rows=clear_rows)

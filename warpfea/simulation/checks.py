@@ -57,19 +57,14 @@ def write_times(target: wp.array, value: Any) -> None:
         target.assign(np.asarray(value, dtype=float))
 
 
-def check_mask(mask: wp.array, model: Model) -> wp.array:
-    """A mask of worlds on the device as int32; ModelError for another shape, kind or device."""
+def check_mask(mask: wp.array, model: Model) -> None:
+    """Raise ModelError for what is not a mask of worlds on the device."""
     known = mask.dtype in (wp.int32, wp.bool)
     if mask.shape != (model.worlds,) or not known or mask.device != model.device:
         raise ModelError(
             f"reset: the mask is {mask.dtype.__name__}{mask.shape} on {mask.device}, expected int32 or bool "
             f"({model.worlds},) on {model.device}"
         )
-    if mask.dtype == wp.int32:
-        return mask
-    flags: wp.array = wp.empty(model.worlds, dtype=wp.int32, device=model.device)
-    wp.utils.array_cast(mask, flags)
-    return flags
 
 
 def check_choice(name: str, value: Any, first: str, second: str) -> None:
@@ -91,7 +86,9 @@ def check_steps(count: Any) -> None:
 
 
 def check_state(model: Model, state: State) -> None:
-    """Raise ModelError for a state of another model."""
+    """Raise ModelError for what is not a state, or one of another model."""
+    if not isinstance(state, State):
+        raise ModelError(f"expected a State, got {type(state).__name__}; model.state() makes one")
     got, expected = state.displacement, (model.worlds, model.slots)
     if got.shape != expected or got.dtype != model.types.vec3 or got.device != model.device:
         raise ModelError(

@@ -30,6 +30,7 @@ class Loops:
         self.ends: wp.array | None = work.array("t_end", (model.worlds,), wp.float64) if ends else None
         self.tally: wp.array | None = None
         self.stepped: wp.array | None = None
+        self._flags: wp.array | None = None
         if quiet:
             self.tally = work.array("tally", (model.worlds, len(TALLY)), wp.float64)
             self.stepped = work.array("stepped", (model.worlds,), wp.int32)
@@ -39,8 +40,8 @@ class Loops:
         """Modules that it launches."""
         return set() if self.tally is None and self.ends is None else {loop_kernels().module}
 
-    def open(self) -> None:
-        """A step begins: worlds that are at their end take no part."""
+    def end(self) -> None:
+        """A step begins, or has been reported: worlds that are at their end take no further part."""
         step = self.work.step
         if self.ends is not None:
             self.launch(loop_kernels().end_episodes, self.worlds, [step.time, self.ends, step.dt, step.status])
@@ -49,6 +50,7 @@ class Loops:
         """A step has been reported."""
         if self.tally is not None:
             self.launch(loop_kernels().tally, self.worlds, [self.work.report, self.tally, self.stepped])
+        self.end()
 
     def take(self) -> tuple[np.ndarray, np.ndarray]:
         """What steps have added up to (worlds, TALLY), which begins anew, and which worlds have stepped (worlds,)."""
@@ -61,6 +63,16 @@ class Loops:
     def _clear(self) -> None:
         assert self.tally is not None
         self.launch(loop_kernels().clear_tally, self.tally.shape, [self.tally])
+
+    def flags(self, mask: wp.array) -> wp.array:
+        """A mask of int32 or bool as int32, always in the same array: what is reset may be the mask itself."""
+        if self._flags is None:
+            self._flags = wp.zeros(self.worlds, dtype=wp.int32, device=mask.device)
+        if mask.dtype == wp.int32:
+            wp.copy(self._flags, mask)
+        else:
+            wp.utils.array_cast(mask, self._flags)
+        return self._flags
 
     def unstep(self, worlds: np.ndarray | wp.array) -> None:
         """The chosen worlds, a mask or flags on the device, have not stepped since their state was set."""

@@ -146,6 +146,7 @@ class Simulation(Digests):
         self.error = adapt.error if adapt else None
         self._open_digest(quiet)
         self._start: State | None = None
+        self._start_of = -1
         if not isinstance(dt, str):
             self.dt = dt
         if t_end is not None:
@@ -218,8 +219,9 @@ class Simulation(Digests):
     def step(self, count: int = 1) -> StepReport:
         """Advance `count` steps of dt, or to the next common instants; the report is that of the last.
 
-        With record=False and on_failure="freeze" nothing is read back from the device (except with dt="auto" and
-        generalized-alpha): the report reads when an array of it is asked for, until the next call.
+        With record=False and on_failure="freeze" nothing is read back from the device (except with dt="auto",
+        generalized-alpha, linear="direct" and capture=False): the report reads when an array of it is asked for, until
+        the next call.
 
         Raises:
             ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
@@ -269,7 +271,7 @@ class Simulation(Digests):
             raise ModelError(f"t_end = {t_end!r} must be finite")
         if not isinstance(outputs, (list, tuple)) or not all(hasattr(out, "write") for out in outputs):
             raise ModelError(f"run: outputs must be a list of writers such as USDWriter(path), got {outputs!r}")
-        if self._own_times:
+        if np.ndim(self.dt) or len(set([] if self.t_end is None else self.t_end)) > 1:
             raise ModelError("run: worlds have times of their own; take step(count), and t_end of Simulation")
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
@@ -313,6 +315,8 @@ class Simulation(Digests):
         if mask.shape != (B,):
             raise ModelError(f"reset: mask has shape {mask.shape}, expected ({B},)")
         source = self.model.state() if state is None else state
+        check_state(self.model, source)
+        self._own_times |= bool(mask.any() and not mask.all())
         fresh = source.numpy()
         values = self.state.numpy()
         for name, array in values.items():
@@ -328,16 +332,18 @@ class Simulation(Digests):
             self.stepper.begin_ledger(mask)
 
     def _reset_on_device(self, mask: wp.array, state: State | None) -> None:
-        flags = check_mask(mask, self.model)
+        check_mask(mask, self.model)
         if state is None:
-            if self._start is None:
-                self._start = self._initial()
+            written = self.model.terms.written
+            if self._start is None or self._start_of != written:
+                self._start, self._start_of = self._initial(), written
             state = self._start
         check_state(self.model, state)
         if lacks := [name for name in self.state.names if name not in state.names]:
             raise ModelError(f"reset: the state lacks {listing(lacks)}; with a Warp array as the mask take one that "
                              "a simulation of this model has had: sim.state.like()")  # fmt: skip
         self._own_times = True
+        flags = self.stepper.loops.flags(mask)
         self.state.copy_rows(self.stepper.launch, flags, state)
         self.stepper.set_on_device(flags)
         if self.quiet:
@@ -347,17 +353,19 @@ class Simulation(Digests):
             self._stepped[flags.numpy() != 0] = False
 
     def _initial(self) -> State:
-        """The state that a simulation from the model's initial one begins with."""
+        """The state that a simulation from the model's initial one begins with; the present one stays."""
+        self.stepper.take_parameters()
         now, stepped = self.state.like(), self._stepped.copy()
-        self.reset()
-        start = self.state.like()
         everyone = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
-        self.state.copy_rows(self.stepper.launch, everyone, now)
-        self.stepper.set_on_device(everyone)
-        self._stepped = stepped
-        if self.stepper.loops.stepped is not None:
-            self.stepper.loops.stepped.assign(stepped.astype(np.int32))
-        return start
+        try:
+            self.reset()
+            return self.state.like()
+        finally:
+            self.state.copy_rows(self.stepper.launch, everyone, now)
+            self.stepper.set_on_device(everyone, restart=False)
+            self._stepped = stepped
+            if self.stepper.loops.stepped is not None:
+                self.stepper.loops.stepped.assign(stepped.astype(np.int32))
 
     def observe(self, *names: str) -> Observations:
         """Numbers of each world as one table on the device, see Observations."""
@@ -400,6 +408,7 @@ class Simulation(Digests):
         from .checkpoint import load_checkpoint
 
         load_checkpoint(self, path)
+        self._start = None
         self._unstep(np.ones(self.model.worlds, bool))
 
     def bytes(self) -> dict[str, int]:

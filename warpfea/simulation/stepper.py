@@ -220,11 +220,16 @@ class Stepper:
             ledger[mask, strain] = energy[mask]
             self.state.ledger.assign(ledger)
 
-    def set_on_device(self, flags: wp.array) -> None:
-        """The state of the flagged worlds was set to one that terms and the ledger have been brought up to."""
+    def set_on_device(self, flags: wp.array, *, restart: bool = True) -> None:
+        """The state of the flagged worlds was set to one that terms and the ledger have been brought up to.
+
+        `restart`: to another one than scratch is of.
+        """
         self.newton.forget(flags)
         if "predictor_potential" not in self.state.names:
             self._measure_potential(flags)
+        for term in self.terms if restart else ():
+            term.restart(self.at, flags)
 
     def _measure_potential(self, flags: np.ndarray | wp.array | None) -> None:
         """Strain energy of the state in the chosen worlds, by which first iterates are judged."""
@@ -299,7 +304,7 @@ class Stepper:
         """All launches of a step."""
         m, w, launch = self.model, self.work, self.launch
         w.any_flag[2:5].zero_()
-        self.loops.open()
+        self.loops.end()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
         if self.adaptive:
             assert self.backup is not None

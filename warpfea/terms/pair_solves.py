@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from ..kernels.common.state import state_kernels
 from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_books import contact_block_kernels
 from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pairs import pair_kernels
+from ..model.state import words_of
 from .contact_tables import block_entries
 from .facet_tables import LISTED
 from .pair_motions import PairMotions
@@ -65,6 +67,12 @@ class PairSolves(Term):
         t = s["touching"]
         arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight, "listed": t.listed}
         return [("stiffness", s["attempt"].stiffness), *arrays.items()]
+
+    def restart(self, at: At, flags: wp.array) -> None:
+        # lists are longer than what they hold, and a preconditioner keeps all of them
+        for _, array in self.keep(at):
+            words = words_of(array)
+            at.launch(state_kernels().clear_rows, words.shape, [flags, words])
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
         if "pair blocks" not in self.model.cache:

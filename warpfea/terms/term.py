@@ -299,6 +299,9 @@ class Term:
         """What the STORED columns hold at the state, (worlds,), J, where the ledger begins anew."""
         return {}
 
+    def restart(self, at: At, flags: wp.array) -> None:
+        """The state of the flagged worlds was set on the device: scratch that lasts is as in a new simulation again."""
+
     # in a linear solve
 
     def product(self, at: At, p: wp.array, active: wp.array) -> None:

@@ -65,6 +65,7 @@ class TermSet:
         side_entries: entries of the pool of forces without a potential; pool_entries: of that of potential ones.
         side_topology: who contributes to a slot there, None without.
         rows: rows of potentials.
+        written: how often parameters were set.
         ledger: columns of the energy ledger. report: columns of the report of a step.
     """
 
@@ -80,6 +81,7 @@ class TermSet:
                 self.all.append(term)
         self.dead = self.find(DeadLoads)
         self.side_topology: Any = None
+        self.written = 0
         self._check()
 
     def _check(self) -> None:
@@ -258,6 +260,7 @@ class TermSet:
         found = [known[name] for known in owners if name in known]
         if len(found) == 1:
             found[0](values, chosen_worlds("set_parameter", mask, self.model.worlds))
+            self.written += 1
             return
         if found:
             raise ModelError(f"set_parameter: {name!r} is a parameter of {len(found)} things of that name; rename one")
