@@ -171,11 +171,16 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         doing: wp.array(dtype=wp.int32),
         shift: wp.array(dtype=T),
         again: wp.array(dtype=wp.int32),
+        exact: wp.array(dtype=wp.int32),
     ):
-        """Where A was not positive definite, raise the shift, up to 1, and ask for another factorisation."""
+        """Where A was not positive definite, raise the shift, up to 1, and ask for another factorisation.
+
+        `exact`: the factors are those of A.
+        """
         world = wp.tid()
         if doing[world] == 0:
             return
+        exact[world] = wp.where(bad[world] == 0 and shift[world] == T(0.0), 1, 0)
         if bad[world] != 0 and shift[world] < T(1.0):
             shift[world] = wp.min(wp.max(T(SHIFT_GROWTH) * shift[world], T(FIRST_SHIFT)), T(1.0))
             wp.atomic_max(again, 0, 1)

@@ -24,6 +24,8 @@ from .band import BLOCK, band_kernels, column_type
 __all__ = ["band_block_kernels", "solution_numbers", "window_numbers"]
 
 SIZE = BLOCK * BLOCK
+PITCH = SIZE + 1
+"""Numbers from a block of the window to the next: odd, too."""
 NARROW = 7
 """Bands of up to so many blocks beside the diagonal are the work of one warp, wider ones of four."""
 CHUNK_NUMBERS = 3072
@@ -32,7 +34,12 @@ CHUNK_NUMBERS = 3072
 
 def window_numbers(width: int) -> int:
     """Numbers of the window, and of the diagonals that its rows began with."""
-    return (width + 1) * (width + 1) * SIZE + (width + 1) * BLOCK
+    return (width + 1) * (_row_numbers(width) + BLOCK)
+
+
+def _row_numbers(width: int) -> int:
+    """Numbers of a row of the window: odd, so that threads of a warp find the blocks of a column in different banks."""
+    return (width + 1) * PITCH | 1
 
 
 def _chunk(width: int) -> int:
@@ -57,7 +64,8 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
     inverse_factor = band_kernels(dtype).inverse_factor
     NUMBER = wp.types.type_size_in_bytes(T)
     M, CHUNK = width + 1, _chunk(width)
-    GIVEN = M * M * SIZE
+    ROW = _row_numbers(width)
+    GIVEN = M * ROW
     BESIDE = BLOCK * width  # columns of a block row beside the diagonal
     Y = BLOCK * rows
     module = kernel_module(f"band_block_{dtype}_{rows}_{width}", max_unroll=BLOCK)
@@ -66,7 +74,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
     @wp.func
     def place(row: int, other: int) -> int:
         """Of a block in the window."""
-        return ((row % M) * M + other % M) * SIZE
+        return (row % M) * ROW + (other % M) * PITCH
 
     @wp.func
     def enter(
@@ -74,18 +82,19 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         place_of: wp.array(dtype=wp.int32), shift: T, world: int, row: int, lane: int, lanes: int,
     ):  # fmt: skip
         """Take a block row of A + shift |diag A| into the window; ones on the diagonal beyond the unknowns."""
-        for k in range(lane, M * SIZE, lanes):
-            window.store(at, (row % M) * M * SIZE + k, T(0.0))
+        for k in range(lane, ROW, lanes):
+            window.store(at, (row % M) * ROW + k, T(0.0))
         sync()
-        for a in range(BLOCK):
+        across = wp.max(lanes / BLOCK, 1)
+        for a in range(lane / across, BLOCK, wp.max(lanes / across, 1)):
             i = BLOCK * row + a
             if i / 3 >= slot_at.shape[0]:
-                if lane == 0:
+                if lane % across == 0:
                     window.store(at, place(row, row) + (BLOCK + 1) * a, T(1.0))
                     window.store(at, GIVEN + BLOCK * (row % M) + a, T(1.0))
             else:
                 slot = slot_at[i / 3]
-                for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
+                for k in range(pattern.start[slot] + lane % across, pattern.start[slot + 1], across):
                     first = 3 * place_of[pattern.column[k]]
                     A = value[world, k]
                     for b in range(3):
@@ -126,7 +135,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         """What column `row` changes to its right."""
         for task in range(lane, BLOCK * (below * (below + 1) / 2), lanes):
             pair = task / BLOCK
-            i = wp.int32((wp.sqrt(T(8 * pair + 1)) - T(1.0)) * T(0.5))
+            i = wp.int32((wp.sqrt(wp.float32(8 * pair + 1)) - wp.float32(1.0)) * wp.float32(0.5))
             if (i + 1) * (i + 2) / 2 <= pair:
                 i += 1
             if i * (i + 1) / 2 > pair:
@@ -178,8 +187,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
                         count += 1
             sync()
             eliminate(at, row, below, lane, lanes)
-            sync()
-            if row + M < rows:
+            if row + M < rows:  # in the place of `row`, which is no longer needed
                 enter(at, pattern, value, slot_at, place_of, shift[world], world, row + M, lane, lanes)
             sync()
         if lane == 0:
@@ -187,11 +195,11 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
 
     @wp.func
     def take_rows(at: wp.uint64, band: wp.array3d(dtype=Column), world: int, first: int, lane: int, lanes: int):
-        """Copy a chunk of rows beside the diagonal."""
+        """Copy a chunk of block rows beside the diagonal, row by row."""
         for task in range(lane, wp.min(CHUNK, rows - first) * BESIDE, lanes):
             column = band[world, first + task / BESIDE, task % BESIDE]
             for r in range(BLOCK):
-                vector.store(at, Y + BLOCK * task + r, column[r])
+                vector.store(at, Y + BESIDE * (BLOCK * (task / BESIDE) + r) + task % BESIDE, column[r])
 
     @wp.func
     def forward(at: wp.uint64, row: int, chunk: int, lane: int, lanes: int):
@@ -200,7 +208,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         for a in range(lane / across, BLOCK, wp.max(lanes / across, 1)):
             s = T(0.0)
             for j in range(BLOCK * wp.max(width - row, 0) + lane % across, BESIDE, across):
-                s += vector.load(at, chunk + BLOCK * j + a) * vector.load(at, BLOCK * (row - width) + j)
+                s += vector.load(at, chunk + BESIDE * a + j) * vector.load(at, BLOCK * (row - width) + j)
             s = scalar_sum(s, across)
             if lane % across == 0:
                 vector.store(at, BLOCK * row + a, vector.load(at, BLOCK * row + a) - s)
@@ -214,7 +222,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         for j in range(BLOCK * wp.max(width - row, 0) + lane, BESIDE, lanes):
             s = vector.load(at, BLOCK * (row - width) + j)
             for r in range(BLOCK):
-                s -= vector.load(at, chunk + BLOCK * j + r) * x[r]
+                s -= vector.load(at, chunk + BESIDE * r + j) * x[r]
             vector.store(at, BLOCK * (row - width) + j, s)
 
     @wp.kernel(module=module)

@@ -122,7 +122,11 @@ def _find_band(model: Model, any_width: bool) -> Band | None:
 
 
 class BandFactor:
-    """The banded factors of all worlds, and the launches that make and apply them."""
+    """The banded factors of all worlds, and the launches that make and apply them.
+
+    Attributes:
+        exact: (worlds,) flags of the worlds whose factors are those of the matrix, without a shift.
+    """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, band: Band, pattern: Pattern) -> None:
         self.band, self.pattern, self.launch, self.worlds = band, pattern, launch, model.worlds
@@ -137,7 +141,8 @@ class BandFactor:
         else:
             self.y = work.array("band vector", (B, band.rows), column)
         self.shift = work.array("band shift", (B,), model.types.T)
-        self.bad, self.doing = (work.array(f"band {name}", (B,), wp.int32) for name in ("bad", "doing"))
+        names = ("bad", "doing", "exact")
+        self.bad, self.doing, self.exact = (work.array(f"band {name}", (B,), wp.int32) for name in names)
         self.again = work.array("band again", (1,), wp.int32)
 
     def modules(self) -> set[wp.Module]:
@@ -167,7 +172,7 @@ class BandFactor:
             args = [self.pattern.data, value, b.place_of, b.width, self.shift, self.doing, self.factors]
             launch(k.fill, (self.worlds, slots), args)
             launch(k.factor, self.worlds, [b.width, self.doing, self.bad, self.factors])
-        launch(k.settle, self.worlds, [self.bad, self.doing, self.shift, self.again])
+        launch(k.settle, self.worlds, [self.bad, self.doing, self.shift, self.again, self.exact])
 
     def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = A^-1 r, [world, slot]."""

@@ -164,7 +164,9 @@ class NewtonLoop:
         operator = options.operator
         if direct and operator == "auto":  # factors are kept as long as the matrix, where nothing is added to it
             operator = "elements" if model.terms.products else "matrix"
-        self.residual = Residual(at, operator=operator, assembled=kind not in ("deflated", "block-jacobi"))
+        banded = kind == "banded" and model.device.is_cuda
+        assembled = kind not in ("deflated", "block-jacobi")
+        self.residual = Residual(at, operator=operator, assembled=assembled, banded=banded)
         self.direct = Direct(at, self.residual) if direct else None
         self.preconditioner = self.direct or make(
             kind, options.preconditioner_dtype, model, work, launch, self.residual

@@ -50,7 +50,7 @@ class PCG:
         self._precondition(active)
         w.pcg.any_active.zero_()
         launch(k.begin, m.worlds, [w.newton, w.pcg])
-        launch(self.residual.newton.copy_active, self.dim, [w.z, w.pcg.active, w.p])
+        launch(k.first_direction, self.dim, [w.pcg, w.z, w.p, w.direction])
         wp.capture_while(w.pcg.any_active, self._iterate)
         self.preconditioner.judge(active)
         self.translate(active)

@@ -37,6 +37,7 @@ from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
 from ..terms.term import Kept
+from .assembled import shaped
 from .band import WHOLE_SLOTS, BandFactor, find_band
 from .dense import DenseInverse, gauss_jordan
 from .levels import GROUP_SLOTS, Level, make_levels
@@ -123,7 +124,11 @@ class TwoLevel:
         # matrix made here serves for D alone then); wider ones are kept for longer than that
         one = self.storage == model.dtype and not residual.at.inertia and first.slots <= WHOLE_SLOTS
         order = find_band(model) if first.dense and one else band
-        self.follows = order is not None and order.quick and residual.by_matrix and not self.adding
+        # (a GPU factors the band of a small model in about the time of its matrix, and with joints whatever couples them)
+        quick = order is not None and (order.quick or (band is not None and model.device.is_cuda))
+        traits = model.terms.traits
+        whole = not self.adding or (model.device.is_cuda and not traits.pooled and residual.keep == 0)
+        self.follows = quick and residual.by_matrix and whole and not traits.tangent
         parted = not self.follows
         self.arrays = [
             LevelArrays(model, work, launch, level, k, self.storage, parted) for k, level in enumerate(self.levels)
@@ -132,6 +137,9 @@ class TwoLevel:
             residual.on_matrix = self._factor
             self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if first.dense else 0), model.types.T)
         self.value = self.assembled.values("preconditioner matrix")
+        free = model.group_count > 0  # bodies whose momentum the solve keeps by a correction of its own
+        if self.follows and self.band and residual.at.inertia and not free:
+            work.pcg.exact = self.band.exact
         self.motions, self.coupling = self._motions()
         self.by_row = 0 if model.device.is_cuda else 1
         self.corrected = not self.levels[0].whole and any(term.preconditions(self.at) for term in self.terms)
@@ -197,7 +205,9 @@ class TwoLevel:
     # the seam
 
     def renew(self, active: wp.array) -> None:
-        """What was made at the iterate before is of no use."""
+        """What was made at the iterate before is of no use; where factors follow the operator's matrix, D still is."""
+        if self.follows and self.model.device.is_cuda:
+            return
         self.launch(self.reuse.kernels.renew, self.model.worlds, [active, self.reuse.control])
 
     def follow(self, active: wp.array) -> None:
@@ -379,7 +389,7 @@ class TwoLevel:
     @labelled("build")
     def _factor(self, value: wp.array, flags: wp.array) -> None:
         if self.band:
-            self.band.make(value, flags)
+            self.band.make(self._with_terms(value, flags) if self.adding else value, flags)
             return
         dense = self.arrays[0].dense
         assert dense is not None
@@ -387,6 +397,16 @@ class TwoLevel:
         dense.fill(self.levels[0].pattern, value, flags)
         args = [lanes, dense.scale, flags, dense.left, dense.top, dense.matrix]
         self.launch(self.making.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
+
+    def _with_terms(self, value: wp.array, flags: wp.array) -> wp.array:
+        """The operator's matrix with all that terms add to it, in the place of the matrix that D was taken from."""
+        w, dim = self.work, (self.model.worlds, 3 * self.assembled.pattern.entries)
+        given, out = (shaped(a, dim, self.model.types.vec3) for a in (value, self.value))
+        self.launch(self.residual.newton.copy_active, dim, [given, flags, out])
+        for term in self.terms:
+            live = [array for _, array in term.keep(self.at)]
+            term.blocks(self.at, self.assembled, live, w.step.dq_dv, flags, self.value, projected=False)
+        return self.value
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array, *, keep: bool) -> None:
         B, k = self.model.worlds, self.making
