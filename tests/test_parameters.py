@@ -9,11 +9,13 @@ import warp as wp
 import warpfea as wf
 
 E, NU, ETA = np.array([1e6, 2.1e6, 0.7e6]), np.array([0.3, 0.45, 0.2]), np.array([30.0, 0.0, 77.0])
+RHO = np.array([1100.0, 2530.0, 870.0])
+VALUES = {"E": E, "nu": NU, "eta": ETA, "density": RHO}
 SVK, NEO, RIVLIN = wf.SVK.from_E_nu, wf.NeoHookean.from_E_nu, wf.MooneyRivlin.from_E_nu
 
 
-def material(law=SVK, E=1e6, nu=0.3, eta=30.0, form="incremental"):
-    return law(E=E, nu=nu, density=1100.0, damping=wf.KelvinVoigt(eta, 20.0, form))
+def material(law=SVK, E=1e6, nu=0.3, eta=30.0, density=1100.0, form="incremental"):
+    return law(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(eta, 20.0, form))
 
 
 def solid(element="T10", bulge=0.0, **options):
@@ -56,10 +58,10 @@ def model(add, law, worlds=1, dtype="float64", gravity=(0.0, 3.0, -9.81)):
     return b.finalize(device="cpu", worlds=worlds, dtype=dtype)
 
 
-def varied(add, worlds=3, names=("E", "nu", "eta"), dtype="float64", **law):
+def varied(add, worlds=3, names=tuple(VALUES), dtype="float64", **law):
     out = model(add, material(**law), worlds, dtype)
     for name in names:
-        out.set_parameter(f"body.{name}", {"E": E, "nu": NU, "eta": ETA}[name])
+        out.set_parameter(f"body.{name}", VALUES[name])
     return out
 
 
@@ -82,10 +84,10 @@ CASES = {
 }
 
 
-def alone_with(case, world, dtype="float64", names=("E", "nu", "eta")):
+def alone_with(case, world, dtype="float64", names=tuple(VALUES)):
     """One world, built with the values of a world; a tied beam has them set, as E/mu in it may round another way."""
     add, law = CASES[case]
-    values = {name: {"E": E, "nu": NU, "eta": ETA}[name][world] for name in names}
+    values = {name: VALUES[name][world] for name in names}
     if case != "3243":
         return model(add, material(**values, **law), dtype=dtype)
     out = model(add, material(**law), dtype=dtype)
@@ -256,11 +258,12 @@ def test_a_change_in_a_run_reaches_the_chosen_worlds_alone(case):
         "E": wp.array([np.nan, 5e6, 3e5], dtype=wp.float64, device="cpu"),
         "nu": np.array([9.0, 0.1, 0.33]),
         "eta": 5,
+        "density": 700.0,
     }
     many = run(3, (None, new), wp.array([False, True, True], dtype=wp.bool, device="cpu"))
     for world in range(3):
-        first = {"E": E[world], "nu": NU[world], "eta": ETA[world]}
-        second = {"E": (5e6, 3e5)[world - 1], "nu": (0.1, 0.33)[world - 1], "eta": 5.0} if world else {}
+        first = {name: values[world] for name, values in VALUES.items()}
+        second = {"E": (5e6, 3e5)[world - 1], "nu": (0.1, 0.33)[world - 1], "eta": 5.0, "density": 700.0} if world else {}
         alone = run(1, (first, second), None)
         assert rows(many, world) == rows(alone, 0), world
     energy = many.energies()
@@ -307,7 +310,9 @@ BAD = {
     "text": ("body.E", "stiff", r"E = 'stiff' must be a number"),
     "misspelt": ("body.Eta", 1.0, r"'body.Eta' is unknown; there are: .*; did you mean 'body.eta'"),
     "body": ("bdoy.E", 1.0, r"'bdoy.E' is unknown.*did you mean 'body.E'"),
-    "shared": ("body.density", 1.0, r"'body.density' can't be set: all worlds share the mass matrix"),
+    "shared": ("body.frames", 1.0, r"'body.frames' can't be set: all worlds share the reference geometry"),
+    "density": ("body.density", [1.0, 0.0, 2.0], r"density = 0.0 in world 1 must be positive, kg/m\^3"),
+    "factor": ("body.density_factor", 1.0, r"'body.density_factor' is unknown.*did you mean 'body.density'"),
     "mesh": ("body.points", 1.0, r"'body.points' can't be set: all worlds share the mesh"),
     "section": ("body.section", 1.0, r"all worlds share the reference geometry"),
     "own": ("body.mu10", 1.0, r"'body.mu10' is unknown"),
@@ -419,3 +424,65 @@ def test_a_checkpoint_holds_the_values(tmp_path):
         with pytest.raises(wf.CheckpointError, match=r"checkpoint has values of 'body\..*' set, the model has not"):
             without.resume(path)
         assert rows(without, 0) == before
+
+
+def test_masses_are_those_of_the_densities():
+    """Of a body with two groups, one of which has a density that varies in space and is scaled."""
+
+    def build(first, second, worlds=1):
+        b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+        mesh = wf.mesh.box((0.1, 0.02, 0.02), cells=(4, 1, 1), element="T4")
+        left = mesh.points[mesh.cells].mean(axis=1)[:, 0] < 0.05
+        mesh = replace(mesh, element_sets={"left": np.flatnonzero(left), "right": np.flatnonzero(~left)})
+        laws = {"left": wf.SVK(E=1e6, nu=0.3, density=first), "right": wf.NeoHookean.from_E_nu(E=2e6, nu=0.4, density=second)}
+        b.add_solid(mesh, material=laws, name="body")
+        return b.finalize(device="cpu", worlds=worlds)
+
+    def graded(X):
+        return 800.0 + 1e4 * X[:, 0]
+
+    many = build(1000.0, graded, 2)
+    assert many.info()["mass"] == pytest.approx(build(1000.0, graded).info()["mass"], rel=1e-14)
+    many.set_parameter("body.left.density", [1000.0, 1700.0])
+    many.set_parameter("body.right.density_factor", [1.0, 3.0])
+    sim = wf.Simulation(many, dt=1e-3)
+    sim.step(3)
+    for world, (first, factor) in enumerate(((1000.0, 1.0), (1700.0, 3.0))):
+        single = build(first, lambda X, factor=factor: factor * graded(X))
+        one, other = many.mass_matrix(world), single.mass_matrix()
+        assert abs(one - other).max() <= 1e-14 * abs(other).max()
+        alone = wf.Simulation(single, dt=1e-3)
+        alone.step(3)
+        kinetic = alone.energies()["kinetic"][0]  # a free fall: half of m v^2
+        assert kinetic == pytest.approx(0.5 * single.mass * (9.81 * 3e-3) ** 2, rel=1e-9)
+        assert sim.energies()["kinetic"][world] == pytest.approx(kinetic, rel=1e-12)
+
+
+def test_what_is_made_of_a_density_is_refused():
+    b = wf.ModelBuilder(gravity=([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.0, -9.81)]))
+    CASES["T4"][0](b, material())
+    m = b.finalize(device="cpu", worlds=2)
+    with pytest.raises(wf.ModelError, match=r"'body.density' can't be set: .*a time law of gravity"):
+        m.set_parameter("body.density", 900.0)
+
+
+@pytest.mark.parametrize("solver", [wf.NewtonPCG(preconditioner="two-level"), wf.Jacobi()], ids=["two-level", "jacobi"])
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_free_bodies_of_other_densities(solver, dtype):
+    """A free body, whose translation is solved for by its mass, falls onto a plane."""
+
+    def build(density, worlds=1):
+        b = wf.ModelBuilder(gravity=(0.1, 0.0, -9.81))
+        mesh = wf.mesh.box((0.04, 0.04, 0.04), cells=(1, 1, 1), origin=(0.0, 0.0, 1e-4))
+        body = b.add_solid(mesh, material=wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=density), name="body")
+        b.add_contact(body.surface("z-"), b.add_collider(wf.HalfSpace(normal=(0, 0, 1))), mu=0.3, name="floor")
+        return b.finalize(device="cpu", worlds=worlds, dtype=dtype)
+
+    many = build(1000.0, 2)
+    many.set_parameter("body.density", RHO[:2])
+    sim = wf.Simulation(many, dt=2e-3, solver=solver)
+    sim.step(4)
+    for world in range(2):
+        alone = wf.Simulation(build(RHO[world]), dt=2e-3, solver=solver)
+        alone.step(4)
+        assert rows(sim, world) == rows(alone, 0), world

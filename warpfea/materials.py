@@ -27,8 +27,12 @@ LIMITS: dict[str, tuple[Callable[[Any], Any], str]] = {
     **dict.fromkeys(("E", "mu", "mu10", "k"), (lambda v: v > 0.0, "positive, Pa")),
     "mu01": (lambda v: v >= 0.0, "0 or above, Pa"),
     **dict.fromkeys(("eta", "lambda_v"), (lambda v: v >= 0.0, "0 or above, Pa s")),
+    "density": (lambda v: v > 0.0, "positive, kg/m^3"),
+    "density_factor": (lambda v: v > 0.0, "positive"),
 }
 """Which finite values a constant may have, and what to say of others."""
+DENSITIES = ("density", "density_factor")
+"""Constants of the mass: the density where it is one number, else a factor on what was given."""
 
 
 def _positive(owner: str, **values: float) -> None:
@@ -116,17 +120,23 @@ class Material:
     def constants(self) -> dict[str, float]:
         """Numbers of the law and of the damping by name; a law made by `from_E_nu` has E and nu in place of its own."""
         out = self._made_of or {name: getattr(self, name) for name in self.own}
-        return out | ({"eta": self.damping.eta, "lambda_v": self.damping.lambda_v} if self.damping else {})
+        out = out | ({"eta": self.damping.eta, "lambda_v": self.damping.lambda_v} if self.damping else {})
+        if self.density is None:
+            return out
+        number = not callable(self.density) and np.ndim(self.density) == 0
+        return out | ({"density": float(self.density)} if number else {"density_factor": 1.0})
 
     def with_constants(self, values: Mapping[str, Any]) -> Self:
         """The material with other `constants`, which are not checked; arrays stand for a value in each world."""
         out = copy.copy(self)
+        if "density" in values:
+            vars(out)["density"] = values["density"]
         rates = {name: values[name] for name in ("eta", "lambda_v") if name in values}
         if rates:
             damping = copy.copy(self.damping)
             vars(damping).update(rates)
             vars(out)["damping"] = damping
-        mine = {name: value for name, value in values.items() if name not in rates}
+        mine = {name: value for name, value in values.items() if name not in {*rates, *DENSITIES}}
         if self._made_of:
             vars(out)["_made_of"] = self._made_of | mine
             mine = self._from_E_nu(**out._made_of, **self._options)

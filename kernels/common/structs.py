@@ -34,13 +34,26 @@ def topology_struct(dtype: str):
         entry: wp.array(dtype=wp.int32)  # contributions that a slot sums, in a fixed order
         mass_start: wp.array(dtype=wp.int32)  # [slot + 1]
         mass_column: wp.array(dtype=wp.int32)
-        mass_value: wp.array(dtype=T)  # kg
+        mass_value: wp.array2d(dtype=T)  # [world or 0, entry] kg
         free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
         held: wp.array(dtype=wp.uint8)  # [slot] bit k is set where component k is prescribed: `free` in one byte
         pool_start: wp.array(dtype=wp.int32)  # [slot + 1] of the pool of terms; with pooled terms
         pool_entry: wp.array(dtype=wp.int32)  # indices into the pool
 
     return Topology
+
+
+@functools.cache
+def mass_function(dtype: str):
+    """Device function: an entry of the mass matrix of a world, kg."""
+    T, Topology = precision(dtype).T, topology_struct(dtype)
+
+    @wp.func
+    def mass_at(topo: Topology, world: int, k: int) -> T:
+        """Entry k as the world has it."""
+        return topo.mass_value[world % topo.mass_value.shape[0], k]
+
+    return mass_at
 
 
 @functools.cache

@@ -90,7 +90,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         start: wp.array(dtype=wp.int32),
         source: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=Number),
-        mass: wp.array(dtype=T),
+        mass: wp.array2d(dtype=T),
         first: int,
         mass_factor: wp.array(dtype=f64),
         dq_dv: wp.array(dtype=f64),
@@ -117,7 +117,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
                 A += wp.transpose(K)
         A = T(dq_dv[world]) * A
         if first != 0:
-            A += T(mass_factor[world]) * mass[index] * wp.identity(n=3, dtype=T)
+            A += T(mass_factor[world]) * mass[world % mass.shape[0], index] * wp.identity(n=3, dtype=T)
         row_free = topo.free[row]
         column_free = topo.free[column]
         for i in range(3):

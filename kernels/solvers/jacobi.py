@@ -289,7 +289,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     def momentum_left(
         ctl: Newton,
         mass_factor: wp.array(dtype=f64),
-        lumped: wp.array(dtype=T),
+        lumped: wp.array2d(dtype=T),
         gradient: wp.array2d(dtype=vec3),
         free: wp.array(dtype=vec3),
         move: wp.array2d(dtype=vec3),
@@ -298,7 +298,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         """r = -g - c_M M p with the lumped mass, whose sum over a body is exact: the force left on its translation."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
-            m = T(mass_factor[world]) * lumped[slot]
+            m = T(mass_factor[world]) * lumped[world % lumped.shape[0], slot]
             r[world, slot] = -wp.cw_mul(gradient[world, slot] + m * move[world, slot], free[slot])
 
     @wp.kernel(module=module)

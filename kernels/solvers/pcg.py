@@ -67,8 +67,8 @@ def groups_struct(dtype: str):
         slot: wp.array(dtype=wp.int32)  # position slots, by group
         of_slot: wp.array(dtype=wp.int32)  # [slot] group or -1
         is_position: wp.array(dtype=T)  # [slot]
-        lumped: wp.array(dtype=T)  # [slot] (M Z)_slot, kg
-        mass: wp.array(dtype=T)  # [group] kg
+        lumped: wp.array2d(dtype=T)  # [world or 0, slot] (M Z)_slot, kg
+        mass: wp.array2d(dtype=T)  # [world or 0, group] kg
         free: wp.array(dtype=vec3)  # [group] directions in which it is free
 
     return FreeGroups
@@ -297,7 +297,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         s = vec3()
         for lane in range(LANES):
             s += partial[world, group, lane]
-        scale = T(1.0) / (T(mass_factor[world]) * groups.mass[group])
+        scale = T(1.0) / (T(mass_factor[world]) * groups.mass[world % groups.mass.shape[0], group])
         velocity[world, group] = scale * wp.cw_mul(s, groups.free[group])
 
     @wp.kernel(module=module)
@@ -319,7 +319,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             return
         c = velocity[world, group]
         x[world, slot] = x[world, slot] + groups.is_position[slot] * c
-        r[world, slot] = r[world, slot] - T(mass_factor[world]) * groups.lumped[slot] * wp.cw_mul(c, free[slot])
+        r[world, slot] = r[world, slot] - T(mass_factor[world]) * groups.lumped[world % groups.lumped.shape[0], slot] * wp.cw_mul(c, free[slot])
 
     return _types.SimpleNamespace(
         module=module,

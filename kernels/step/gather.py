@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.inverse import inverse_function
 from ..common.lanes import lane_functions
-from ..common.structs import additions_struct, balance_struct, pattern_struct, topology_struct
+from ..common.structs import additions_struct, balance_struct, mass_function, pattern_struct, topology_struct
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import SMALL, kernel_module, precision
 from ..terms.constraints import constraint_struct, multiplier_struct
@@ -42,7 +42,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     f64 = wp.float64
     Pattern = pattern_struct()
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
-    free_inverse = inverse_function(dtype)
+    free_inverse, mass_at = inverse_function(dtype), mass_function(dtype)
     name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'ties', 'midpoint')}"
     module = kernel_module(f"gather_{name}", max_unroll=SMALL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
@@ -156,8 +156,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             j = topo.mass_column[k]
             before = balance.v_tilde[world, j]
-            a += topo.mass_value[k] * (balance.v[world, j] - before)
-            past += topo.mass_value[k] * before
+            a += mass_at(topo, world, k) * (balance.v[world, j] - before)
+            past += mass_at(topo, world, k) * before
         a = T(balance.mass_factor[world]) * a
         load = balance.dead[world, slot]
         magnitude = balance.dead_magnitude[world, slot]
@@ -284,7 +284,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             f = gathered(topo, contribution, world, slot)
             a = vec3()
             for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-                a += topo.mass_value[k] * p_in[world, topo.mass_column[k]]
+                a += mass_at(topo, world, k) * p_in[world, topo.mass_column[k]]
             dq = T(more.dq_dv[world])
             h = T(more.mass_factor[world]) * a + dq * f
             share = finish(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
@@ -369,7 +369,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         mass = T(0.0)
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             if topo.mass_column[k] == slot:
-                mass = T(mass_factor[world]) * topo.mass_value[k]
+                mass = T(mass_factor[world]) * mass_at(topo, world, k)
         k6 = T(dq_dv[world]) * k6
         A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
         free = topo.free[slot]
@@ -390,7 +390,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         world, slot = wp.tid()
         s = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            s += topo.mass_value[k] * a[world, topo.mass_column[k]]
+            s += mass_at(topo, world, k) * a[world, topo.mass_column[k]]
         rows[0, world, slot] = f64(0.5) * f64(wp.dot(s, a[world, slot]))
 
     return _types.SimpleNamespace(

@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.structs import balance_struct, topology_struct
+from ..common.structs import balance_struct, mass_function, topology_struct
 from ..common.types import precision
 from ..solvers.control import control_struct
 from .control import step_struct
@@ -66,6 +66,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
+    mass_at = mass_function(dtype)
     Step = step_struct()
     Newton = control_struct()
     Topology, Balance = topology_struct(dtype), balance_struct(dtype)
@@ -76,7 +77,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         step: Step,
         topo: Topology,
         balance: Balance,
-        lumped: wp.array(dtype=T),
+        lumped: wp.array2d(dtype=T),
         u_n: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3),
     ):
@@ -87,13 +88,13 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
             return
         Mv = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            Mv += topo.mass_value[k] * balance.v[world, topo.mass_column[k]]
+            Mv += mass_at(topo, world, k) * balance.v[world, topo.mass_column[k]]
         dq = balance.u[world, slot] - u_n[world, slot]
         a = balance.inertia[world, slot]
         dv = balance.v[world, slot] - v_n[world, slot]
         f = topo.free[slot]
         held = vec3(T(1.0) - f[0], T(1.0) - f[1], T(1.0) - f[2])
-        weight = lumped[slot] * vec3(step.gravity[world])
+        weight = lumped[world % lumped.shape[0], slot] * vec3(step.gravity[world])
         loads = balance.dead[world, slot]
         balance.rows[0, world, slot] = f64(0.5) * step.dq_dv[world] * f64(wp.dot(dv, a))
         balance.rows[1, world, slot] = f64(wp.dot(balance.internal[world, slot], dq))

@@ -93,7 +93,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         law: wp.array(dtype=wp.int32),
         weight: wp.array(dtype=vec3),
         value: wp.array2d(dtype=wp.vec3d),
-        lumped: wp.array(dtype=T),
+        lumped: wp.array2d(dtype=T),
         gravity: wp.array(dtype=wp.vec3d),
         ramp: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
@@ -104,7 +104,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        f = (T(ramp[world]) * lumped[slot]) * vec3(gravity[world])
+        f = (T(ramp[world]) * lumped[world % lumped.shape[0], slot]) * vec3(gravity[world])
         m = wp.cw_mul(f, wp.sign(f))
         for k in range(start[slot], start[slot + 1]):
             x = wp.cw_mul(weight[k], vec3(value[world, law[k]]))

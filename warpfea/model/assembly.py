@@ -23,11 +23,14 @@ __all__ = [
     "BlockKey",
     "FacetTables",
     "HostBlock",
+    "MassPart",
     "body_mass",
     "density_of",
     "facet_places",
     "facet_tables",
     "gather_table",
+    "is_number",
+    "mass_parts",
     "host_blocks",
     "require_density",
     "rigid_modes",
@@ -175,8 +178,10 @@ def require_density(bodies: Iterable[Discretisation], what: str) -> None:
                 )
 
 
-def density_at(body: Discretisation, elements: np.ndarray, s: np.ndarray, conn: np.ndarray) -> np.ndarray:
-    """(E, Q) density of elements at points."""
+def density_at(
+    body: Discretisation, elements: np.ndarray, s: np.ndarray, conn: np.ndarray, number: float | None = None
+) -> np.ndarray:
+    """(E, Q) density of elements at points; `number` stands for densities that are one number."""
     out = np.empty((len(elements), s.shape[1]))
     index = body.material_of[elements]
     for k, (_, material) in enumerate(body.materials):
@@ -196,7 +201,7 @@ def density_at(body: Discretisation, elements: np.ndarray, s: np.ndarray, conn: 
         elif np.ndim(density) == 1:
             out[rows] = np.asarray(density, dtype=float)[elements[rows], None]
         else:
-            out[rows] = float(density)
+            out[rows] = float(density) if number is None else number
     return out
 
 
@@ -207,32 +212,56 @@ def parent_mass(family: Any) -> np.ndarray:
     return np.einsum("q,qi,qj->ij", family.mass_rule.weights, table, table)
 
 
-def element_density(host: HostBlock) -> np.ndarray:
-    """(E,) density of the elements of a block, constant in each, kg/m^3."""
-    density = np.asarray(density_of(host.body.materials[host.material][1]), dtype=float)
-    return np.full(len(host.elements), float(density)) if density.ndim == 0 else density[host.elements]
+@dataclass(frozen=True)
+class MassPart:
+    """What a material adds to the mass of its body: `scale` times a matrix.
+
+    Attributes:
+        scale: the density, kg/m^3, or 1 where it is a function or one per element.
+        matrix: scalar mass matrix over it, (slots, slots) CSR of the body.
+        total: mass over it.
+    """
+
+    scale: float
+    matrix: sp.csr_matrix
+    total: float
+
+
+def is_number(material: Material) -> bool:
+    """Whether the density of a material is one number."""
+    return not callable(density_of(material)) and np.ndim(density_of(material)) == 0
+
+
+def mass_parts(body: Discretisation) -> list[MassPart]:
+    """Consistent scalar mass m_ij = int rho s_i s_j dV (Eq. 20) of each material of a body."""
+    flat = straight(body)
+    n = body.slot_count
+    scales = [float(density_of(m)) if is_number(m) else UNIT for _, m in body.materials]
+    out = []
+    for k, scale in enumerate(scales):
+        total, mass = sp.csr_matrix((n, n)), 0.0
+        for affine in (True, False):
+            chosen = np.flatnonzero((flat == affine) & (body.material_of == k))
+            rule = mass_rule(body, affine)
+            for part in chunks(body, chosen, len(rule.weights)):
+                conn = body.connectivity[part]
+                s, _, _, det = geometry(body, part, rule.points)
+                w = density_at(body, part, s, conn, UNIT) * det * rule.weights
+                mass += float(w.sum())
+                subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
+                table = s[0] if len(s) == 1 else s
+                local = np.einsum(subscripts, w, table, table, optimize=True)
+                S = conn.shape[1]
+                rows = np.repeat(conn, S, axis=1).ravel()
+                cols = np.tile(conn, (1, S)).ravel()
+                total = total + sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n))
+        out.append(MassPart(scale, total, mass))
+    return out
 
 
 def body_mass(body: Discretisation) -> sp.csr_matrix:
-    """Consistent scalar mass matrix m_ij = int rho s_i s_j dV (Eq. 20), body slots, kg."""
-    flat = straight(body)
-    n = body.slot_count
-    total = sp.csr_matrix((n, n))
-    for affine in (True, False):
-        chosen = np.flatnonzero(flat == affine)
-        rule = mass_rule(body, affine)
-        for part in chunks(body, chosen, len(rule.weights)):
-            conn = body.connectivity[part]
-            s, _, _, det = geometry(body, part, rule.points)
-            w = density_at(body, part, s, conn) * det * rule.weights
-            subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
-            table = s[0] if len(s) == 1 else s
-            local = np.einsum(subscripts, w, table, table, optimize=True)
-            S = conn.shape[1]
-            rows = np.repeat(conn, S, axis=1).ravel()
-            cols = np.tile(conn, (1, S)).ravel()
-            total = total + sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n))
-    return total
+    """Consistent scalar mass matrix of a body (Eq. 20), (slots, slots) CSR, kg."""
+    return sum((part.scale * part.matrix for part in mass_parts(body)), sp.csr_matrix((body.slot_count,) * 2))
 
 
 def law_of(integral: Part, material: Material) -> tuple[str, tuple[Any, ...]]:

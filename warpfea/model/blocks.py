@@ -27,7 +27,8 @@ __all__ = ["Block", "build_block", "output_block", "output_rows"]
 class Block:
     """Elements that one kernel does: their kind, device data, and where they came from.
 
-    `coupled`: each world has its own couplings of assumed strains.
+    `coupled`: each world has its own couplings of assumed strains. `det`: det J0 of straight elements, where the mass
+    of an element is one table times a number.
     """
 
     key: assembly.BlockKey
@@ -43,6 +44,7 @@ class Block:
     field_rule: Any = None
     output: Any = None
     coupled: bool = False
+    det: np.ndarray | None = None
 
     @property
     def connectivity(self) -> np.ndarray:
@@ -108,17 +110,19 @@ def build_block(
     data.coefficients = model.coefficients
     data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
     data.count = len(conn)
+    det = None
     if key.tying:
         _tied_tables(model, data, key, parts)
         points = len(key.tying.points)
         kernels = tied_kernels(model.dtype, family.slots, points, key.tying.width)
     else:
-        _point_tables(model, data, key, parts)
+        det = _point_tables(model, data, key, parts)
         points = len(key.rule.weights)
         kind = (key.law, family.slots, points, key.affine, key.damping, key.framed)
         kernels = element_kernels(model.dtype, *kind)
     cluster = cluster_size(model.dtype, len(conn), fit=model.device.is_cuda)
-    return Block(key, data, kernels, parts, len(conn), points, family.slots, contribution, element, cluster)
+    sizes = len(conn), points, family.slots
+    return Block(key, data, kernels, parts, *sizes, contribution, element, cluster, det=det)
 
 
 def output_block(model: Any, block: Block, scheme: str) -> Block:
@@ -171,13 +175,14 @@ def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[asse
         data.second, data.X_second = data.first, data.X_first
 
 
-def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> None:
-    """Gradients, weights, maps and axes at the points of elements."""
+def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> np.ndarray | None:
+    """Gradients, weights, maps and axes at the points of elements; det J0 where the mass of one is a table times it."""
     T, vec3, mat33 = model.types.T, model.types.vec3, model.types.mat33
     family, rule = elements.get(key.family), key.rule
     Q = len(rule.weights)
     points = np.vstack([rule.points, family.vertices])
     h, w, J0, axes = [], [], [], []
+    det_J0 = None
     for part in parts:
         for members in assembly.chunks(part.body, part.elements, len(points)):
             if key.affine:
@@ -197,8 +202,8 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
         data.det_J0 = model.array("elements", np.concatenate(w), T)
         if not any(callable(p.body.materials[p.material][1].density) for p in parts):
             data.mass = model.array("elements", assembly.parent_mass(family), T)
-            density = [assembly.element_density(p) for p in parts]
-            data.density = model.array("elements", np.concatenate(density) * np.concatenate(w), T)
+            det_J0 = np.concatenate(w)
+            data.density = model.array("elements", model.masses.of_elements(parts, det_J0), T)
         data.weight = model.array("elements", rule.weights[:, None], T)
     else:
         table = np.moveaxis(np.concatenate(h), 0, 2)
@@ -208,3 +213,4 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
         data.vertex_gradient = model.element_array(table[Q:], vec3)
     if key.framed:
         data.frame = model.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)
+    return det_J0

@@ -19,10 +19,10 @@ from .discretisation import Discretisation
 from .handles import SurfaceSet
 
 __all__ = [
+    "body_mass_total",
     "RULES",
     "ContactPoints",
     "Modulus",
-    "body_mass_total",
     "check_points",
     "contact_points",
     "corner_points",
@@ -173,15 +173,7 @@ def effective_modulus(
 
 
 def body_mass_total(body: Discretisation) -> float:
-    """Mass of a body, kg; 0 where a material has no density, so that only statics are possible."""
+    """Mass of a body as it was built, kg; 0 where a material has no density, so that only statics are possible."""
     if any(material.density is None for _, material in body.materials):
         return 0.0
-    total = 0.0
-    flat = assembly.straight(body)
-    for affine in (True, False):
-        rule = assembly.mass_rule(body, affine)
-        for part in assembly.chunks(body, np.flatnonzero(flat == affine), len(rule.weights)):
-            s, _, _, det = assembly.geometry(body, part, rule.points)
-            density = assembly.density_at(body, part, s, body.connectivity[part])
-            total += float(np.sum((density * det) @ rule.weights))
-    return total
+    return sum(part.scale * part.total for part in assembly.mass_parts(body))

@@ -17,6 +17,7 @@ from . import assembly
 from .blocks import Block, build_block
 from .bodies import Body
 from .description import Description
+from .masses import Masses
 from .parameters import MaterialParameters
 from .state import State
 from .topology import free_groups, label_components, make_topology
@@ -173,10 +174,8 @@ class Model:
             raise ModelError("every component of every node is prescribed: nothing is left to solve for")
 
     def _assemble_mass(self) -> None:
-        self.mass_host = sp.block_diag([assembly.body_mass(b) for b in self.bodies], format="csr")
-        self.mass_host.sum_duplicates()
-        self.lumped_host = self.mass_host @ self.is_position_host
-        self.lumped = self.array("slots", self.lumped_host, self.types.T)
+        self.masses = Masses(self)
+        self.mass_host, self.lumped_host = self.masses.matrix, self.masses.lumped[0]
 
     def _build_blocks(self, tables: bool) -> None:
         groups: dict[assembly.BlockKey, list[assembly.HostBlock]] = {}
@@ -322,14 +321,14 @@ class Model:
         self.terms.laws.register(out)
         return out
 
-    def mass_matrix(self) -> sp.csr_matrix:
-        """Consistent mass, (3 slots, 3 slots) CSR, kg; unknown 3 slot + component.
+    def mass_matrix(self, world: int = 0) -> sp.csr_matrix:
+        """Consistent mass of one world, (3 slots, 3 slots) CSR, kg; unknown 3 slot + component.
 
         Raises:
             ModelError: a material without a density.
         """
         assembly.require_density(self.bodies, "mass_matrix")
-        return sp.kron(self.mass_host, sp.identity(3), format="csr")
+        return sp.kron(self.masses.of_world(world), sp.identity(3), format="csr")
 
     def internal_force(self, state: State) -> np.ndarray:
         """Elastic internal force, Eq. (32), [world, slot, 3], N."""
@@ -393,8 +392,9 @@ class Model:
 
         Args:
             name: "B.E" with the name B of a body, or "B.G.E" with a group G that has a material of its own: a constant
-                of the material (E and nu where it was made of them, else those of the law), or eta and lambda_v of its
-                damping, which a value of 0 leaves in. The first value of such a name precedes the simulations.
+                of the material (E and nu where it was made of them, else those of the law), eta and lambda_v of its
+                damping, which a value of 0 leaves in, or density, kg/m^3; density_factor where densities are a function
+                or one per element. The first value of such a name precedes the simulations.
                 "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
                 ModelBuilder.add_contact; where mu_static equals mu, it follows mu. "K.offset" with the name K of a
                 collider: of a HalfSpace the offset of its plane, m; of other shapes by how much the surface lies

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
-from .contact_points import ContactPoints, Modulus, body_mass_total, effective_modulus, points_by_rules
+from .contact_points import ContactPoints, Modulus, effective_modulus, points_by_rules
 from .contacts import ContactOptions
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
@@ -230,19 +231,14 @@ def thickness(surface: SurfaceSet) -> np.ndarray:
         return np.asarray(out.numpy(), dtype=float) * size
 
 
-def pair_mass(contact: PairContact) -> float:
-    """Effective mass of two bodies, kg."""
-    mass = 0.0
+def pair_numbers(
+    contact: PairContact, area: float, mass_of: Callable[[Discretisation], float], modulus_of: Modulus
+) -> dict[str, float]:
+    """Constants of Eqs. (74)-(76), (79) and (80) of two bodies whose region has an area, m^2, and the effective mass."""
+    compliance = shear = lightness = 0.0
     for surface in (contact.slave, contact.master):
-        total = body_mass_total(surface.body)
-        mass += 1.0 / total if total > 0.0 else math.inf
-    return 1.0 / mass
-
-
-def pair_numbers(contact: PairContact, area: float, mass: float, modulus_of: Modulus) -> dict[str, float]:
-    """Constants of Eqs. (74)-(76), (79) and (80) of two bodies whose region has an area, m^2, of an effective mass."""
-    compliance = shear = 0.0
-    for surface in (contact.slave, contact.master):
+        total = mass_of(surface.body)
+        lightness += 1.0 / total if total > 0.0 else math.inf
         E, nu = modulus_of(surface.body, surface)
         compliance += (1.0 - nu**2) / E
         shear += 2.0 * (2.0 - nu) * (1.0 + nu) / E
@@ -251,5 +247,5 @@ def pair_numbers(contact: PairContact, area: float, mass: float, modulus_of: Mod
         "normal": 4.0 / 3.0 * a / compliance,
         "tangent": 8.0 * a / shear,
         "modulus": 2.0 * a / compliance,
-        "mass": mass,
+        "mass": 1.0 / lightness,
     }

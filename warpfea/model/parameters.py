@@ -12,7 +12,7 @@ import numpy as np
 from ..base.errors import CheckpointError, ModelError
 from ..base.names import listing
 from ..base.worlds import per_world, refuse
-from ..materials import LIMITS, Material
+from ..materials import DENSITIES, LIMITS, Material
 from . import assembly
 from .blocks import Block, output_rows
 from .contact_points import Modulus, effective_modulus
@@ -31,7 +31,6 @@ Owner = tuple["Discretisation", int]
 RATES = ("eta", "lambda_v")
 SHARED = {
     "cells": "the mesh",
-    "density": "the mass matrix",
     "elements": "the mesh",
     "form": "the kernels of damping",
     "frames": "the reference geometry",
@@ -112,8 +111,9 @@ class MaterialParameters:
             return f"the material {kinds} has no damping, so its kernels were left out; give it KelvinVoigt(eta=0)"
         for law in laws:
             if what in {"E", "nu", *law.own} - set(law.constants):
+                made = [constant for constant in law.constants if constant not in DENSITIES]
                 other = "from_E_nu" if what in ("E", "nu") else "its constructor"
-                return f"the material {type(law).__name__} was made of {listing(law.constants)}; {other} takes {what!r}"
+                return f"the material {type(law).__name__} was made of {listing(made)}; {other} takes {what!r}"
         return None
 
     # values
@@ -125,6 +125,11 @@ class MaterialParameters:
     def varies(self, body: Discretisation) -> bool:
         """Whether constants of a body's materials were set."""
         return any(index == self._index(body) for index, _, _ in self.values)
+
+    def mass(self, body: Discretisation, world: int | None) -> float:
+        """Mass of a body as a world has it, or as it was built, kg; 0 where a material has no density."""
+        masses = self.model.masses
+        return masses.of_body(body) if world is None else masses.of_body(body, world)
 
     def modulus(self, world: int | None) -> Modulus:
         """`effective_modulus` as a world has it, or as the bodies were built."""
@@ -156,6 +161,8 @@ class MaterialParameters:
         wanted = per_world(owner, name, values, self.model.worlds)
         good, text = LIMITS.get(name, (np.isfinite, "finite"))
         refuse(owner, name, wanted, ~mask | (np.isfinite(wanted) & good(wanted)), text)
+        if name in DENSITIES:
+            self._refuse_density(f"{owner}.{name}", [body for body, _ in members])
         keys = [(self._index(body), k, name) for body, k in members]
         if self.begun and any(key not in self.values for key in keys):
             raise ModelError(
@@ -173,11 +180,29 @@ class MaterialParameters:
         self.changes[mask] += 1
         self.version += 1
 
+    def _refuse_density(self, name: str, bodies: list[Discretisation]) -> None:
+        """Refuse to set densities where all worlds share what was made of them."""
+        forces = [force for force in self.model.description.body_forces if set(force.bodies) & set(bodies)]
+        if forces:
+            raise ModelError(
+                f"set_parameter: {name!r} can't be set: all worlds share what add_body_force does to a body, which is "
+                "per mass; build a model of its own for another density"
+            )
+        if self.model.terms.dead.gravity_law is not None:
+            raise ModelError(
+                f"set_parameter: {name!r} can't be set: all worlds share the weights of a time law of gravity; take "
+                "constant gravity, which set_gravity sets in each world"
+            )
+
     # tables
 
     def _write(self, members: list[Owner], name: str, mask: np.ndarray) -> None:
         """Bring the tables on the device up to date with the values of some materials."""
         m = self.model
+        if name in DENSITIES:
+            keys = [(self._index(body), k) for body, k in members]
+            m.masses.set({key: self.values[(*key, name)] for key in keys})
+            return
         if len(m.coefficient_table) != m.worlds:
             m.coefficient_table = np.tile(m.coefficient_table, (m.worlds, 1, 1))
         chosen = {(self._index(body), k) for body, k in members}
@@ -242,7 +267,8 @@ class MaterialParameters:
         kept = [(block, block.data.coefficients, getattr(block.data, "coupling", None)) for block in blocks]
         try:
             for block, coefficients, coupling in kept:
-                block.data.coefficients = coefficients[world : world + 1]
+                if coefficients.shape[0] == self.model.worlds:
+                    block.data.coefficients = coefficients[world : world + 1]
                 if block.coupled:
                     block.data.coupling = coupling[:, :, world * block.count : (world + 1) * block.count]
             yield

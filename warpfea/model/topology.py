@@ -24,7 +24,7 @@ def make_topology(model: Any) -> Any:
     topo.entry = model.array("topology", entry, wp.int32)
     topo.mass_start = model.array("mass", model.mass_host.indptr, wp.int32)
     topo.mass_column = model.array("mass", model.mass_host.indices, wp.int32)
-    topo.mass_value = model.array("mass", model.mass_host.data, model.types.T)
+    topo.mass_value = model.masses.values
     topo.free = model.array("slots", model.free_host, model.types.vec3)
     topo.held = model.array("slots", (model.free_host == 0.0) @ [1, 2, 4], wp.uint8)
     model.terms.join(topo)
@@ -62,13 +62,13 @@ def free_groups(model: Any) -> tuple[Any, int]:
     of_slot = number[label]
     slots = np.flatnonzero((of_slot >= 0) & (model.slot_kind == 0))
     slots = slots[np.argsort(of_slot[slots], kind="stable")]
-    mass = np.bincount(of_slot[slots], weights=model.lumped_host[slots], minlength=len(keep))
     start = np.concatenate([[0], np.cumsum(np.bincount(of_slot[slots], minlength=len(keep)))])
     groups.start = model.array("groups", start, wp.int32)
     groups.slot = model.array("groups", slots, wp.int32)
     groups.of_slot = model.array("groups", of_slot, wp.int32)
-    groups.is_position, groups.lumped = model.is_position, model.lumped
-    groups.mass = model.array("groups", mass, model.types.T)
+    groups.is_position, groups.lumped = model.is_position, model.masses.lumped_values
+    model.cache["free groups"] = of_slot, slots, len(keep)
+    groups.mass = model.array("groups", model.masses.of_groups(*model.cache["free groups"]), model.types.T)
     groups.free = model.array("groups", free[keep], model.types.vec3)
     return groups, len(keep)
 

@@ -59,7 +59,8 @@ class Opening:
         self.driven = supports.moved is not None or supports.turned is not None
         self.count = 0
         self._breaks: tuple[float, np.ndarray, np.ndarray] = (0.0, np.zeros(0), np.zeros((2, 0)))
-        self._mass: list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]] = []
+        self._mass: dict[int, list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]] = {}
+        self._world = 0  # that is started now
         refuse(at.model, integrator, self.driven)
 
     def prepare(self, dt: float) -> None:
@@ -108,7 +109,8 @@ class Opening:
         laws = self._law_motion(flags, ahead, dt)
         u, v = state.displacement.numpy().astype(float), state.velocity.numpy().astype(float)
         before = self._kinetic(v)
-        for world in np.flatnonzero(flags):
+        for world in np.flatnonzero(flags).tolist():
+            self._world = world
             v[world] += self._impulse(u[world], v[world], laws[:, world])
         self._set(state.velocity, flags, v)
         g = self._unbalanced(flags, ahead, dt)
@@ -116,7 +118,8 @@ class Opening:
         rho = self.integrator.parameter
         early = (rho - 1.0) / (rho + 1.0)  # a_n is of the time t + early dt
         late = 1.0 / 6.0 - 1.0 / (rho + 1.0) ** 2 - 0.5 * early
-        for world in np.flatnonzero(flags):
+        for world in np.flatnonzero(flags).tolist():
+            self._world = world
             motion = u[world], v[world], laws[:, world]
             w[world] = self._acceleration(g[world], *motion)
             jerk = self._jerk(*motion, w[world], 0.25 * dt)
@@ -138,7 +141,8 @@ class Opening:
 
     def _kinetic(self, v: np.ndarray) -> np.ndarray:
         """1/2 v.M v, (B,), J."""
-        return np.array([0.5 * np.sum(one * (self.model.mass_host @ one)) for one in v])
+        masses = self.model.masses
+        return np.array([0.5 * np.sum(one * (masses.of_world(world) @ one)) for world, one in enumerate(v)])
 
     def _book(self, flags: np.ndarray, change: np.ndarray) -> None:
         """What the impulse does is the integrator's."""
@@ -275,7 +279,7 @@ class Opening:
     def _saddle(self, force: np.ndarray, held: np.ndarray, J: Any = None, goal: Any = None) -> np.ndarray:
         """x (slots, 3) with M x + J^T m = force on free components, x = held on others, and J x = goal."""
         m = self.model
-        x = self._solve(force - m.mass_host @ held) + held
+        x = self._solve(force - m.masses.of_world(self._world) @ held) + held
         if J is None:
             return x
         free = m.free_host.ravel() != 0.0
@@ -287,19 +291,20 @@ class Opening:
 
     def _solve(self, force: np.ndarray) -> np.ndarray:
         """M^-1 force on the free components, 0 on others."""
-        if not self._mass:
-            self._mass = [mass_solver(self.model, c) for c in range(3)]
+        world = self._world if self.model.masses.varied else 0
+        if world not in self._mass:
+            self._mass[world] = [mass_solver(self.model, c, world) for c in range(3)]
         out = np.zeros_like(force)
-        for c, (free, solve) in enumerate(self._mass):
+        for c, (free, solve) in enumerate(self._mass[world]):
             if len(free) and force[free, c].any():
                 out[free, c] = solve(force[free, c])
         return out
 
 
-def mass_solver(model: Model, component: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+def mass_solver(model: Model, component: int, world: int = 0) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """The slots that are free in a component, and what solves with the mass matrix among them."""
     free = np.flatnonzero(model.free_host[:, component])
-    M = model.mass_host[free][:, free].astype(float).tocsc()
+    M = model.masses.of_world(world)[free][:, free].astype(float).tocsc()
     if len(free) <= FACTORED:
         return free, spl.splu(M).solve if len(free) else lambda f: f
     scale = sp.diags(1.0 / M.diagonal())

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.writer import Output
 from ..model.assembly import element_volumes, require_density
-from ..model.contact_points import body_mass_total, effective_modulus
+from ..model.contact_points import effective_modulus
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -33,7 +33,7 @@ def spring_stiffness(model: Model, stabilise: Any) -> float:
     require_density(model.bodies, "stabilise")
     if stabilise is not True:
         return float(stabilise)
-    stiffest = max(effective_modulus(b)[0] * float(element_volumes(b).sum()) / body_mass_total(b) for b in model.bodies)
+    stiffest = max(effective_modulus(b)[0] * float(element_volumes(b).sum()) / model.masses.of_body(b) for b in model.bodies)
     return SOFT * stiffest / model.size**2
 
 

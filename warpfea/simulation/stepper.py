@@ -168,17 +168,9 @@ class Stepper:
     def begin_ledger(self, mask: np.ndarray) -> None:
         """Measure the ledger of the chosen worlds from the present state; what has added up stays."""
         m = self.model
-        rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
-        kernel = self.newton.residual.gather.mass_product
-        Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
-        u = self.state.displacement.numpy().astype(float)
         columns = list(m.terms.ledger)
-        fresh = np.zeros((m.worlds, len(columns)))
-        fresh[:, 0] = rows.numpy()[0].sum(axis=1)
-        fresh[:, 1] = m.strain_energy(self.state)
-        fresh[:, 2] = -np.einsum("bc,s,bsc->b", m.terms.dead.gravity.numpy(), m.lumped_host, u)
         ledger = self.state.ledger.numpy()
-        ledger[mask, :3] = fresh[mask, :3]
+        ledger[mask, :3] = self._stored()[mask]
         for term in self.terms:
             measured = term.measure(self.at)
             check_measured(term, measured, m.worlds)
@@ -186,6 +178,16 @@ class Stepper:
                 ledger[mask, columns.index(name)] = values[mask]
         self.state.ledger.assign(ledger)
         self.state.ledger_time.assign(self.state.time)
+
+    def _stored(self) -> np.ndarray:
+        """(worlds, 3) kinetic energy, strain energy and potential of gravity of the state, J."""
+        m = self.model
+        rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
+        kernel = self.newton.residual.gather.mass_product
+        Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
+        u = self.state.displacement.numpy().astype(float)
+        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.of_worlds(m.worlds), u)
+        return np.stack([rows.numpy()[0].sum(axis=1), m.strain_energy(self.state), pull], axis=1)
 
     def forget(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:
         """The state of the chosen worlds was set from elsewhere: what follows it on the device is made anew.
@@ -199,9 +201,9 @@ class Stepper:
         self._changes[chosen] = self.model.parameters.changes[chosen]
 
     def take_parameters(self) -> None:
-        """Follow constants of materials that were set since the last step: kept matrices, the energy of the state.
+        """Follow constants of materials that were set since the last step: kept matrices, the energies of the state.
 
-        The ledger has the jump of that energy as the work of who set them, among that of fields.
+        The ledger has the jump of those energies as the work of who set them, among that of fields.
         """
         parameters = self.model.parameters
         if self._version == parameters.version:
@@ -213,11 +215,9 @@ class Stepper:
         self.forget(mask)
         if self.ledger:
             ledger = self.state.ledger.numpy()
-            columns = list(self.model.terms.ledger)
-            strain, fields = columns.index("strain"), columns.index("work_fields")
-            energy = self.model.strain_energy(self.state)
-            ledger[mask, fields] += (energy - ledger[:, strain])[mask]
-            ledger[mask, strain] = energy[mask]
+            stored = self._stored()
+            ledger[mask, list(self.model.terms.ledger).index("work_fields")] += (stored - ledger[:, :3]).sum(axis=1)[mask]
+            ledger[mask, :3] = stored[mask]
             self.state.ledger.assign(ledger)
 
     def set_on_device(self, flags: wp.array, *, restart: bool = True) -> None:
@@ -421,7 +421,7 @@ class Stepper:
         accepted = w.step.accepted
         reduce = self.newton.residual.reduce
         topo = m.topology
-        args = [w.step, topo, w.balance, m.lumped, state.displacement, state.velocity]
+        args = [w.step, topo, w.balance, m.masses.lumped_values, state.displacement, state.velocity]
         launch(self.kernels.ledger_rows, self.dim, args)
         reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
         self.terms.book(self.at, reduce, accepted)

@@ -111,7 +111,7 @@ class Assembled:
         self.whole = not model.device.is_cuda if whole is None else whole
         if "matrix" not in model.cache:
             model.cache["matrix"] = self._make_tables()
-        self.pattern, self.mass = model.cache["matrix"]
+        self.pattern: Pattern = model.cache["matrix"][0]
         self.runs = self._runs()
         name = f"contributions to the matrix, {'whole elements' if self.whole else 'columns'}"
         if name not in model.cache:
@@ -126,7 +126,7 @@ class Assembled:
         """Make the pattern and the masses of its upper entries."""
         model = self.model
         pattern = make_pattern(model, coupled_slots(model))
-        return pattern, model.array("matrix pattern", self._mass_of(pattern), model.types.T)
+        return pattern, model.array("matrix pattern", model.masses.of_pattern(pattern), model.types.T)
 
     def modules(self) -> set[wp.Module]:
         """Modules that assembly launches."""
@@ -181,18 +181,6 @@ class Assembled:
         model.count("matrix pattern", start, source)
         return start, source
 
-    def _mass_of(self, pattern: Pattern) -> np.ndarray:
-        """Scalar masses of the upper entries, kg."""
-        mass, upper = self.model.mass_host.sorted_indices(), pattern.upper
-        if len(mass.indices) == pattern.entries:
-            return mass.data[upper[:, 0]]
-        n = np.int64(mass.shape[0])
-        rows = np.repeat(np.arange(n), np.diff(mass.indptr))
-        key = rows * n + mass.indices
-        wanted = upper[:, 2].astype(np.int64) * n + upper[:, 3]
-        at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-        return np.where(key[at] == wanted, mass.data[at], 0.0)
-
     def values(self, name: str) -> wp.array:
         """A new array for the blocks, [world, entry]."""
         return self.work.array(name, (self.model.worlds, self.pattern.entries), self.model.types.mat33)
@@ -225,7 +213,7 @@ class Assembled:
                 args = [block.data, dq_dv, lines, w.newton.mixed, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (m.worlds, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
-            args += [self.mass, int(first == 0), mass_factor, dq_dv, active, out]
+            args += [m.cache["matrix"][1], int(first == 0), mass_factor, dq_dv, active, out]
             launch(self.assembly(block).add_elements, (m.worlds, len(self.pattern.upper)), args)
 
     def matrix(self, values: wp.array, world: int = 0) -> sp.csr_matrix:

@@ -28,7 +28,7 @@ class ContactTables(FacetTables[Contact]):
 
     Attributes:
         colliders: as described.
-        sizes: see `law_sizes`, by the index of a contact.
+        sizes: see `law_radius`, by the index of a contact.
         left_out: how many points of each contact only move with clamped slots, and so do not count.
     """
 
@@ -38,7 +38,7 @@ class ContactTables(FacetTables[Contact]):
         self.colliders: list[Collider] = list(model.description.colliders)
         self.clamped = clamped_slots(model)
         self.left_out: list[int] = []
-        self.sizes: dict[int, tuple[float, float]] = {}
+        self.sizes: dict[int, float] = {}
         self.shares = [self._share(c, p) for c, p in zip(self.contacts, self.host)]
 
     @property
@@ -113,8 +113,10 @@ class ContactTables(FacetTables[Contact]):
 
     def numbers(self, contact: Contact, world: int | None = None) -> dict[str, float]:
         if contact.index not in self.sizes:
-            self.sizes[contact.index] = law_sizes(contact)
-        return law_numbers(contact, self.model.parameters.modulus(world), self.sizes[contact.index])
+            self.sizes[contact.index] = law_radius(contact)
+        parameters = self.model.parameters
+        mass = parameters.mass(contact.body, world)
+        return law_numbers(contact, parameters.modulus(world), self.sizes[contact.index], mass)
 
     def _touching(self, collider: Collider) -> list[np.ndarray]:
         """Points of the surfaces that may touch a collider, (n, 3), m."""
@@ -138,27 +140,26 @@ class ContactTables(FacetTables[Contact]):
         h.update(self.built)
 
 
-def law_sizes(contact: Contact) -> tuple[float, float]:
-    """Radius of the region of a contact, m, of lumped ones over the root of the depth; mass of its body, kg."""
+def law_radius(contact: Contact) -> float:
+    """Radius of the region of a contact, m, of lumped ones over the root of the depth."""
     if contact.model == "sphere":
         # 1/R_eff = 1/R_A + 1/R_B, with a = sqrt(R_eff depth)
         assert contact.radius is not None
-        a = math.sqrt(1.0 / (1.0 / contact.radius + 1.0 / contact.collider.shape.radius_of_curvature))
-    elif contact.radius:
-        a = contact.radius
-    else:
-        a = math.sqrt(float(contact_points(contact.surface, contact.points).area.sum()) / math.pi)
-    return a, body_mass_total(contact.body)
+        return math.sqrt(1.0 / (1.0 / contact.radius + 1.0 / contact.collider.shape.radius_of_curvature))
+    if contact.radius:
+        return contact.radius
+    return math.sqrt(float(contact_points(contact.surface, contact.points).area.sum()) / math.pi)
 
 
 def law_numbers(
-    contact: Contact, modulus_of: Modulus = effective_modulus, sizes: tuple[float, float] | None = None
+    contact: Contact, modulus_of: Modulus = effective_modulus, a: float | None = None, mass: float | None = None
 ) -> dict[str, float]:
     """Constants of Eqs. (74)-(76), (79) and (80) with a rigid obstacle; of lumped contacts over powers of the depth."""
     E, nu = modulus_of(contact.body, contact.surface)
     modulus = E / (1.0 - nu**2)
     shear = E / (2.0 * (1.0 + nu)) / (2.0 - nu)
-    a, mass = sizes or law_sizes(contact)
+    a = law_radius(contact) if a is None else a
+    mass = body_mass_total(contact.body) if mass is None else mass
     return {
         "normal": 4.0 / 3.0 * modulus * a,
         "tangent": 8.0 * shear * a,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from ..model.pairs import (
     bernstein,
     exponents,
     master_facets,
-    pair_mass,
     pair_numbers,
     pair_points,
 )
@@ -39,7 +39,7 @@ class PairTables(FacetTables[PairContact]):
 
     Attributes:
         surfaces, masters: master surfaces, each once, and their facets; of: that of each contact.
-        regions: area of each contact, m^2. mass: effective, kg, by the index of a contact.
+        regions: area of each contact, m^2.
         facets: master facets in all. bodies: that are in a pair. corners: of the slave facets of each group.
         far: how far off a gap is told, m. deepest: overlap that is looked for at the start, m.
     """
@@ -47,7 +47,6 @@ class PairTables(FacetTables[PairContact]):
     def __init__(self, model: Model) -> None:
         contacts = list(model.description.pairs)
         super().__init__(model, contacts, [pair_points(contact.slave, contact.points) for contact in contacts])
-        self.mass: dict[int, float] = {}
         self.surfaces: list[SurfaceSet] = []
         self.of: list[int] = []
         for contact in self.contacts:
@@ -109,9 +108,8 @@ class PairTables(FacetTables[PairContact]):
 
     def numbers(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
         region = self.regions[self.number[contact.index]]
-        if contact.index not in self.mass:
-            self.mass[contact.index] = pair_mass(contact)
-        row = pair_numbers(contact, region, self.mass[contact.index], self.model.parameters.modulus(world))
+        parameters = self.model.parameters
+        row = pair_numbers(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
         return row | {"normal_damping": normal_damping(row["modulus"], row["mass"])}
 
     @property

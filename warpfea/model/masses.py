@@ -1,0 +1,158 @@
+"""Masses: one matrix for all worlds, or one of each world where densities were set (Model.set_parameter)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from . import assembly
+
+if TYPE_CHECKING:
+    from .discretisation import Discretisation
+
+__all__ = ["Masses"]
+
+UNIT = 1.0
+
+
+def _keys(matrix: sp.csr_matrix) -> np.ndarray:
+    """Numbers of the entries, row by row."""
+    n = np.int64(matrix.shape[0])
+    return np.repeat(np.arange(n), np.diff(matrix.indptr)) * n + matrix.indices
+
+
+class Masses:
+    """The consistent mass matrix (Eq. 20) as a sum over materials: density times the matrix of a density of 1.
+
+    Densities that are functions or one per element are in the matrix, and scaled by a factor. Arrays on the device have
+    a row of each world where densities were set, else one row that all worlds read.
+
+    Attributes:
+        matrix: (slots, slots) CSR as the bodies were built, kg.
+        table, lumped: (worlds or 1, entries), its entries; (worlds or 1, slots), its sums over position slots.
+        values, lumped_values: the same on the device.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.parts = {
+            (b, k): part for b, body in enumerate(model.bodies) for k, part in enumerate(assembly.mass_parts(body))
+        }
+        n = model.slots
+        # with zeros in it that a matrix has where others have entries
+        pattern = sp.csr_matrix((n, n))
+        whole: dict[tuple[int, int], sp.csr_matrix] = {}
+        for (b, k), part in self.parts.items():
+            at = part.matrix.tocoo()
+            first = model.bodies[b].slot_offset
+            whole[b, k] = sp.csr_matrix((at.data, (first + at.row, first + at.col)), shape=(n, n))
+            pattern = pattern + abs(whole[b, k])
+        pattern.sort_indices()
+        self.matrix = pattern
+        self.unit = {key: self._in_pattern(one) for key, one in whole.items()}
+        self.unit_lumped = {key: one @ model.is_position_host for key, one in whole.items()}
+        self.scales = {key: np.array([part.scale]) for key, part in self.parts.items()}
+        self._sum()
+        self.matrix = self._csr(0)
+        self.values = model.array("mass", self.table, model.types.T)
+        self.lumped_values = model.array("slots", self.lumped, model.types.T)
+
+    @property
+    def varied(self) -> bool:
+        """Whether worlds have masses of their own."""
+        return len(self.table) != 1
+
+    def of_world(self, world: int) -> sp.csr_matrix:
+        """(slots, slots) CSR, kg."""
+        return self._csr(world) if self.varied else self.matrix
+
+    def of_worlds(self, worlds: int) -> np.ndarray:
+        """(worlds, slots) lumped masses, kg."""
+        return np.broadcast_to(self.lumped, (worlds, self.lumped.shape[1]))
+
+    def of_body(self, body: Discretisation, world: int = 0) -> float:
+        """Mass of a body, kg; 0 where a material has no density, so that only statics are possible."""
+        if any(material.density is None for _, material in body.materials):
+            return 0.0
+        index = self.model.bodies.index(body)
+        return sum(
+            float(self.scales[key][world % len(self.scales[key])]) * part.total
+            for key, part in self.parts.items()
+            if key[0] == index
+        )
+
+    def of_pattern(self, pattern: Any) -> np.ndarray:
+        """(worlds or 1, upper entries) masses of a pattern of blocks (solvers/assembled.py), kg."""
+        upper = pattern.upper
+        if len(self.matrix.indices) == pattern.entries:
+            return self.table[:, upper[:, 0]]
+        key = _keys(self.matrix)
+        wanted = upper[:, 2].astype(np.int64) * self.matrix.shape[0] + upper[:, 3]
+        at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+        return np.where(key[at] == wanted, self.table[:, at], 0.0)
+
+    def of_groups(self, of_slot: np.ndarray, slots: np.ndarray, count: int) -> np.ndarray:
+        """(worlds or 1, groups) masses of groups of position slots, kg."""
+        return np.array([np.bincount(of_slot[slots], weights=row[slots], minlength=count) for row in self.lumped])
+
+    def of_elements(self, parts: list[assembly.HostBlock], det: np.ndarray) -> np.ndarray:
+        """(worlds or 1, elements) density times det J0 of a block of straight elements, kg."""
+        rows, first = [], 0
+        for part in parts:
+            last = first + len(part.elements)
+            material = part.body.materials[part.material][1]
+            own = UNIT if assembly.is_number(material) else np.asarray(material.density, dtype=float)[part.elements]
+            scale = self.scales[self.model.bodies.index(part.body), part.material]
+            rows.append(scale[:, None] * (own * det[first:last]))
+            first = last
+        worlds = max(len(row) for row in rows)
+        return np.concatenate([np.broadcast_to(row, (worlds, row.shape[1])) for row in rows], axis=1)
+
+    def set(self, scales: dict[tuple[int, int], np.ndarray]) -> None:
+        """Take densities, or factors on them, (worlds,), by the index of a body and the number of a material."""
+        self.scales |= scales
+        self._sum()
+        m, known = self.model, self.model.cache
+        self.values = self._renew("mass", self.values, self.table)
+        self.lumped_values = self._renew("slots", self.lumped_values, self.lumped)
+        m.topology.mass_value = self.values
+        if "matrix" in known:
+            pattern, mass = known["matrix"]
+            known["matrix"] = pattern, self._renew("matrix pattern", mass, self.of_pattern(pattern))
+        if m.group_count:
+            m.groups.mass = self._renew("groups", m.groups.mass, self.of_groups(*known["free groups"]))
+            m.groups.lumped = self.lumped_values
+        for block in m.blocks:
+            if block.det is not None:
+                table = self.of_elements(block.parts, block.det)
+                block.data.density = self._renew("elements", block.data.density, table)
+
+    def _renew(self, name: str, array: wp.array, values: np.ndarray) -> wp.array:
+        """Write values into an array of the device, or into a new one where they are of more worlds."""
+        if array.shape == values.shape:
+            array.assign(values)
+            return array
+        self.model.forget(name, array)
+        return self.model.array(name, values, self.model.types.T)
+
+    def _sum(self) -> None:
+        """Sum the tables over materials, in the same order for any number of worlds."""
+        worlds = max(len(scale) for scale in self.scales.values())
+        self.table = np.zeros((worlds, self.matrix.nnz))
+        self.lumped = np.zeros((worlds, self.matrix.shape[0]))
+        for key, scale in self.scales.items():
+            self.table += scale[:, None] * self.unit[key]
+            self.lumped += scale[:, None] * self.unit_lumped[key]
+
+    def _in_pattern(self, one: sp.csr_matrix) -> np.ndarray:
+        """Entries of a matrix at the places of `matrix`."""
+        one.sort_indices()
+        out = np.zeros(self.matrix.nnz)
+        out[np.searchsorted(_keys(self.matrix), _keys(one))] = one.data
+        return out
+
+    def _csr(self, world: int) -> sp.csr_matrix:
+        return sp.csr_matrix((self.table[world], self.matrix.indices, self.matrix.indptr), shape=self.matrix.shape)
