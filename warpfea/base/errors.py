@@ -67,12 +67,17 @@ class CapacityError(Error):
     """A device has too little memory for a model, a simulation or a step.
 
     Attributes:
-        bytes: size of the array that found no room; 0 where that is not known.
+        bytes: size of the array that found no room, or of the simulation that would find none; 0 where that is not
+            known.
+        per_world: bytes that a world of a simulation takes; 0 where that is not known.
+        worlds: the most worlds that fit; 0 where that is not known.
     """
 
-    def __init__(self, message: str, *, bytes: int = 0) -> None:
+    def __init__(self, message: str, *, bytes: int = 0, per_world: int = 0, worlds: int = 0) -> None:
         super().__init__(message)
         self.bytes = bytes
+        self.per_world = per_world
+        self.worlds = worlds
 
 
 class CheckpointError(Error):

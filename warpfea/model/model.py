@@ -82,8 +82,13 @@ class Model:
         self._memory: dict[str, int] = {}
         self.cache: dict[str, Any] = {}
         self.parameters = MaterialParameters(self)
+        self._source, self._tables = builder, tables
         with enough_memory(f"a model with {self.worlds} worlds", self.device):
             self._build(builder, tables)
+
+    def resized(self, worlds: int) -> Model:
+        """The model as it was built, with so many worlds."""
+        return Model(self._source, device=self.device, dtype=self.dtype, worlds=worlds, tables=self._tables)
 
     def _build(self, builder: Source, tables: bool) -> None:
         """Number, assemble and upload what the builder describes."""

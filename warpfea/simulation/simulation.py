@@ -22,6 +22,7 @@ from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
 from .adaptive import adapt_of
+from .capacity import check_capacity
 from .checks import (
     check_choice,
     check_constraint_tol,
@@ -127,19 +128,24 @@ class Simulation(Digests):
             constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
         check_constraint_tol(constraint_tol)
 
+        def stepper(model: Model, state: State, capture: bool = False) -> Stepper:
+            return Stepper(
+                model, state, scheme, options,
+                ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
+                adapt=adapt, quiet=quiet, ends=t_end is not None, on_compile=on_compile or bar,
+            )  # fmt: skip
+
         self.model = model
+        began = clock.perf_counter()
+        with quiet_warp(), compile_bar(None if on_compile is None else False) as bar:
+            check_capacity(model, stepper)
         self.state = model.state() if state is None else state
         check_state(model, self.state)
         self.integrator, self.solver = scheme, options
         self.on_failure, self.record = on_failure, record
-        began = clock.perf_counter()
         room = enough_memory(f"a simulation of {model.worlds} worlds", model.device)
         with quiet_warp(), room, compile_bar(None if on_compile is None else False) as bar:
-            self.stepper = Stepper(
-                model, self.state, scheme, options,
-                ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
-                adapt=adapt, quiet=quiet, ends=t_end is not None, on_compile=on_compile or bar,
-            )  # fmt: skip
+            self.stepper = stepper(model, self.state, capture)
         model.parameters.begun = True
         self.controls = Controls(model, self.state)
         self.compile_s = clock.perf_counter() - began

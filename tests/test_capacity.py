@@ -1,0 +1,47 @@
+"""Too many worlds are refused before anything is allocated, with what a world takes and how many fit."""
+
+import pytest
+import warpfea as wf
+from warpfea.simulation import capacity
+
+
+def build(worlds, *, contact=False):
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    body = b.add_solid(
+        wf.mesh.box((0.1, 0.02, 0.02), cells=(4, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1000.0), name="body"
+    )
+    if contact:
+        b.add_contact(body, b.add_collider(wf.HalfSpace(normal=(0, 0, 1), offset=-0.01), name="floor"), mu=0.3)
+    b.clamp(body.nodes("x-"))
+    return b.finalize(device="cpu", worlds=worlds)
+
+
+def taken(worlds, **options):
+    """Bytes besides the model's constants."""
+    sim = wf.Simulation(build(worlds, contact=True), dt=1e-3, **options)
+    return sum(count for name, count in sim.bytes().items() if not name.startswith("model."))
+
+
+@pytest.mark.parametrize("options", [{}, {"integrator": "bdf2", "ledger": False}], ids=["default", "bdf2"])
+def test_what_fits_is_told_and_does(options, monkeypatch):
+    per_world = taken(4, **options) - taken(3, **options)
+    room = taken(3, **options) + int(4.5 * per_world)
+    monkeypatch.setattr(capacity, "free_bytes", lambda device: int(room / (1.0 - capacity.KEPT)) + 1)
+    with pytest.raises(wf.CapacityError, match=rf"{per_world} bytes per world.*at most 7 worlds fit") as refused:
+        wf.Simulation(build(8, contact=True), dt=1e-3, **options)
+    assert (refused.value.worlds, refused.value.per_world) == (7, per_world)
+    assert refused.value.bytes == taken(3, **options) + 5 * per_world
+    assert taken(7, **options) <= room
+
+
+def test_where_there_is_plenty_nothing_is_measured(monkeypatch):
+    def fail(self, worlds):
+        raise AssertionError("a model was built once more")
+
+    monkeypatch.setattr(wf.Model, "resized", fail)
+    wf.Simulation(build(3), dt=1e-3)
+
+
+def test_memory_of_the_host_is_known_or_not_asked_for():
+    free = capacity.free_bytes(build(1).device)
+    assert free is None or free > 0
