@@ -1,8 +1,10 @@
 """Too many worlds are refused before anything is allocated, with what a world takes and how many fit."""
 
 import pytest
+
 import warpfea as wf
 from warpfea.simulation import capacity
+from warpfea.solvers import assembled
 
 
 def build(worlds, *, contact=False):
@@ -24,14 +26,16 @@ def taken(worlds, **options):
 
 @pytest.mark.parametrize("options", [{}, {"integrator": "bdf2", "ledger": False}], ids=["default", "bdf2"])
 def test_what_fits_is_told_and_does(options, monkeypatch):
-    per_world = taken(4, **options) - taken(3, **options)
-    room = taken(3, **options) + int(4.5 * per_world)
+    monkeypatch.setattr(assembled, "CHUNK", 2)
+    room = (taken(7, **options) + taken(8, **options)) // 2
     monkeypatch.setattr(capacity, "free_bytes", lambda device: int(room / (1.0 - capacity.KEPT)) + 1)
-    with pytest.raises(wf.CapacityError, match=rf"{per_world} bytes per world.*at most 7 worlds fit") as refused:
-        wf.Simulation(build(8, contact=True), dt=1e-3, **options)
-    assert (refused.value.worlds, refused.value.per_world) == (7, per_world)
-    assert refused.value.bytes == taken(3, **options) + 5 * per_world
-    assert taken(7, **options) <= room
+    with pytest.raises(wf.CapacityError, match=r"bytes per world, and cpu has .*at most 7 worlds fit") as refused:
+        wf.Simulation(build(9, contact=True), dt=1e-3, **options)
+    monkeypatch.undo()
+    monkeypatch.setattr(assembled, "CHUNK", 2)
+    assert refused.value.worlds == 7
+    assert refused.value.bytes == taken(9, **options)
+    assert refused.value.per_world == refused.value.bytes // 9
 
 
 def test_where_there_is_plenty_nothing_is_measured(monkeypatch):

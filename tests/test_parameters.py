@@ -263,7 +263,9 @@ def test_a_change_in_a_run_reaches_the_chosen_worlds_alone(case):
     many = run(3, (None, new), wp.array([False, True, True], dtype=wp.bool, device="cpu"))
     for world in range(3):
         first = {name: values[world] for name, values in VALUES.items()}
-        second = {"E": (5e6, 3e5)[world - 1], "nu": (0.1, 0.33)[world - 1], "eta": 5.0, "density": 700.0} if world else {}
+        second = (
+            {"E": (5e6, 3e5)[world - 1], "nu": (0.1, 0.33)[world - 1], "eta": 5.0, "density": 700.0} if world else {}
+        )
         alone = run(1, (first, second), None)
         assert rows(many, world) == rows(alone, 0), world
     energy = many.energies()
@@ -434,7 +436,10 @@ def test_masses_are_those_of_the_densities():
         mesh = wf.mesh.box((0.1, 0.02, 0.02), cells=(4, 1, 1), element="T4")
         left = mesh.points[mesh.cells].mean(axis=1)[:, 0] < 0.05
         mesh = replace(mesh, element_sets={"left": np.flatnonzero(left), "right": np.flatnonzero(~left)})
-        laws = {"left": wf.SVK(E=1e6, nu=0.3, density=first), "right": wf.NeoHookean.from_E_nu(E=2e6, nu=0.4, density=second)}
+        laws = {
+            "left": wf.SVK(E=1e6, nu=0.3, density=first),
+            "right": wf.NeoHookean.from_E_nu(E=2e6, nu=0.4, density=second),
+        }
         b.add_solid(mesh, material=laws, name="body")
         return b.finalize(device="cpu", worlds=worlds)
 

@@ -36,7 +36,9 @@ def block_struct(dtype: str):
         weight: wp.array2d(dtype=T)  # [point, elem] W det J0; affine: [point, 0] W
         det_J0: wp.array(dtype=T)  # [elem], affine only
         mass: wp.array2d(dtype=T)  # [local, local] int s_i s_j over the parent; affine only
-        density: wp.array2d(dtype=T)  # [world or 0, elem] rho det J0, kg; affine only, with a density constant in each element
+        density: wp.array2d(
+            dtype=T
+        )  # [world or 0, elem] rho det J0, kg; affine only, with a density constant in each element
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]
         frame: wp.array2d(dtype=mat33)  # [point, elem] axes of the law, framed blocks only

@@ -204,4 +204,12 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
         at = pair[group]
         coarse[world, at[0] + k * at[1] + at[2] + l] = A
 
-    return _types.SimpleNamespace(module=module, take_diagonal=take_diagonal, galerkin=galerkin)
+    @wp.kernel(module=module)
+    def choose_worlds(flags: wp.array(dtype=wp.int32), first: int, last: int, out: wp.array(dtype=wp.int32)):
+        """Flags of the worlds first .. last - 1, zero of others."""
+        world = wp.tid()
+        out[world] = wp.where(world >= first and world < last, flags[world], 0)
+
+    return _types.SimpleNamespace(
+        choose_worlds=choose_worlds, module=module, take_diagonal=take_diagonal, galerkin=galerkin
+    )

@@ -319,7 +319,9 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             return
         c = velocity[world, group]
         x[world, slot] = x[world, slot] + groups.is_position[slot] * c
-        r[world, slot] = r[world, slot] - T(mass_factor[world]) * groups.lumped[world % groups.lumped.shape[0], slot] * wp.cw_mul(c, free[slot])
+        r[world, slot] = r[world, slot] - T(mass_factor[world]) * groups.lumped[
+            world % groups.lumped.shape[0], slot
+        ] * wp.cw_mul(c, free[slot])
 
     return _types.SimpleNamespace(
         module=module,

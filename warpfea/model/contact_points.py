@@ -19,10 +19,10 @@ from .discretisation import Discretisation
 from .handles import SurfaceSet
 
 __all__ = [
-    "body_mass_total",
     "RULES",
     "ContactPoints",
     "Modulus",
+    "body_mass_total",
     "check_points",
     "contact_points",
     "corner_points",

@@ -234,7 +234,7 @@ def thickness(surface: SurfaceSet) -> np.ndarray:
 def pair_numbers(
     contact: PairContact, area: float, mass_of: Callable[[Discretisation], float], modulus_of: Modulus
 ) -> dict[str, float]:
-    """Constants of Eqs. (74)-(76), (79) and (80) of two bodies whose region has an area, m^2, and the effective mass."""
+    """Constants of Eqs. (74)-(76), (79), (80) of two bodies whose region has an area, m^2, and the effective mass."""
     compliance = shear = lightness = 0.0
     for surface in (contact.slave, contact.master):
         total = mass_of(surface.body)

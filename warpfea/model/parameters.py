@@ -260,17 +260,17 @@ class MaterialParameters:
         block.take_couplings(m.dtype)
 
     @contextmanager
-    def alone(self, world: int) -> Iterator[None]:
-        """For a while the tables are those of one world, for an evaluation of it alone."""
+    def window(self, first: int, last: int) -> Iterator[None]:
+        """For a while the tables are those of some worlds, for launches over them alone."""
         blocks = self.model.blocks if self.values else []
         kept: list[tuple[Block, Any, Any]]
         kept = [(block, block.data.coefficients, getattr(block.data, "coupling", None)) for block in blocks]
         try:
             for block, coefficients, coupling in kept:
                 if coefficients.shape[0] == self.model.worlds:
-                    block.data.coefficients = coefficients[world : world + 1]
+                    block.data.coefficients = coefficients[first:last]
                 if block.coupled:
-                    block.data.coupling = coupling[:, :, world * block.count : (world + 1) * block.count]
+                    block.data.coupling = coupling[:, :, first * block.count : last * block.count]
             yield
         finally:
             for block, coefficients, coupling in kept:

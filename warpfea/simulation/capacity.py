@@ -6,7 +6,9 @@ nothing is measured.
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,25 +55,46 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
     item = 3 * wp.types.type_size_in_bytes(model.types.T)
     if free is None or model.worlds <= 2 or model.worlds * model.slots * PLENTY * item < free:
         return
-    one, two = (_bytes(model, worlds, make) for worlds in (1, 2))
-    per_world = two - one
-    room = int((1.0 - KEPT) * free) - (one - per_world)
-    if model.worlds * per_world <= room:
+    small = Sizes(*(_arrays(model, worlds, make) for worlds in (1, 2)))
+    room = int((1.0 - KEPT) * free)
+    need = small.of(model.worlds)
+    if need <= room:
         return
-    most = max(room // per_world, 0)
-    need = one + (model.worlds - 1) * per_world
+    fit = bisect.bisect_right(range(1, model.worlds), room, key=small.of)
+    per_world = need // model.worlds
     raise CapacityError(
-        f"a simulation of {model.worlds} worlds takes {size(need)}, {per_world} bytes per world, and {model.device} has "
-        f"{size(free)} free: at most {most} worlds fit; take fewer, a coarser mesh, dtype='float32' or a device with "
-        "more memory",
-        bytes=need, per_world=per_world, worlds=most,
+        f"a simulation of {model.worlds} worlds takes {size(need)}, {per_world} bytes per world, and {model.device} "
+        f"has {size(free)} free: at most {fit} worlds fit; take fewer, a coarser mesh, dtype='float32' or a device "
+        "with more memory",
+        bytes=need, per_world=per_world, worlds=fit,
     )  # fmt: skip
 
 
-def _bytes(model: Model, worlds: int, make: Callable[[Model, State], Stepper]) -> int:
-    """Bytes of the state and of the scratch of a simulation of so many worlds."""
+@dataclass(frozen=True)
+class Sizes:
+    """Bytes of arrays by name with one and with two worlds, and for how many worlds an array is."""
+
+    one: tuple[dict[str, int], dict[str, Callable[[int], int]]]
+    two: tuple[dict[str, int], dict[str, Callable[[int], int]]]
+
+    def of(self, worlds: int) -> int:
+        """Bytes of so many worlds."""
+        out = 0
+        for name, count in self.one[0].items():
+            chunk = self.one[1].get(name, int)
+            out += count + (chunk(worlds) - 1) * (self.two[0][name] - count)
+        return out
+
+
+def _arrays(
+    model: Model, worlds: int, make: Callable[[Model, State], Stepper]
+) -> tuple[dict[str, int], dict[str, Callable[[int], int]]]:
+    """Arrays of the state and of the scratch of a simulation of so many worlds."""
     small = model.resized(worlds)
     state = small.state()
     stepper = make(small, state)
-    out = sum(stepper.work.bytes.values()) + sum(state.bytes.values())
-    return out + (sum(stepper.backup.bytes.values()) if stepper.backup is not None else 0)
+    out = dict(stepper.work.bytes)
+    for label, kept in (("state", state), ("backup", stepper.backup)):
+        if kept is not None:
+            out |= {f"{label}.{name}": count for name, count in kept.bytes.items()}
+    return out, stepper.work.chunks

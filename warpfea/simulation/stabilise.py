@@ -33,7 +33,9 @@ def spring_stiffness(model: Model, stabilise: Any) -> float:
     require_density(model.bodies, "stabilise")
     if stabilise is not True:
         return float(stabilise)
-    stiffest = max(effective_modulus(b)[0] * float(element_volumes(b).sum()) / model.masses.of_body(b) for b in model.bodies)
+    stiffest = max(
+        effective_modulus(b)[0] * float(element_volumes(b).sum()) / model.masses.of_body(b) for b in model.bodies
+    )
     return SOFT * stiffest / model.size**2
 
 

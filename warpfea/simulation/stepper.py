@@ -216,7 +216,9 @@ class Stepper:
         if self.ledger:
             ledger = self.state.ledger.numpy()
             stored = self._stored()
-            ledger[mask, list(self.model.terms.ledger).index("work_fields")] += (stored - ledger[:, :3]).sum(axis=1)[mask]
+            ledger[mask, list(self.model.terms.ledger).index("work_fields")] += (stored - ledger[:, :3]).sum(axis=1)[
+                mask
+            ]
             ledger[mask, :3] = stored[mask]
             self.state.ledger.assign(ledger)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..terms.workspace import Workspace
 
-__all__ = ["Assembled", "Pattern", "coupled_slots", "make_pattern", "shaped"]
+__all__ = ["Assembled", "Pattern", "chunk_of", "coupled_slots", "make_pattern", "shaped"]
 
 
 def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
@@ -94,12 +94,24 @@ def coupled_slots(model: Model) -> sp.csr_matrix:
     return model.cache["coupled slots"]
 
 
+CHUNK, CHUNKS = 512, 16
+"""Worlds whose matrices are assembled at once: at least so many, and at most so many times to do all."""
+
+
+def chunk_of(worlds: int) -> int:
+    """Worlds of a chunk."""
+    return min(worlds, max(CHUNK, -(-worlds // CHUNKS)))
+
+
 class Assembled:
     """Assembly of the elements' part of H, c_M M + (dq/dv) K; terms add their `blocks` to it.
 
     Prescribed components have rows and columns of zeros.
 
+    Scratch is for a chunk of worlds; as worlds have nothing to do with each other, chunks change no bit.
+
     Attributes:
+        chunk: worlds that are assembled at once.
         whole: a thread computes the matrix of a whole element (CPU); else one column of it (GPU).
     """
 
@@ -117,10 +129,12 @@ class Assembled:
         if name not in model.cache:
             model.cache[name] = [self._contributions(parts[0][0]) for parts in self.runs]
         self.contributions: list[tuple[wp.array, wp.array]] = model.cache[name]
+        self.chunk = chunk_of(model.worlds)
         S = max(self._size(block) for block in model.blocks)
         points = 0 if self.whole else max(5 * block.points * block.count for block in model.blocks)
-        self.lines = work.array("element gradients", (model.worlds, points), model.types.vec3)
-        self.scratch = work.array("element matrices", (model.worlds, S), model.types.vec3)
+        work.chunks |= dict.fromkeys(("element gradients", "element matrices"), chunk_of)
+        self.lines = work.array("element gradients", (self.chunk, points), model.types.vec3)
+        self.scratch = work.array("element matrices", (self.chunk, S), model.types.vec3)
 
     def _make_tables(self) -> tuple[Pattern, wp.array]:
         """Make the pattern and the masses of its upper entries."""
@@ -181,40 +195,67 @@ class Assembled:
         model.count("matrix pattern", start, source)
         return start, source
 
-    def values(self, name: str) -> wp.array:
-        """A new array for the blocks, [world, entry]."""
-        return self.work.array(name, (self.model.worlds, self.pattern.entries), self.model.types.mat33)
+    def values(self, name: str, worlds: int | None = None) -> wp.array:
+        """A new array for the blocks, [world, entry]; `worlds`: of a chunk, see `view`."""
+        return self.work.array(name, (worlds or self.model.worlds, self.pattern.entries), self.model.types.mat33)
+
+    def view(self, values: wp.array, first: int) -> wp.array:
+        """An array of a chunk as one of all worlds, [world, entry], where those from `first` on alone are there."""
+        out: Any = wp.array(
+            ptr=values.ptr - first * values.strides[0], dtype=values.dtype, device=values.device,
+            shape=(self.model.worlds, self.pattern.entries),
+        )  # fmt: skip
+        out._owner = values
+        return out
 
     def assemble(
-        self, u: wp.array, factors: tuple[wp.array, wp.array], active: wp.array, out: wp.array, *, projected: bool
-    ) -> None:
+        self, u: wp.array, factors: tuple[wp.array, wp.array], active: wp.array, out: wp.array, *, projected: bool,
+        worlds: range | None = None,
+    ) -> None:  # fmt: skip
         """out = c_M M + (dq/dv) K at u; `factors` are c_M and dq/dv per world.
 
         `projected`: K is made positive semi-definite at each quadrature point, and depends on u and the factors alone.
+        `worlds`: those to look at.
         """
-        m, w, launch = self.model, self.work, self.launch
-        mass_factor, dq_dv = factors
+        w = self.work
+        every = worlds or range(self.model.worlds)
+        state = [u, w.v_stage, w.base, w.newton.mixed, w.history, *factors, active, out]
+        for first in range(every.start, every.stop, self.chunk):
+            last = min(first + self.chunk, every.stop)
+            if last - first == self.model.worlds:
+                self._assemble(last, state, projected)
+                continue
+            with self.model.parameters.window(first, last):
+                self._assemble(last - first, [a[first:last] for a in state], projected, first)
+
+    def _assemble(self, count: int, state: list[wp.array], projected: bool, first_world: int = 0) -> None:
+        """Assemble so many worlds from the first one on, of which `state` has the arrays."""
+        m, launch = self.model, self.launch
+        u, v, base, mixed, history, mass_factor, dq_dv, active, out = state
+        mass = m.cache["matrix"][1]
+        if mass.shape[0] != 1:
+            mass = mass[first_world : first_world + count]
         for first, parts in enumerate(self.runs):
             for k, (block, elements) in enumerate(parts):
-                state = [block.data, u, w.v_stage, w.base, w.newton.mixed, w.history, dq_dv, int(projected), active]
+                given = [block.data, u, v, base, mixed, history, dq_dv, int(projected), active]
                 if self.whole:
                     _, width, rows = panels_of(block.slots)
-                    matrix = shaped(self.scratch, (m.worlds, block.count, rows), rows_type(m.dtype, width))
-                    launch(elements.element_rows, (m.worlds, block.count), [*state, int(k > 0), matrix])
-                    matrix = shaped(self.scratch, (m.worlds, block.count, 9 * width * rows), m.types.T)
+                    matrix = shaped(self.scratch, (count, block.count, rows), rows_type(m.dtype, width))
+                    launch(elements.element_rows, (count, block.count), [*given, int(k > 0), matrix])
+                    matrix = shaped(self.scratch, (count, block.count, 9 * width * rows), m.types.T)
                     continue
                 pairs = 3 * block.slots * (block.slots + 1) // 2
-                matrix = shaped(self.scratch, (m.worlds, pairs, block.count))
-                lines = shaped(self.lines, (m.worlds, 5 * block.points, block.count))
-                points = (m.worlds, block.points, block.count)
-                launch(elements.prepare_matrix, points, [*state, lines])
+                matrix = shaped(self.scratch, (count, pairs, block.count))
+                lines = shaped(self.lines, (count, 5 * block.points, block.count))
+                points = (count, block.points, block.count)
+                launch(elements.prepare_matrix, points, [*given, lines])
                 if block.key.tying and not projected:
-                    launch(elements.prepare_stress, points, [block.data, w.newton.mixed, active, lines])
-                args = [block.data, dq_dv, lines, w.newton.mixed, int(projected), int(k > 0), active, matrix]
-                launch(elements.element_matrix, (m.worlds, 3 * block.slots * block.count), args)
+                    launch(elements.prepare_stress, points, [block.data, mixed, active, lines])
+                args = [block.data, dq_dv, lines, mixed, int(projected), int(k > 0), active, matrix]
+                launch(elements.element_matrix, (count, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
-            args += [m.cache["matrix"][1], int(first == 0), mass_factor, dq_dv, active, out]
-            launch(self.assembly(block).add_elements, (m.worlds, len(self.pattern.upper)), args)
+            args += [mass, int(first == 0), mass_factor, dq_dv, active, out]
+            launch(self.assembly(block).add_elements, (count, len(self.pattern.upper)), args)
 
     def matrix(self, values: wp.array, world: int = 0) -> sp.csr_matrix:
         """The blocks of one world as (3 slots, 3 slots) CSR on the host."""

@@ -39,6 +39,7 @@ class Direct:
     def __init__(self, at: At, residual: Residual) -> None:
         model = at.model
         self.at, self.model, self.work, self.launch, self.residual = at, model, at.work, at.launch, residual
+        at.work.reserve_blocks()
         assert residual.assembled is not None
         self.assembled = residual.assembled
         self.kernels = direct_kernels(model.dtype)

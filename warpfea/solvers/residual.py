@@ -34,8 +34,8 @@ MATRIX_SLOTS = 10
 MATRIX_COST = {False: 2.0, True: 0.5}
 """Iterations of Newton's method that the matrix costs, on the CPU and on CUDA."""
 BAND_COST = 3.0
-"""The same, of matrices that a GPU factors in a band. 4096 pendulums take 8.5, 8.1 and 8.2 ms per step with 0.5, 1.5 and 3
-where the tolerance is 1e-8, and 6.9, 5.7 and 4.2 ms where it is 1e-4."""
+"""The same, of matrices that a GPU factors in a band. 4096 pendulums take 8.5, 8.1 and 8.2 ms per step with 0.5, 1.5
+and 3 where the tolerance is 1e-8, and 6.9, 5.7 and 4.2 ms where it is 1e-4."""
 SMALL_SLOTS = 16384
 """Slots up to which a GPU makes a matrix faster than it solves with one."""
 
@@ -126,7 +126,9 @@ class Residual:
                 self.keep = 0
             self.lasting = self.keep == 2
             if self.keep:
-                self.reuse = Reuse(model, work, launch, "operator", BAND_COST if banded else MATRIX_COST[model.device.is_cuda])
+                self.reuse = Reuse(
+                    model, work, launch, "operator", BAND_COST if banded else MATRIX_COST[model.device.is_cuda]
+                )
 
     def _additions(self) -> Any:
         """What a product H p needs besides the elements' part."""

@@ -24,22 +24,23 @@ With constraints, tiles and coarse matrices contain their penalties. As a constr
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from ..base.launch import labelled
-from ..kernels.common.types import precision
 from ..kernels.solvers.blocks import block_kernels
 from ..kernels.solvers.levels import TILE, TILE_SLOTS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
 from ..terms.term import Kept
-from .assembled import shaped
+from .assembled import chunk_of, shaped
 from .band import WHOLE_SLOTS, BandFactor, find_band
-from .dense import DenseInverse, gauss_jordan
+from .dense import gauss_jordan
+from .level_arrays import LevelArrays
 from .levels import GROUP_SLOTS, Level, make_levels
 from .motions import Motions, motion_bodies
 from .reuse import Reuse
@@ -60,34 +61,6 @@ RATIO = 8.0
 """Ratio of the largest to the smallest eigenvalue that the Chebyshev steps are designed for."""
 REBUILD_COST = 40.0
 """Cost of making the preconditioner, in PCG iterations."""
-
-
-class LevelArrays:
-    """Matrices and vectors of one level, [world, ...]."""
-
-    def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, level: Level, depth: int, storage: str, parted: bool
-    ) -> None:  # fmt: skip
-        B, n, T = model.worlds, level.slots, model.types.T
-        S = precision(storage).T
-        other = storage != model.dtype
-        name = f"level {depth}"
-        self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
-        if level.band is not None:
-            return
-        parts = level.parts if parted else None
-        self.dense = DenseInverse(model, work, launch, name, 3 * n, storage, parts) if level.dense else None
-        if not level.dense:
-            shape = (B, level.tiles, TILE, TILE)
-            self.matrix = work.array(f"{name} inverse", shape, T)
-            self.stored = work.array(f"{name} stored", shape, S) if other else self.matrix
-            self.root = work.array(f"{name} root", shape[:3] if other else (1, 1, 1), T)
-            self.diagonal = work.array(f"{name} pivots", (B, level.tiles, TILE), T)
-            self.column = work.array(f"{name} column", (B, level.tiles, TILE), T)
-        self.vectors: dict[str, wp.array] = {}
-        if depth:
-            names = ("r", "x") if level.dense else ("r", "x", "z", "d")
-            self.vectors = {k: work.array(f"{name} {k}", (B, n), model.types.vec3) for k in names}
 
 
 class TwoLevel:
@@ -124,7 +97,7 @@ class TwoLevel:
         # matrix made here serves for D alone then); wider ones are kept for longer than that
         one = self.storage == model.dtype and not residual.at.inertia and first.slots <= WHOLE_SLOTS
         order = find_band(model) if first.dense and one else band
-        # (a GPU factors the band of a small model in about the time of its matrix, and with joints whatever couples them)
+        # (a GPU factors the band of a small model in about the time of its matrix, and with joints what they add)
         quick = order is not None and (order.quick or (band is not None and model.device.is_cuda))
         traits = model.terms.traits
         whole = not self.adding or (model.device.is_cuda and not traits.pooled and residual.keep == 0)
@@ -136,7 +109,14 @@ class TwoLevel:
         if self.follows:
             residual.on_matrix = self._factor
             self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if first.dense else 0), model.types.T)
-        self.value = self.assembled.values("preconditioner matrix")
+        # the matrix of a chunk of worlds; factors of each keep a GPU busy with more of them at once
+        share = 2 if self.follows and self.adding else 1
+        self.chunk = model.worlds
+        if not motion_bodies(model):
+            work.chunks["preconditioner matrix"] = lambda worlds: min(worlds, share * chunk_of(worlds))
+            self.chunk = work.chunks["preconditioner matrix"](model.worlds)
+        self.value = self.assembled.values("preconditioner matrix", self.chunk)
+        self.chosen = work.array("preconditioner chunk", (model.worlds,), wp.int32)
         free = model.group_count > 0  # bodies whose momentum the solve keeps by a correction of its own
         if self.follows and self.band and residual.at.inertia and not free:
             work.pcg.exact = self.band.exact
@@ -330,44 +310,76 @@ class TwoLevel:
     def _build_first(self) -> None:
         self._build(penalty=True)
 
+    def _chunks(self, flags: wp.array) -> Iterator[tuple[range, wp.array, wp.array]]:
+        """Worlds of each chunk, flags of those that `flags` chooses, and `value` as an array of all worlds."""
+        B = self.model.worlds
+        for first in range(0, B, self.chunk):
+            worlds = range(first, min(first + self.chunk, B))
+            if len(worlds) == B:
+                yield worlds, flags, self.value
+                return
+            self.launch(self.blocks.choose_worlds, B, [flags, worlds.start, worlds.stop, self.chosen])
+            yield worlds, self.chosen, self.assembled.view(self.value, first)
+
     def _build(self, *, penalty: bool = False) -> None:
         m, w, launch, reuse = self.model, self.work, self.launch, self.reuse.control
-        flags, factors = reuse.build, (reuse.mass_factor, reuse.dq_dv)
+        factors = (reuse.mass_factor, reuse.dq_dv)
         # the rows follow once the penalties are known
         self.reuse.carry()
-        self.assembled.assemble(self.reuse.place, factors, flags, self.value, projected=True)
-        if self.adding and m.terms.traits.pooled:
-            self._carry()
-            self._add(penalties=False)
-        args = [m.topology, self.assembled.pattern.data, self.value, flags, w.diagonal, w.inverse]
-        launch(self.blocks.take_diagonal, self.dim, args)
-        if m.terms.traits.gated:
-            if penalty:
-                for term in self.terms:
-                    term.scale(self.at, flags)
-            self._carry()
-            self._add(penalties=True)
+        for worlds, flags, value in self._chunks(reuse.build):
+            self.assembled.assemble(self.reuse.place, factors, flags, value, projected=True, worlds=worlds)
+            if self.adding and m.terms.traits.pooled:
+                self._carry()
+                self._add(value, flags, penalties=False)
+            args = [m.topology, self.assembled.pattern.data, value, flags, w.diagonal, w.inverse]
+            launch(self.blocks.take_diagonal, self.dim, args)
+            if m.terms.traits.gated:
+                if penalty:
+                    for term in self.terms:
+                        term.scale(self.at, flags)
+                self._carry()
+                self._add(value, flags, penalties=True)
+            self._take(value, flags)
         self.reuse.made()
         if self.motions:
-            self._couple(self.motions, flags)
+            self._couple(self.motions, reuse.build)
+        if not (self.follows or self.band):
+            self._invert(reuse.build)
+
+    def _take(self, value: wp.array, flags: wp.array) -> None:
+        """What is made of the matrix of some worlds: factors, or what inverses and the next level begin with."""
+        level, arrays = self.levels[0], self.arrays[0]
         if self.follows:
             return
         if self.band:
-            self.band.make(self.value, flags)
-            return
-        for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
-            value = arrays.value if depth else self.value
-            if arrays.dense is not None:
-                arrays.dense.fill(level.pattern, value, flags)
-                arrays.dense.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
-                return
-            self._invert_tiles(level, arrays, value, flags, keep=depth == 0)
-            if depth + 1 == len(self.levels):
-                return
+            self.band.make(value, flags)
+        elif arrays.dense is not None:
+            arrays.dense.fill(level.pattern, value, flags)
+        else:
+            self._fill(0, value, flags)
+
+    def _fill(self, depth: int, value: wp.array, flags: wp.array) -> None:
+        """Fill the tiles of a level, and the matrix of the next one."""
+        m, level, arrays = self.model, self.levels[depth], self.arrays[depth]
+        args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
+        self.launch(self.making.fill_tiles, (m.worlds, level.tiles, TILE_SLOTS), args)
+        if depth + 1 < len(self.levels):
             assert level.galerkin is not None
             free = self.all_free if depth else m.topology.free
             args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
-            launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+            self.launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+
+    def _invert(self, flags: wp.array) -> None:
+        """The inverses of all levels, the first of which is filled."""
+        for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
+            if arrays.dense is not None:
+                if depth:
+                    arrays.dense.fill(level.pattern, arrays.value, flags)
+                arrays.dense.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
+                return
+            if depth:
+                self._fill(depth, arrays.value, flags)
+            self._invert_tiles(level, arrays, flags, keep=depth == 0)
 
     def _couple(self, motions: Motions, flags: wp.array) -> None:
         """The matrix of the bodies' rigid motions, and its inverse."""
@@ -378,18 +390,23 @@ class TwoLevel:
                 term.couple(self.at, kept, self.reuse.control.dq_dv, flags)
         motions.end(flags)
 
-    def _add(self, *, penalties: bool) -> None:
-        """Add the terms' blocks to the matrix: those that D is taken from, or the penalties, which follow from D."""
+    def _add(self, value: wp.array, flags: wp.array, *, penalties: bool) -> None:
+        """Add the terms' blocks to the matrix of some worlds: those that D is taken from, or the penalties."""
         reuse = self.reuse.control
         for term in self.terms:
             if term.penalty == penalties:
                 kept = self.kept[term.name].place if term.name in self.kept else []
-                term.blocks(self.at, self.assembled, kept, reuse.dq_dv, reuse.build, self.value, projected=True)
+                term.blocks(self.at, self.assembled, kept, reuse.dq_dv, flags, value, projected=True)
 
     @labelled("build")
     def _factor(self, value: wp.array, flags: wp.array) -> None:
+        if self.band and not self.adding:
+            self.band.make(value, flags)
+            return
         if self.band:
-            self.band.make(self._with_terms(value, flags) if self.adding else value, flags)
+            for worlds, chosen, out in self._chunks(flags):
+                self._add_to_copy(value, worlds, chosen, out)
+                self.band.make(out, chosen)
             return
         dense = self.arrays[0].dense
         assert dense is not None
@@ -398,20 +415,18 @@ class TwoLevel:
         args = [lanes, dense.scale, flags, dense.left, dense.top, dense.matrix]
         self.launch(self.making.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
 
-    def _with_terms(self, value: wp.array, flags: wp.array) -> wp.array:
-        """The operator's matrix with all that terms add to it, in the place of the matrix that D was taken from."""
-        w, dim = self.work, (self.model.worlds, 3 * self.assembled.pattern.entries)
-        given, out = (shaped(a, dim, self.model.types.vec3) for a in (value, self.value))
-        self.launch(self.residual.newton.copy_active, dim, [given, flags, out])
+    def _add_to_copy(self, value: wp.array, worlds: range, flags: wp.array, out: wp.array) -> None:
+        """The operator's matrix of some worlds with all that terms add to it."""
+        w, dim = self.work, (len(worlds), 3 * self.assembled.pattern.entries)
+        rows = slice(worlds.start, worlds.stop)
+        given, copy = (shaped(a, dim, self.model.types.vec3) for a in (value[rows], self.value))
+        self.launch(self.residual.newton.copy_active, dim, [given, flags[rows], copy])
         for term in self.terms:
             live = [array for _, array in term.keep(self.at)]
-            term.blocks(self.at, self.assembled, live, w.step.dq_dv, flags, self.value, projected=False)
-        return self.value
+            term.blocks(self.at, self.assembled, live, w.step.dq_dv, flags, out, projected=False)
 
-    def _invert_tiles(self, level: Level, arrays: LevelArrays, value: Any, flags: wp.array, *, keep: bool) -> None:
+    def _invert_tiles(self, level: Level, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
         B, k = self.model.worlds, self.making
-        args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
-        self.launch(k.fill_tiles, (B, level.tiles, TILE_SLOTS), args)
         gauss_jordan(self.launch, k, level.tiles, arrays, arrays.matrix, flags, keep=keep)
         if arrays.stored is not arrays.matrix:
             args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]

@@ -98,7 +98,16 @@ class DeadLoads(Term):
         if not self.present:
             return
         m, w = self.model, at.work
-        args = [self.start_of_slot, self.law, self.weight, w.law_stage, m.masses.lumped_values, self.constant, w.step.ramp, active]
+        args = [
+            self.start_of_slot,
+            self.law,
+            self.weight,
+            w.law_stage,
+            m.masses.lumped_values,
+            self.constant,
+            w.step.ramp,
+            active,
+        ]
         at.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])
 
     def set_gravity(self, gravity: Any, mask: np.ndarray) -> None:

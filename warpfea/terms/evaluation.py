@@ -124,7 +124,7 @@ class Evaluation:
                 host = np.zeros((1, m.slots, 3), dtype=precision(m.dtype).T._type_)
                 host[0, colour == c, axis] = 1.0
                 direction.assign(host)
-                with m.parameters.alone(world):
+                with m.parameters.window(world, world + 1):
                     self.elements.tangent(at, direction, flag)
                 out = at.work.contribution.numpy()[0]
                 for block, conn in zip(m.blocks, conns):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +33,9 @@ class Workspace:
     def __init__(self, model: Model, *, max_newton: int, ledger: bool, midpoint: bool = False) -> None:
         self.device = model.device
         self.bytes: dict[str, int] = {}
+        # of arrays for some of the worlds: for how many, of so many in all
+        self.chunks: dict[str, Callable[[int], int]] = {}
+        self.blocks_shape, self.sym = (model.worlds, model.contributions), model.types.sym
         B, n, vec3 = model.worlds, model.slots, model.types.vec3
 
         def field(name: str) -> wp.array:
@@ -53,7 +57,8 @@ class Workspace:
         self.diagonal = field("diagonal")
         self.inverse = self.array("inverse", (B, n), model.types.mat33)
         self.contribution = self.array("contribution", (B, model.contributions), vec3)
-        self.block_contribution = self.array("block_contribution", (B, model.contributions), model.types.sym)
+        # with a preconditioner that is made of blocks on the diagonal alone
+        self.block_contribution: wp.array = wp.zeros((0, 0), dtype=model.types.sym, device=model.device)
         none = self.array("none", (1, 1), vec3)
         side = (B, terms.side_entries)
         self.nonpotential = field("nonpotential") if traits.nonpotential else none
@@ -130,6 +135,11 @@ class Workspace:
         for name in balance_struct(model.dtype).vars:
             of_step = name in ("mass_factor", "dq_dv")
             setattr(self.balance, name, getattr(self.step if of_step else self, name))
+
+    def reserve_blocks(self) -> None:
+        """Make room for the blocks on the diagonal of elements' matrices."""
+        if self.block_contribution.shape != self.blocks_shape:
+            self.block_contribution = self.array("block_contribution", self.blocks_shape, self.sym)
 
     def rows_of(self, term: Any) -> wp.array:
         """The rows of a term's potential, [TERM_ROWS, world, row]."""

@@ -1,0 +1,47 @@
+"""Matrices and vectors of the levels of a preconditioner."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from ..kernels.common.types import precision
+from ..kernels.solvers.levels import TILE
+from .dense import DenseInverse
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
+    from .levels import Level
+
+__all__ = ["LevelArrays"]
+
+
+class LevelArrays:
+    """Matrices and vectors of one level, [world, ...]."""
+
+    def __init__(
+        self, model: Model, work: Workspace, launch: Launcher, level: Level, depth: int, storage: str, parted: bool
+    ) -> None:  # fmt: skip
+        B, n, T = model.worlds, level.slots, model.types.T
+        S = precision(storage).T
+        other = storage != model.dtype
+        name = f"level {depth}"
+        self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
+        if level.band is not None:
+            return
+        parts = level.parts if parted else None
+        self.dense = DenseInverse(model, work, launch, name, 3 * n, storage, parts) if level.dense else None
+        if not level.dense:
+            shape = (B, level.tiles, TILE, TILE)
+            self.matrix = work.array(f"{name} inverse", shape, T)
+            self.stored = work.array(f"{name} stored", shape, S) if other else self.matrix
+            self.root = work.array(f"{name} root", shape[:3] if other else (1, 1, 1), T)
+            self.diagonal = work.array(f"{name} pivots", (B, level.tiles, TILE), T)
+            self.column = work.array(f"{name} column", (B, level.tiles, TILE), T)
+        self.vectors: dict[str, wp.array] = {}
+        if depth:
+            names = ("r", "x") if level.dense else ("r", "x", "z", "d")
+            self.vectors = {k: work.array(f"{name} {k}", (B, n), model.types.vec3) for k in names}
