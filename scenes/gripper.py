@@ -14,6 +14,7 @@ def gripper(
     lift: float = 0.08,
     side: float = 0.06,
     cells: int = 3,
+    element: str = "T10",
     E: float = 1e5,
     nu: float = 0.4,
     density: float = 1000.0,
@@ -28,13 +29,14 @@ def gripper(
         lift: of the jaws, m.
         side: of the block, a cube, m.
         cells: along each edge of the block.
+        element: "T10" or "T4".
         E: Young's modulus (neo-Hookean), Pa.
         nu: Poisson's ratio.
         density: kg/m^3.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     half = 0.5 * side
-    mesh = wf.mesh.box((side, side, side), cells=(cells, cells, cells), origin=(-half, -half, 0.0))
+    mesh = wf.mesh.box((side,) * 3, cells=(cells,) * 3, origin=(-half, -half, 0.0), element=element)
     material = wf.NeoHookean.from_E_nu(E=E, nu=nu, density=density)
     block = b.add_solid(mesh, material=material, name="block")
     floor = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)), name="floor")

@@ -7,7 +7,7 @@ import warp as wp
 
 from .types import precision
 
-__all__ = ["WARP", "block_memory", "lane_functions"]
+__all__ = ["WARP", "block_memory", "lane_functions", "warp_low"]
 
 WARP = 32
 """Threads of a warp."""
@@ -47,6 +47,28 @@ def lane_sum_float64(x: wp.float64, lanes: int) -> wp.float64:
 )
 def lane_sum_float32(x: wp.float32, lanes: int) -> wp.float32:
     """Sum of x over a run of `lanes` threads, in its first thread; x itself on the CPU."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+    #if defined(__CUDA_ARCH__)
+    int same;
+    unsigned warp = __activemask();
+    __match_all_sync(warp, world, &same);
+    if (same && warp == 0xffffffffu) {
+        for (int o = 16; o > 0; o /= 2) x = fmin(x, __shfl_xor_sync(warp, x, o));
+        if (threadIdx.x % 32 != 0) x = 1.0e300;
+    }
+    #endif
+    return x;
+    """
+)
+def warp_low(x: wp.float64, world: int) -> wp.float64:
+    """Smallest x of a warp, in its first thread and 1e300 in others, if all are of one world; else x itself.
+
+    For an atomic minimum, which in double precision is a loop that threads of a world wait in for each other.
+    """
     ...
 
 

@@ -8,7 +8,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.lanes import lane_functions
+from ..common.lanes import lane_functions, warp_low
 from ..common.types import kernel_module
 from . import materials
 from .matrix import matrix_kernels
@@ -45,6 +45,7 @@ def element_kernels(
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     NS, needs_J = fn.slots, fn.needs_J
+    constant = affine and slots == 4  # F of a straight T4 is the same everywhere
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
     viscous = materials.svk(dtype)
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
@@ -113,11 +114,14 @@ def element_kernels(
         lost = row_sum(wp.float64(psi_v), lanes)
         low = wp.float64(J_low)
         if wp.static(needs_J):
-            if low < domain_J[world]:
-                wp.atomic_min(domain_J, world, low)
-            if wp.static(midpoint):
-                U = U + V
-            low = wp.min(low, wp.float64(fn.vertex_jacobian(block, U, elem)))
+            lowest = warp_low(low, world)
+            if lowest < domain_J[world]:
+                wp.atomic_min(domain_J, world, lowest)
+            if wp.static(not constant):
+                if wp.static(midpoint):
+                    U = U + V
+                low = wp.min(low, wp.float64(fn.vertex_jacobian(block, U, elem)))
+        low = warp_low(low, world)
         if low < min_J[world]:
             wp.atomic_min(min_J, world, low)
         if lane == 0 and index < block.count * lanes:

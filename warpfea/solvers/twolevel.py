@@ -118,7 +118,7 @@ class TwoLevel:
         self.value = self.assembled.values("preconditioner matrix", self.chunk)
         self.chosen = work.array("preconditioner chunk", (model.worlds,), wp.int32)
         free = model.group_count > 0  # bodies whose momentum the solve keeps by a correction of its own
-        if self.follows and self.band and residual.at.inertia and not free:
+        if self.follows and self.band and model.dtype == "float64" and residual.at.inertia and not free:
             work.pcg.exact = self.band.exact
         self.motions, self.coupling = self._motions()
         self.by_row = 0 if model.device.is_cuda else 1
