@@ -28,6 +28,7 @@ def fall():
 # errors
 
 
+@pytest.mark.slow
 def test_errors_of_a_fall_are_those_of_the_scheme(fall):
     """Backward Euler falls g h t / 2 too far, and loses g^2 h t / 2 of energy per mass in t."""
     assert isinstance(fall[0], Row)
@@ -44,6 +45,7 @@ def test_errors_of_a_fall_are_those_of_the_scheme(fall):
         assert row.probes["face"] == {"end": row.end, "l2": row.l2}
 
 
+@pytest.mark.slow
 def test_orders_are_observed(fall):
     assert "dt" not in fall[0].orders
     assert [row.orders["dt"] for row in fall[1:3]] == pytest.approx([1.0, 1.0], abs=0.1)
@@ -54,6 +56,7 @@ def test_orders_are_observed(fall):
     assert fits["bdf2"]["rows"] == 3
 
 
+@pytest.mark.slow
 def test_a_row_tells_what_the_run_took(fall):
     for row in fall:
         assert (row.steps, row.repeats) == (round(T / row.setting.dt), 1)
@@ -67,6 +70,7 @@ def test_a_row_tells_what_the_run_took(fall):
     assert all(a[1] > b[1] for a, b in itertools.pairwise(front))
 
 
+@pytest.mark.slow
 def test_the_target_is_answered_with_the_cheapest_row(fall):
     good = [row for row in fall if row.error <= 0.02]
     assert fall.answer.seconds == min(row.seconds for row in good)
@@ -91,6 +95,7 @@ def test_the_answer_is_run_again_with_other_steps():
     assert run(over={"dt": [5e-3]}, target=1e-9).checks == []
 
 
+@pytest.mark.slow
 def test_a_row_tells_the_energy_ledger(fall):
     """Of the energy exchanged: what falls is potential and becomes kinetic, less what backward Euler takes."""
     for row in fall:
@@ -107,6 +112,7 @@ def test_refusals_for_one_reason_are_told_once(tmp_path):
     assert [r.status for r in found] == ["done", "done", "refused", "refused"]
 
 
+@pytest.mark.slow
 def test_parts_of_the_error(fall):
     """In a fall all is time: for backward Euler the difference of steps gives it exactly, for BDF2 nearly."""
     (row,) = [r for r in fall if r.split is not None]
@@ -163,6 +169,7 @@ def test_a_parameter_of_the_problem_has_references_of_its_own():
     assert found[0].error == pytest.approx(found[2].error, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_steps_that_adapt_stand_beside_fixed_ones(fall):
     """Rows made by hand: a curve of their own, the slope of true against asked error, and the command that runs one."""
     axes = make_axes(falling, {"dt": [1e-2, 5e-3], "error": [1e-2, 1e-3], "method": ["bdf2"]}, None)

@@ -197,6 +197,7 @@ def test_contact_stands_beside_a_step_without(bench):
     assert {"schema", "command", "commit", "machine", "versions"} <= set(content)
 
 
+@pytest.mark.slow
 def test_pairs_measure_rows_of_each_kind(bench):
     rows = "pile-4-loose,pile-4-T10-tight,search-1e3,core-1e4,worlds-blocks-1,worlds-finger-16"
     code, text, content = bench("--pairs", "--rows", rows, "--steps", "2")

@@ -124,6 +124,7 @@ def test_statics_of_a_slender_beam(data):
     assert data.error(got.displacements(beam), expected.displacements(beam)) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_column_beyond_its_critical_load(data, monkeypatch):
     """Where H is indefinite its inverse may lead uphill, and the positive matrix takes its place."""
     from warpfea.solvers.direct import Direct

@@ -9,10 +9,11 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..laws import time_law
-from ..model.assembly import center_of_mass, surface_weights
+from ..model.assembly import surface_weights
 from ..model.bodies import Body
 from ..model.description import DeadLoad, Moment, Pressure, Probe, support_slots
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
+from ..model.masses import center_of_mass
 from .checks import slot_field, vector
 
 __all__ = [

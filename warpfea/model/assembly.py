@@ -23,15 +23,11 @@ __all__ = [
     "BlockKey",
     "FacetTables",
     "HostBlock",
-    "MassPart",
-    "body_mass",
     "density_of",
     "facet_places",
     "facet_tables",
     "gather_table",
     "host_blocks",
-    "is_number",
-    "mass_parts",
     "require_density",
     "rigid_modes",
     "surface_weights",
@@ -212,58 +208,6 @@ def parent_mass(family: Any) -> np.ndarray:
     return np.einsum("q,qi,qj->ij", family.mass_rule.weights, table, table)
 
 
-@dataclass(frozen=True)
-class MassPart:
-    """What a material adds to the mass of its body: `scale` times a matrix.
-
-    Attributes:
-        scale: the density, kg/m^3, or 1 where it is a function or one per element.
-        matrix: scalar mass matrix over it, (slots, slots) CSR of the body.
-        total: mass over it.
-    """
-
-    scale: float
-    matrix: sp.csr_matrix
-    total: float
-
-
-def is_number(material: Material) -> bool:
-    """Whether the density of a material is one number."""
-    return not callable(density_of(material)) and np.ndim(density_of(material)) == 0
-
-
-def mass_parts(body: Discretisation) -> list[MassPart]:
-    """Consistent scalar mass m_ij = int rho s_i s_j dV (Eq. 20) of each material of a body."""
-    flat = straight(body)
-    n = body.slot_count
-    scales = [float(density_of(m)) if is_number(m) else UNIT for _, m in body.materials]
-    out = []
-    for k, scale in enumerate(scales):
-        total, mass = sp.csr_matrix((n, n)), 0.0
-        for affine in (True, False):
-            chosen = np.flatnonzero((flat == affine) & (body.material_of == k))
-            rule = mass_rule(body, affine)
-            for part in chunks(body, chosen, len(rule.weights)):
-                conn = body.connectivity[part]
-                s, _, _, det = geometry(body, part, rule.points)
-                w = density_at(body, part, s, conn, UNIT) * det * rule.weights
-                mass += float(w.sum())
-                subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
-                table = s[0] if len(s) == 1 else s
-                local = np.einsum(subscripts, w, table, table, optimize=True)
-                S = conn.shape[1]
-                rows = np.repeat(conn, S, axis=1).ravel()
-                cols = np.tile(conn, (1, S)).ravel()
-                total = total + sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n))
-        out.append(MassPart(scale, total, mass))
-    return out
-
-
-def body_mass(body: Discretisation) -> sp.csr_matrix:
-    """Consistent scalar mass matrix of a body (Eq. 20), (slots, slots) CSR, kg."""
-    return sum((part.scale * part.matrix for part in mass_parts(body)), sp.csr_matrix((body.slot_count,) * 2))
-
-
 def law_of(integral: Part, material: Material) -> tuple[str, tuple[Any, ...]]:
     """The device law of a part of the energy, and its coefficients; arrays where those of the material are."""
     law, values = integral.law(material) if integral.law else (material.law, material.coefficients())
@@ -428,13 +372,6 @@ def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
     weights = np.einsum("fq,fqi->fi", dA, t.shape)
     slots, inverse = np.unique(t.conn, return_inverse=True)
     return slots, np.bincount(inverse.ravel(), weights=weights.ravel(), minlength=len(slots))
-
-
-def center_of_mass(body: Discretisation, values: np.ndarray) -> np.ndarray:
-    """Centre of mass (m) of a body with slot values (slots, 3) relative to its origin."""
-    position = (body.slot_kind == 0).astype(float)
-    lumped = body_mass(body) @ position
-    return lumped @ values / (lumped @ position) + body.origin
 
 
 def rigid_modes(x: np.ndarray, kind: np.ndarray) -> np.ndarray:

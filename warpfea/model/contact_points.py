@@ -17,6 +17,7 @@ from ..materials import Material
 from . import assembly
 from .discretisation import Discretisation
 from .handles import SurfaceSet
+from .masses import mass_parts
 
 __all__ = [
     "RULES",
@@ -176,4 +177,4 @@ def body_mass_total(body: Discretisation) -> float:
     """Mass of a body as it was built, kg; 0 where a material has no density, so that only statics are possible."""
     if any(material.density is None for _, material in body.materials):
         return 0.0
-    return sum(part.scale * part.total for part in assembly.mass_parts(body))
+    return sum(part.scale * part.total for part in mass_parts(body))

@@ -2,26 +2,85 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from ..materials import Material
 from . import assembly
 
 if TYPE_CHECKING:
     from .discretisation import Discretisation
 
-__all__ = ["Masses"]
-
-UNIT = 1.0
+__all__ = ["MassPart", "Masses", "body_mass", "center_of_mass", "is_number", "mass_parts"]
 
 
 def _keys(matrix: sp.csr_matrix) -> np.ndarray:
     """Numbers of the entries, row by row."""
     n = np.int64(matrix.shape[0])
     return np.repeat(np.arange(n), np.diff(matrix.indptr)) * n + matrix.indices
+
+
+@dataclass(frozen=True)
+class MassPart:
+    """What a material adds to the mass of its body: `scale` times a matrix.
+
+    Attributes:
+        scale: the density, kg/m^3, or 1 where it is a function or one per element.
+        matrix: scalar mass matrix over it, (slots, slots) CSR of the body.
+        total: mass over it.
+    """
+
+    scale: float
+    matrix: sp.csr_matrix
+    total: float
+
+
+def is_number(material: Material) -> bool:
+    """Whether the density of a material is one number."""
+    return not callable(assembly.density_of(material)) and np.ndim(assembly.density_of(material)) == 0
+
+
+def mass_parts(body: Discretisation) -> list[MassPart]:
+    """Consistent scalar mass m_ij = int rho s_i s_j dV (Eq. 20) of each material of a body."""
+    flat = assembly.straight(body)
+    n = body.slot_count
+    scales = [float(assembly.density_of(m)) if is_number(m) else assembly.UNIT for _, m in body.materials]
+    out = []
+    for k, scale in enumerate(scales):
+        total, mass = sp.csr_matrix((n, n)), 0.0
+        for affine in (True, False):
+            chosen = np.flatnonzero((flat == affine) & (body.material_of == k))
+            rule = assembly.mass_rule(body, affine)
+            for part in assembly.chunks(body, chosen, len(rule.weights)):
+                conn = body.connectivity[part]
+                s, _, _, det = assembly.geometry(body, part, rule.points)
+                w = assembly.density_at(body, part, s, conn, assembly.UNIT) * det * rule.weights
+                mass += float(w.sum())
+                subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
+                table = s[0] if len(s) == 1 else s
+                local = np.einsum(subscripts, w, table, table, optimize=True)
+                S = conn.shape[1]
+                rows = np.repeat(conn, S, axis=1).ravel()
+                cols = np.tile(conn, (1, S)).ravel()
+                total = total + sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n))
+        out.append(MassPart(scale, total, mass))
+    return out
+
+
+def body_mass(body: Discretisation) -> sp.csr_matrix:
+    """Consistent scalar mass matrix of a body (Eq. 20), (slots, slots) CSR, kg."""
+    return sum((part.scale * part.matrix for part in mass_parts(body)), sp.csr_matrix((body.slot_count,) * 2))
+
+
+def center_of_mass(body: Discretisation, values: np.ndarray) -> np.ndarray:
+    """Centre of mass (m) of a body with slot values (slots, 3) relative to its origin."""
+    position = (body.slot_kind == 0).astype(float)
+    lumped = body_mass(body) @ position
+    return lumped @ values / (lumped @ position) + body.origin
 
 
 class Masses:
@@ -38,9 +97,7 @@ class Masses:
 
     def __init__(self, model: Any) -> None:
         self.model = model
-        self.parts = {
-            (b, k): part for b, body in enumerate(model.bodies) for k, part in enumerate(assembly.mass_parts(body))
-        }
+        self.parts = {(b, k): part for b, body in enumerate(model.bodies) for k, part in enumerate(mass_parts(body))}
         n = model.slots
         # with zeros in it that a matrix has where others have entries
         pattern = sp.csr_matrix((n, n))
@@ -104,7 +161,7 @@ class Masses:
         for part in parts:
             last = first + len(part.elements)
             material = part.body.materials[part.material][1]
-            own = UNIT if assembly.is_number(material) else np.asarray(material.density, dtype=float)[part.elements]
+            own = assembly.UNIT if is_number(material) else np.asarray(material.density, dtype=float)[part.elements]
             scale = self.scales[self.model.bodies.index(part.body), part.material]
             rows.append(scale[:, None] * (own * det[first:last]))
             first = last
