@@ -377,7 +377,7 @@ class TwoLevel:
                     arrays.dense.fill(level.pattern, arrays.value, flags)
                 arrays.dense.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
                 return
-            if depth:
+            if arrays.value is not None:
                 self._fill(depth, arrays.value, flags)
             self._invert_tiles(level, arrays, flags, keep=depth == 0)
 
