@@ -8,13 +8,16 @@ import pytest
 
 from warpfea.studies.reports.identify import NOISE, TRUTH, identify, record
 
-FILE = pathlib.Path(__file__).resolve().parent / "results" / "identify_cpu.json"
+FOLDER = pathlib.Path(__file__).resolve().parent / "results"
 
 
-def test_the_committed_search_finds_both():
-    assert FILE.exists(), f"{FILE} is missing: warpfea study identify --device cpu --out {FILE}"
-    found = json.loads(FILE.read_text())
+@pytest.mark.parametrize(("device", "worlds"), [("cpu", 64), ("h200", 4096)])
+def test_the_committed_search_finds_both(device, worlds):
+    file = FOLDER / f"identify_{device}.json"
+    assert file.exists(), f"{file} is missing: warpfea study identify --worlds {worlds} --out {file}"
+    found = json.loads(file.read_text())
     (row,) = found["rows"]
+    assert row["worlds"] == worlds
     assert found["settings"]["truth"] == TRUTH
     assert row["noise"] == NOISE == 0.01
     assert row["E_error"] < 0.02
