@@ -98,19 +98,13 @@ class Masses:
     def __init__(self, model: Any) -> None:
         self.model = model
         self.parts = {(b, k): part for b, body in enumerate(model.bodies) for k, part in enumerate(mass_parts(body))}
-        n = model.slots
         # with zeros in it that a matrix has where others have entries
-        pattern = sp.csr_matrix((n, n))
-        whole: dict[tuple[int, int], sp.csr_matrix] = {}
-        for (b, k), part in self.parts.items():
-            at = part.matrix.tocoo()
-            first = model.bodies[b].slot_offset
-            whole[b, k] = sp.csr_matrix((at.data, (first + at.row, first + at.col)), shape=(n, n))
-            pattern = pattern + abs(whole[b, k])
-        pattern.sort_indices()
-        self.matrix = pattern
-        self.unit = {key: self._in_pattern(one) for key, one in whole.items()}
-        self.unit_lumped = {key: one @ model.is_position_host for key, one in whole.items()}
+        patterns = [
+            sum(abs(self.parts[b, k].matrix) for k in range(len(body.materials))) for b, body in enumerate(model.bodies)
+        ]
+        self.matrix = sp.block_diag(patterns, format="csr")
+        self.matrix.sort_indices()
+        self.entries = {key: self._places(key, patterns[key[0]]) for key in self.parts}
         self.scales = {key: np.array([part.scale]) for key, part in self.parts.items()}
         self._sum()
         self.matrix = self._csr(0)
@@ -201,15 +195,20 @@ class Masses:
         self.table = np.zeros((worlds, self.matrix.nnz))
         self.lumped = np.zeros((worlds, self.matrix.shape[0]))
         for key, scale in self.scales.items():
-            self.table += scale[:, None] * self.unit[key]
-            self.lumped += scale[:, None] * self.unit_lumped[key]
+            body, part = self.model.bodies[key[0]], self.parts[key]
+            self.table[:, self.entries[key]] += scale[:, None] * part.matrix.data
+            rows = slice(body.slot_offset, body.slot_offset + body.slot_count)
+            self.lumped[:, rows] += scale[:, None] * (part.matrix @ self.model.is_position_host[rows])
 
-    def _in_pattern(self, one: sp.csr_matrix) -> np.ndarray:
-        """Entries of a matrix at the places of `matrix`."""
-        one.sort_indices()
-        out = np.zeros(self.matrix.nnz)
-        out[np.searchsorted(_keys(self.matrix), _keys(one))] = one.data
-        return out
+    def _places(self, key: tuple[int, int], pattern: sp.csr_matrix) -> slice | np.ndarray:
+        """Where the entries of a part are in `matrix`, whose rows of a body have the body's pattern."""
+        part = self.parts[key].matrix
+        for matrix in (pattern, part):
+            matrix.sort_indices()
+        first = int(self.matrix.indptr[self.model.bodies[key[0]].slot_offset])
+        if part.nnz == pattern.nnz:  # all of the body
+            return slice(first, first + part.nnz)
+        return first + np.searchsorted(_keys(pattern), _keys(part))
 
     def _csr(self, world: int) -> sp.csr_matrix:
         return sp.csr_matrix((self.table[world], self.matrix.indices, self.matrix.indptr), shape=self.matrix.shape)
