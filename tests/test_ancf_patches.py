@@ -200,7 +200,7 @@ def fall_error(sim, bodies, exact):
     return np.abs(u - np.where(kind == 0, exact, 0.0))[rows].max() / np.abs(exact).max()
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("name", "integration"), ONE_EACH)
 def test_free_fall_is_exact(name, integration, dtype):
     bound = 1e-12 if dtype == "float64" else 1e-5

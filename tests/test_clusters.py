@@ -85,7 +85,7 @@ def test_product_of_elements_in_any_order(element, dtype, tol):
     assert np.abs(out.numpy()[0] - expected).max() < tol * np.abs(expected).max()
 
 
-@pytest.mark.parametrize(("dtype", "tol"), [("float64", 1e-14), ("float32", 1e-5)])
+@pytest.mark.parametrize(("dtype", "tol"), [("float64", 1e-14), pytest.param("float32", 1e-5, marks=pytest.mark.slow)])
 def test_several_blocks_and_worlds_against_the_plain_sum(dtype, tol):
     b = wf.ModelBuilder()
     for k, (element, form) in enumerate([("T10", "rate"), ("T4", None), ("T10", "incremental")]):

@@ -171,7 +171,7 @@ def separate_product(model, u, v, p, mass_factor):
         ("svk", "incremental", "float64", "tet5_paper"),
         ("svk", "rate", "float64", "tet4"),
         ("mooney_rivlin", None, "float64", "tet5_paper"),
-        ("mooney_rivlin", "rate", "float32", "tet5_paper"),
+        pytest.param("mooney_rivlin", "rate", "float32", "tet5_paper", marks=pytest.mark.slow),
         ("neo_hookean", "incremental", "float64", "tet4"),
         ("neo_hookean", None, "float32", "tet4"),
     ],

@@ -203,7 +203,7 @@ _ENTRIES = (
         "noisy record of its tip, a generation of candidates at a time, each a world of one model.",
         options=("device", "worlds", "quick"),
         example="--device cpu --out tests/results/identify_cpu.json",
-        results=("identify_cpu.json",),
+        results=("identify_cpu.json", "identify_h200.json"),
     ),
     Entry(
         name="devices",
