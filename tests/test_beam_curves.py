@@ -41,7 +41,7 @@ def geometry(curve, elements, normal=(0.1, 0.2, 1.0)):
 
 @pytest.mark.parametrize("speed", [0.0, 0.5])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-@pytest.mark.parametrize("turns", [1, 10, 160, 1000])
+@pytest.mark.parametrize("turns", [1, 10, 160, pytest.param(1000, marks=pytest.mark.slow)])
 def test_tangents_of_a_helix(turns, scale, speed):
     curve, derivative, normal = helix(turns, scale, speed)
     elements = 12 * turns

@@ -43,6 +43,7 @@ def test_a_loose_tolerance_of_forces_does_not_open_joints(tol):
     assert sim.totals["newton"][0] < 20 * 8
 
 
+@pytest.mark.slow
 def test_float32_holds_its_tolerance():
     model, joint = joined("revolute", ("ground", "surface"), dtype="float32", axis=(0, 1, 0))
     sim = wf.Simulation(model, dt=1e-3)

@@ -364,7 +364,8 @@ def test_followers_act_on_the_middle_of_a_step(load):
 # precision, worlds, what is refused
 
 
-@pytest.mark.parametrize(("family", "law"), marked([("T10", "svk"), ("T10", "mooney_rivlin"), ("3243 tied", "svk")]))
+@pytest.mark.slow
+@pytest.mark.parametrize(("family", "law"), [("T10", "svk"), ("T10", "mooney_rivlin"), ("3243 tied", "svk")])
 def test_single_precision_runs(family, law):
     sim = simulate(tumble(family, law, dtype="float32"), solver=wf.NewtonPCG())
     watch = Conserved(sim)

@@ -220,6 +220,7 @@ def test_no_drift_live_and_resumed(tmp_path):
     assert row["violation_max"] == max(whole.joint_record(j).violation.max() for j in joints) / whole.model.size
 
 
+@pytest.mark.slow
 def test_free_fall_live():
     rows = report.free_fall("cpu", quick=True)
     assert len(rows) > 50

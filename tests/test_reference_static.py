@@ -81,6 +81,7 @@ def stretch(b, body, amount):
     return end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("q", ["q4", "q5"])
 @pytest.mark.parametrize("k", KS)
 def test_s2_uniaxial(cube, data, k, q):
