@@ -6,6 +6,7 @@ import scipy.sparse as sp
 from constraint_models import LAW, box, joined
 
 import warpfea as wf
+from warpfea.builder.scene import find as scene
 
 
 @pytest.mark.parametrize("solver", [
@@ -157,3 +158,18 @@ def test_rows_are_sparse():
     sim = wf.Simulation(model, dt=1e-3)
     sim.step(3)
     assert sim.max_violation <= 1e-8 * model.size
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+def test_a_double_pendulum_in_single_precision_with_two_levels(device):
+    """On 8934ce7 its fifth step took 4270 conjugate gradients, and the eleventh was refused."""
+
+    def run(dtype):
+        model = scene("double_pendulum")().finalize(device=device, dtype=dtype)
+        sim = wf.Simulation(model, dt=4e-3, solver=wf.NewtonPCG(preconditioner="two-level"))
+        most = max(int(sim.step().pcg[0]) for _ in range(25))
+        return most, sim.probe("tip").displacement[0, -1]
+
+    (most, single), (_, double) = run("float32"), run("float64")
+    assert most < 250
+    assert np.linalg.norm(single - double) < 1e-3 * np.linalg.norm(double)

@@ -66,7 +66,8 @@ class NewtonPCG:
             without constraints the matrix of an earlier iterate serves while Newton's method does not suffer.
         multipliers: how constraint forces are found: "newton", with every Newton step, or "outer", the classical
             augmented Lagrangian, in a loop around the Newton solves.
-        penalty: kappa, the penalty of a constraint over the stiffness of what it ties.
+        penalty: kappa, the penalty of a constraint over the stiffness of what it ties; None: 1000 in float64, 100 in
+            float32, where inverses of tiles that hold more lose their positive eigenvalues to rounding.
         max_outer: multiplier updates of the classical method.
 
     Raises:
@@ -85,7 +86,7 @@ class NewtonPCG:
     preconditioner_dtype: str | None = None
     operator: str = "auto"
     multipliers: str = "newton"
-    penalty: float = 1000.0
+    penalty: float | None = None
     max_outer: int = 100
 
     def __post_init__(self) -> None:
@@ -117,7 +118,7 @@ class NewtonPCG:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be a whole number, at least 1")
         if self.multipliers not in ("newton", "outer"):
             raise ModelError(f"NewtonPCG: multipliers = {self.multipliers!r} is neither 'newton' nor 'outer'")
-        if not (is_number(self.penalty) and self.penalty > 0.0):
+        if self.penalty is not None and not (is_number(self.penalty) and self.penalty > 0.0):
             raise ModelError(f"NewtonPCG: penalty = {self.penalty!r} must be positive")
         if not (is_count(self.max_halvings) and 0 <= self.max_halvings <= 20):
             raise ModelError(f"NewtonPCG: max_halvings = {self.max_halvings!r} must be a whole number from 0 to 20")
@@ -125,6 +126,10 @@ class NewtonPCG:
     def tolerance(self, dtype: str) -> float:
         """The relative tolerance in one precision, "float64" or "float32"."""
         return self.tol if self.tol is not None else {"float64": 1e-8, "float32": 1e-4}[dtype]
+
+    def kappa(self, dtype: str) -> float:
+        """The penalty of constraints in one precision."""
+        return self.penalty if self.penalty is not None else {"float64": 1000.0, "float32": 100.0}[dtype]
 
 
 @dataclass(frozen=True)
@@ -158,7 +163,7 @@ class NewtonLoop:
         kind = "direct" if direct else choose(options.preconditioner, options.preconditioner_dtype, model)
         # factors hold the penalties
         deflate = kind not in ("block-jacobi", "banded") and not direct
-        at.options = TermOptions(classical=self.classical, kappa=options.penalty, deflate=deflate)
+        at.options = TermOptions(classical=self.classical, kappa=options.kappa(model.dtype), deflate=deflate)
         for term in self.terms:
             term.configure(at)
         operator = options.operator
@@ -205,7 +210,7 @@ class NewtonLoop:
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.nonpotential = int(traits.nonpotential or rate)
         ctl.classical = int(self.classical)
-        ctl.slack = 1.0 / math.sqrt(1.0 + options.penalty)
+        ctl.slack = 1.0 / math.sqrt(1.0 + options.kappa(model.dtype))
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves are for g alone
         if at.accelerated and model.dtype == "float64":  # in float32 places are rounded by more
             ctl.constraint_pace = max(constraint_tol / model.size, ctl.tol) * FALL
