@@ -239,7 +239,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def fail(ctl: Control, world: int, why: int):
         """No step was found. Where rounding alone may explain that, stand still and ask for the error that is left."""
-        near = ctl.floor_excess[world] <= f64(NEAR) and ctl.iterations[world] > 0 and ctl.strict_count[world] < TRIES
+        near = ctl.floor_excess[world] <= f64(NEAR) and ctl.strict_count[world] < TRIES
         enough = False
         if wp.static(gated):  # only accelerations ask for more, and rounding does not give it
             if ctl.constraint_pace > f64(0.0) and ctl.relative[world] <= ctl.tol + f64(FLOOR) * ctl.eps:
