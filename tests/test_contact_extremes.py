@@ -336,4 +336,6 @@ def test_a_steel_block_at_rest_after_a_drop_takes_few_iterations(device, dtype):
     if dtype == "float64":
         assert max(newton) <= 6
     weight = 7850.0 * 1e-3 * 9.81
-    assert sim.contact_record(pad).normal_force[0, -1] == pytest.approx(weight, rel=1e-6 if dtype == "float64" else 1e-2)
+    assert sim.contact_record(pad).normal_force[0, -1] == pytest.approx(
+        weight, rel=1e-6 if dtype == "float64" else 1e-2
+    )
