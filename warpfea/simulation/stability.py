@@ -94,9 +94,8 @@ def announce(result: StaticResult, *, refuse: bool) -> None:
     many = f"{len(worlds)} of {m.worlds} worlds, the first of them {world}" if len(worlds) > 1 else f"world {world}"
     text = (
         f"the equilibrium is unstable in {many}: body {body.name!r} buckles or snaps through; its mode is largest at "
-        f"({where}) m, along ({way}). For what follows give an imperfection: "
-        f"solve_static(model, state=r.perturbed({1e-3 * m.size:.1g}), load_steps=1), r.mode(body) times a size on the "
-        "points of the mesh, or a small load across"
+        f"({where}) m, along ({way}). What follows needs an imperfection: r.mode(body) times a size on the points of the "
+        f"mesh, a small load across, or a damped motion from r.perturbed({1e-3 * m.size:.1g})"
     )
     if refuse:
         error = StabilityError(text, time=1.0, world=world, state=sim.state)
@@ -199,7 +198,7 @@ class Tangent:
         terms = [term for term in m.terms if not term.potential]
         if not terms:
             return np.zeros(m.worlds, dtype=bool)
-        every, u = self.flags(np.ones(m.worlds)), w.u.numpy()
+        every, u = self.flags(np.ones(m.worlds)), w.u.numpy().copy()  # on the CPU a view
         gather = self.residual.gather.gather_force
 
         def gathered(call: str, pool: wp.array, *more: Any) -> np.ndarray:
@@ -288,6 +287,8 @@ def _shake(probe: Tangent, sim: Simulation, out: Stability, curvature: np.ndarra
     for world in range(len(u)):
         if out.stable[world] is not None and abs(curvature[world]) <= NOISE * change[world]:
             out.stable[world], out.reasons[world] = None, "within the rounding of float32"
+    if all(s is not False for s in out.stable):
+        return
     state.displacement.assign(u)
     _open(probe.stepper)
     probe.take()

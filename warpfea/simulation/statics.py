@@ -68,7 +68,7 @@ class StaticResult:
         return self.simulation._rows(body, self.stability.mode)
 
     def perturbed(self, size: float) -> State:
-        """A copy of the state, moved by the unstable mode times a size, m: a start that leads off the equilibrium."""
+        """A copy of the state, moved by the unstable mode times a size, m: where a motion leads off the equilibrium."""
         if self.stability is None:
             raise ModelError("solve_static(unstable='ignore') has looked for no unstable mode")
         out = self.state.like()
