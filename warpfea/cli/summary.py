@@ -69,8 +69,8 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     those accepted short of the tolerance (Jacobi), `floored_steps` those whose residual rounding stopped above it,
     and `max_floor` the largest error that was estimated there (`StepReport.floor`), 0 without such steps; energies and
     probes are the last values, of statics the strain energy alone; `violation` is the largest of the constraints in any
-    step, m; `stable` tells of statics at full load, null where it is not known; `contacts` has by name the largest normal_force, N, and penetration, m, of any step, and the last force, N,
-    area, m^2, and stick.
+    step, m; `contacts` has by name the largest normal_force, N, and penetration, m, of any step, and the last force, N,
+    area, m^2, and stick; `stable` is whether the equilibrium of statics is, null where that is not known.
     """
     probes = {}
     for probe in sim.model.probes:

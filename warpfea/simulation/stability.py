@@ -1,14 +1,14 @@
 """Stability of static equilibria: whether the tangent H is positive on what supports, joints and contact leave free.
 
 Conjugate gradients on H from a random force r_0, preconditioned by B as the solves were (Lanczos' method in the inner
-product of B). A direction p with p.H p < 0 proves an equilibrium unstable. Where all curvatures are positive, a mode phi
-with H phi = -mu B^-1 phi, mu > 0, has phi.r_k = phi.r_0 prod(1 + mu / theta_i) with positive Ritz values theta_i: its
-part of the residual never falls. Once the norm of the residual has fallen to REDUCTION, such a mode would have held less
-than that share of the random force (Kuczynski & Wozniakowski 1992 bound the probability). The coefficients of the solves
-themselves don't do: a load may not excite the mode at all.
+product of B). A direction p with p.H p < 0 proves an equilibrium unstable. Where all curvatures are positive, a mode
+phi with H phi = -mu B^-1 phi, mu > 0, has phi.r_k = phi.r_0 prod(1 + mu / theta_i) with positive Ritz values theta_i:
+its part of the residual never falls. Once the norm of the residual has fallen to REDUCTION, such a mode would have held
+less than that share of the random force (Kuczynski and Wozniakowski 1992 bound the probability). The coefficients of
+the solves themselves don't do: a load may not excite the mode at all.
 
 The mode is that of least w = p.H p / p.M p, by locally optimal conjugate gradients (Knyazev 2001), from the direction
-that was found.
+that was found. A float32 state takes a float64 tangent, that of a twin of the model.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse as sp
 import warp as wp
 
 from ..base.errors import StabilityError, StabilityWarning
@@ -94,8 +93,8 @@ def announce(result: StaticResult, *, refuse: bool) -> None:
     many = f"{len(worlds)} of {m.worlds} worlds, the first of them {world}" if len(worlds) > 1 else f"world {world}"
     text = (
         f"the equilibrium is unstable in {many}: body {body.name!r} buckles or snaps through; its mode is largest at "
-        f"({where}) m, along ({way}). What follows needs an imperfection: r.mode(body) times a size on the points of the "
-        f"mesh, a small load across, or a damped motion from r.perturbed({1e-3 * m.size:.1g})"
+        f"({where}) m, along ({way}). What follows needs an imperfection: r.mode(body) times a size on the points of "
+        f"the mesh, a small load across, or a damped motion from r.perturbed({1e-3 * m.size:.1g})"
     )
     if refuse:
         error = StabilityError(text, time=1.0, world=world, state=sim.state)
@@ -127,7 +126,8 @@ def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
     strange = probe.unlike()
     for world in range(model.worlds):
         if strange[world] and not out.reasons[world]:
-            out.reasons[world] = "loads that follow the motion have no potential"
+            names = ", ".join(term.name for term in model.terms if not term.potential)
+            out.reasons[world] = f"forces that no potential is known of: {names}"
     curvature, p = _search(probe, out)
     if single:
         _shake(probe, sim, out, curvature, p)
@@ -331,8 +331,7 @@ def _mode(probe: Tangent, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
         basis, H, M = [x, w], [Hx, probe.product(w, chosen)], [Mx, mass(w)]
         if (_norm(p)[chosen] > 0.0).all():
             basis, H, M = [*basis, p], [*H, Hp], [*M, Mp]
-    position = np.abs(x) * m.is_position_host[None, :, None]
-    largest = position.reshape(m.worlds, -1).max(axis=1)
+    largest = (np.linalg.norm(x, axis=2) * m.is_position_host).max(axis=1)
     return x / np.where(largest > 0.0, largest, 1.0)[:, None, None]
 
 

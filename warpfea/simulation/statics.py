@@ -17,8 +17,8 @@ from ..solvers import NewtonPCG
 from .checks import check_choice, check_model
 from .integrators import INTEGRATORS
 from .simulation import Simulation, StepReport
-from .stability import Stability, announce, judge_stability
 from .stabilise import Springs, spring_stiffness
+from .stability import Stability, announce, judge_stability
 
 if TYPE_CHECKING:
     from ..model.model import Model
