@@ -73,6 +73,9 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
             "; at full load the springs of stabilise= are gone: supports and contact alone do not hold the bodies there"
         )
     hint += overload_text(sim.model)
+    lumped = [c.name for c in sim.model.description.contacts if c.model == "sphere"] if sim.integrator.static else []
+    if lumped and code != FAIL_FLOOR:
+        hint += f"; contact {lumped[0]!r} has one place, which jumps as the body rolls: in statics take model='patch'"
     spent, most = int(sim.last.newton[world]), int(work.step.most_newton)
     if code != FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
         hint += f"; its {spent} iterations of Newton's method are all that max_work = {sim.solver.max_work} allows"
