@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -26,9 +26,6 @@ from ..model.state import remembered
 from ..solvers import NewtonPCG
 from ..terms.term import Term
 from .simulation import Simulation
-
-if TYPE_CHECKING:
-    from .statics import StaticResult
 
 __all__ = ["Stability", "announce", "judge_stability"]
 
@@ -76,10 +73,9 @@ class Stability:
         return f"Stability({self.text})"
 
 
-def announce(result: StaticResult, *, refuse: bool) -> None:
-    """Warn of unstable worlds, or raise StabilityError for the first."""
+def announce(result: Any, *, refuse: bool) -> None:
+    """Warn of unstable worlds of a StaticResult, or raise StabilityError for the first."""
     found, sim = result.stability, result.simulation
-    assert found is not None
     worlds = [world for world, s in enumerate(found.stable) if s is False]
     if not worlds:
         return
@@ -122,7 +118,7 @@ def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
     if all(out.reasons):
         return out
     # an inverse of H itself is no preconditioner where H is indefinite
-    probe = Tangent(_twin(sim) if single or sim.solver.linear == "direct" else sim)
+    probe = Tangent(_twin(sim) if single or sim.stepper.newton.direct else sim)
     strange = probe.unlike()
     for world in range(model.worlds):
         if strange[world] and not out.reasons[world]:
@@ -172,6 +168,7 @@ class Tangent:
         self.diagonal = np.where(self.free > 0.0, w.diagonal.numpy().astype(float), 1.0)
 
     def flags(self, chosen: np.ndarray) -> wp.array:
+        """A mask of worlds on the device."""
         return wp.array(chosen.astype(np.int32), dtype=wp.int32, device=self.model.device)
 
     def product(self, p: np.ndarray, chosen: np.ndarray) -> np.ndarray:
@@ -347,7 +344,8 @@ def _twin(sim: Simulation) -> Simulation:
         for term in twin.terms:
             term.parameters_taken()
     state = twin.state()
-    solver = NewtonPCG(max_pcg=sim.solver.max_pcg, multipliers=sim.solver.multipliers, penalty=sim.solver.penalty)
+    assert isinstance(sim.solver, NewtonPCG)
+    solver = NewtonPCG(multipliers=sim.solver.multipliers, penalty=sim.solver.penalty)
     out = Simulation(twin, state, dt=sim.dt, integrator=sim.integrator, solver=solver, ledger=False, capture=False)
     for name in state.names:
         if name in sim.state.names and not remembered(name):

@@ -42,7 +42,7 @@ def column(setting: Setting, factor: float) -> Answer:
     return _judged(b, setting, factor < 1.0, "Euler")
 
 
-@case("buckling-pushed", GROUP, values=(1.01, 1.1, 10.0), quick="float32",
+@case("buckling-pushed", GROUP, values=(1.01, 1.1, 10.0), quick="both",
       refusal={"float64": ("was not accepted",), "float32": ("float32",)})  # fmt: skip
 def pushed(setting: Setting, factor: float) -> Answer:
     """The same with 1e-5 of the load across it does not stay straight in silence: told, refused, or bent by 0.1 L."""
