@@ -212,9 +212,20 @@ def test_large_models_in_single_precision_are_judged_on_demand(monkeypatch):
     model, _ = column(1.01, "float32")
     found = wf.solve_static(model)
     assert found.report.stable.tolist() == [None]
-    assert "unstable='refuse' judges all" in found.stability.reasons[0]
+    assert "unstable='refuse' judges it" in found.stability.reasons[0]
     with pytest.raises(wf.StabilityError):
         wf.solve_static(model, unstable="refuse")
+
+
+def test_the_search_takes_no_more_than_a_share_of_the_solve(monkeypatch):
+    monkeypatch.setattr(stability, "ITERATIONS", 2)
+    model, _ = column(0.99, element="T10")
+    found = wf.solve_static(model)
+    most = max(2, int(0.3 * found.pcg[0]))
+    assert found.stability.iterations[0] <= most
+    monkeypatch.setattr(stability, "SHARE", 0.0)
+    assert wf.solve_static(model).stability.reasons[0].startswith("not resolved in 2 iterations; unstable='refuse'")
+    assert wf.solve_static(model, unstable="refuse").report.stable.tolist() == [True]
 
 
 def test_the_sign_of_rounding_is_not_told(monkeypatch):
