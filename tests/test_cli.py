@@ -197,6 +197,37 @@ def test_statics_of_a_scene_has_ten_load_steps(folder, capfd):
     assert json.loads(out)["steps"] == 10
 
 
+STRUT = """
+import numpy as np
+import warpfea as wf
+
+@wf.scene(t_end=0.1, dt=0.01)
+def strut(factor: float = 1.1):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    beam = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=4, section=wf.Rectangle(0.02, 0.02), normal=(0, 0, 1),
+                      material=wf.SVK(E=2e11, nu=0.0, density=7800.0), name="strut")
+    b.clamp(beam.start, slots="position+section")
+    b.add_point_load(beam.end, (-factor * np.pi**2 * 2e11 * 0.02**4 / 12 / 4, 0, 0))
+    return b
+"""
+
+
+def test_statics_tells_an_unstable_equilibrium(folder, capfd):
+    """On 8934ce7 it says nothing of it."""
+    (folder / "strut.py").write_text(STRUT)
+    command = ["run", "strut.py", "--static", "--load-steps", "2", "--device", "cpu"]
+    code, out, err = run(capfd, *command, "--json", "-")
+    assert (code, json.loads(out)["stable"]) == (0, False)
+    assert "warpfea: warning: the equilibrium is unstable in world 0: body 'strut' buckles" in err
+    code, out, err = run(capfd, *command, "--unstable", "refuse", "--json", "-")
+    assert (code, json.loads(out)["status"]) == (3, "not converged")
+    assert "warpfea: error: the equilibrium is unstable" in err
+    code, out, err = run(capfd, *command, "--unstable", "ignore", "--json", "-")
+    assert (code, json.loads(out)["stable"], err) == (0, None, "")
+    _, out, _ = run(capfd, *command, "--set", "factor=0.9")
+    assert "the equilibrium is stable" in out
+
+
 def test_statics_holds_what_rests_on_contact_with_stabilise(folder, capfd):
     command = ["run", "belt", "--static", "--load-steps", "2", "--device", "cpu", "--json", "-"]
     code, _, err = run(capfd, *command)

@@ -44,6 +44,7 @@ BAD = {
     "info of a missing mesh": (["info", "none.msh"], ["none.msh"]),
     "load steps of a motion": ([*SHORT, "--load-steps", "3"], ["--load-steps is for --static"]),
     "springs of a motion": ([*SHORT, "--stabilise"], ["--stabilise is for --static"]),
+    "stability of a motion": ([*SHORT, "--unstable", "refuse"], ["--unstable is for --static"]),
     "static with dt": (["run", "cantilever", "--static", "--dt", "1e-3"], ["--dt is for a motion"]),
     "static with a checkpoint": (["run", "cantilever", "--static", "--checkpoint", "o.npz"], ["--checkpoint is for"]),
     "static with jacobi": (["run", "cantilever", "--static", "--solver", "jacobi"], ["--solver jacobi"]),

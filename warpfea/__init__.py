@@ -45,6 +45,8 @@ from .base.errors import (  # noqa: E402
     ModelError,
     OutputError,
     PenetrationError,
+    StabilityError,
+    StabilityWarning,
 )
 from .base.version import __version__  # noqa: E402
 from .builder.beams import spline  # noqa: E402
@@ -113,6 +115,8 @@ __all__ = [
     "Rotation",
     "Simulation",
     "Sphere",
+    "StabilityError",
+    "StabilityWarning",
     "State",
     "StepReport",
     "SurfaceSet",

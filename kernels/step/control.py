@@ -81,6 +81,7 @@ def step_struct():
         any_running: wp.array(dtype=wp.int32)
         any_refused: wp.array(dtype=wp.int32)  # for the first time in the step; for good
         max_halvings: wp.int32
+        most_newton: wp.int32  # iterations of Newton's method in a step after which it is not halved; 0: no limit
         parameter: wp.float64  # of the integrator
         stabilise: wp.float64  # N/m per kg, of statics: springs from the last equilibrium, none at full load
         total_J: wp.array(dtype=wp.float64)

@@ -253,6 +253,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         why = newton.failed[world]
         # a shorter step has no more digits, and is another motion
         hopeless = why == FAIL_WORK or why == FAIL_FLOOR
+        if step.most_newton > 0 and newton.total_iterations[world] >= step.most_newton:
+            hopeless = True
         if hopeless or level > step.max_halvings:
             step.status[world] = wp.static(STATUS["failed"])
             step.running[world] = 0

@@ -15,6 +15,8 @@ __all__ = [
     "ModelError",
     "OutputError",
     "PenetrationError",
+    "StabilityError",
+    "StabilityWarning",
 ]
 
 
@@ -119,6 +121,20 @@ class ConvergenceError(Error):
 
 class PenetrationError(ConvergenceError):
     """A step of a model with contact was not accepted, and a point of a body went through an obstacle in it."""
+
+
+class StabilityError(ConvergenceError):
+    """A static equilibrium is unstable, and `unstable="refuse"` was asked for.
+
+    Attributes:
+        state: the equilibrium. result: the StaticResult.
+    """
+
+    result: Any = None
+
+
+class StabilityWarning(UserWarning):
+    """A static equilibrium is unstable: without an imperfection a model stays on it, a real structure leaves it."""
 
 
 class UsageError(Error):

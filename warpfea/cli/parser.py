@@ -9,6 +9,7 @@ from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
+from ..simulation.statics import UNSTABLE
 from ..solvers import SOLVERS
 from .arguments import (
     Once,
@@ -189,6 +190,11 @@ def _add_run(commands: Any) -> None:
         "--stabilise",
         action="store_true",
         help="of --static: springs that fade with the load, for bodies that only contact holds",
+    )
+    to.add_argument(
+        "--unstable",
+        choices=UNSTABLE,
+        help="of --static: warn of an unstable equilibrium (default), refuse it, or do not judge it",
     )
     out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
     out.add_argument(

@@ -64,7 +64,8 @@ def run(options: argparse.Namespace) -> int:
         status = "failed"
         try:
             if options.static:
-                run_static(sim, outputs=outputs, progress=progress(options))
+                unstable = options.unstable or "warn"
+                run_static(sim, outputs=outputs, progress=progress(options), unstable=unstable)
             else:
                 sim.run(t_end, outputs=outputs, progress=progress(options))
             status = "done"
@@ -132,6 +133,8 @@ def _check_kind(options: argparse.Namespace) -> None:
             raise UsageError("--load-steps is for --static")
         if options.stabilise:
             raise UsageError("--stabilise is for --static")
+        if options.unstable:
+            raise UsageError("--unstable is for --static")
         return
     given = [name for name in FOR_MOTION if getattr(options, name) is not None]
     if given:

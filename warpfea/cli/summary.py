@@ -48,6 +48,7 @@ KEYS = (
     "versions",
     "left_out",
     "contacts",
+    "stable",
 )
 MANY = 12
 """Joints and contacts that are listed one by one."""
@@ -69,7 +70,7 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     and `max_floor` the largest error that was estimated there (`StepReport.floor`), 0 without such steps; energies and
     probes are the last values, of statics the strain energy alone; `violation` is the largest of the constraints in any
     step, m; `contacts` has by name the largest normal_force, N, and penetration, m, of any step, and the last force, N,
-    area, m^2, and stick.
+    area, m^2, and stick; `stable` is whether the equilibrium of statics is, null where that is not known.
     """
     probes = {}
     for probe in sim.model.probes:
@@ -112,6 +113,7 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
         "versions": versions(),
         "left_out": sim.model.info()["left_out"],
         "contacts": _contacts(sim),
+        "stable": None if sim.last is None or sim.last.stable is None else sim.last.stable[0],
     }
     assert tuple(content) == KEYS
     return {name: plain(value) for name, value in content.items()}
@@ -141,6 +143,8 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
         rows.insert(5, ["", end])
     if s["min_J"] is not None and s["min_J"] <= 0.0:
         rows.append(["WARNING", _inverted(s["min_J"], sim.model)])
+    if s["stable"] is not None:
+        rows.append(["", "the equilibrium is stable"] if s["stable"] else ["UNSTABLE", "the equilibrium is unstable"])
     if s["rough_steps"]:
         reached = s["steps"] - s["rough_steps"]
         tol = number(sim.solver.tolerance(s["dtype"]))

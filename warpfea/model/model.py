@@ -86,9 +86,9 @@ class Model:
         with enough_memory(f"a model with {self.worlds} worlds", self.device):
             self._build(builder, tables)
 
-    def resized(self, worlds: int) -> Model:
-        """The model as it was built, with so many worlds."""
-        return Model(self._source, device=self.device, dtype=self.dtype, worlds=worlds, tables=self._tables)
+    def resized(self, worlds: int, dtype: str | None = None) -> Model:
+        """The model as it was built, with so many worlds, in its precision or another."""
+        return Model(self._source, device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
 
     def _build(self, builder: Source, tables: bool) -> None:
         """Number, assemble and upload what the builder describes."""

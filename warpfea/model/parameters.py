@@ -304,7 +304,11 @@ class MaterialParameters:
 
     def load(self, saved: Mapping[str, np.ndarray]) -> None:
         """Take what `numpy` gave."""
+        self.take({owner: saved[key] for owner, key in zip(list(self.values), self.numpy())})
+
+    def take(self, values: Mapping[tuple[int, int, str], np.ndarray]) -> None:
+        """Take `values` of the same model, or of one in another precision."""
         every = np.ones(self.model.worlds, dtype=bool)
-        for (b, k, name), key in zip(list(self.values), self.numpy()):
+        for (b, k, name), of_worlds in values.items():
             body = self.model.bodies[b]
-            self._set(body.name, [(body, k)], name, saved[key], every)
+            self._set(body.name, [(body, k)], name, of_worlds, every)

@@ -105,10 +105,27 @@ def check_static_supports(model: Any) -> None:
         free = len(modes) - rank
         if free:
             moves = (turned[:, rank:] ** 2).reshape(len(parts), -1).sum(axis=1)  # of each part in these motions
-            first = slots[part == int(np.argmax(moves > 1e-6))][0]
+            loose = slots[part == int(np.argmax(moves > 1e-6))]
+            first = loose[0]
             body = next(b for b in model.bodies if b.slot_offset <= first < b.slot_offset + b.slot_count)
             raise ModelError(
-                f"body {body.name!r} is not supported: supports, joints and terms leave {free} rigid "
+                f"{_piece(body, loose)} is not supported: supports, joints and terms leave {free} rigid "
                 f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "
                 f"not counted): clamp or drive more nodes, {held_by}or let a damped dynamic run come to rest"
             )
+
+
+def _piece(body: Any, slots: np.ndarray) -> str:
+    """A body, or a piece of it that shares no node with the rest, with these slots of the model."""
+    inside = np.zeros(body.slot_count, dtype=bool)
+    inside[slots - body.slot_offset] = True
+    if inside.all():
+        return f"body {body.name!r}"
+    elements = int(inside[body.connectivity[:, 0]].sum())
+    position = body.slot_kind == 0
+    places = body.reference[inside & position] + body.origin
+    center = ", ".join(f"{x + 0.0:.4g}" for x in np.round(0.5 * (places.min(axis=0) + places.max(axis=0)), 12))
+    return (
+        f"a piece of body {body.name!r} that shares no node with the rest ({elements} of {len(body.connectivity)} "
+        f"elements, {len(places)} of {int(position.sum())} nodes, around ({center}) m)"
+    )

@@ -25,6 +25,7 @@ from ..kernels.solvers.judging import NEAR
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
 from .jumps import jumping_drives
+from .overload import overload_text
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -71,6 +72,13 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         hint += (
             "; at full load the springs of stabilise= are gone: supports and contact alone do not hold the bodies there"
         )
+    hint += overload_text(sim.model)
+    lumped = [c.name for c in sim.model.description.contacts if c.model == "sphere"] if sim.integrator.static else []
+    if lumped and code != FAIL_FLOOR:
+        hint += f"; contact {lumped[0]!r} has one place, which jumps as the body rolls: in statics take model='patch'"
+    spent, most = int(sim.last.newton[world]), int(work.step.most_newton)
+    if code != FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
+        hint += f"; its {spent} iterations of Newton's method are all that max_work = {sim.solver.max_work} allows"
     jumps = "" if code == FAIL_FLOOR else jumping_drives(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
     for term in sim.model.terms:
@@ -107,7 +115,8 @@ def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
         limit = f"max_work = {sim.solver.max_work}"
         if near and dtype == "float32":
             return f"float32 can't hold this case: the residual is within rounding, and {spent} ({limit})", finer
-        return spent, f"; look for slivers and extreme contrasts of stiffness, or raise {limit}"
+        slivers = f"; look for slivers and extreme contrasts of stiffness, or raise {limit}"
+        return spent, "" if overload_text(sim.model) else slivers
     if code == FAIL_INVERTED:
         return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
     bent = sim.integrator.static and int(work.newton.bent.numpy()[world])

@@ -32,6 +32,8 @@ class StepReport:
         residual_force: |g| over the free components, N, of the last attempt.
         violation: largest of the constraints, m.
         outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
+        stable: of statics at full load: objects True, False, or None where it can't be known (`StaticResult.stability`
+            has why). None in place of the array where it was not judged.
         substeps, rejected: of dt="auto": accepted substeps, and those refused for their estimated error, which count
             among the halvings; least_h, largest_h: their sizes, s. None with a fixed dt.
     """
@@ -53,6 +55,7 @@ class StepReport:
     rejected: np.ndarray | None = None
     least_h: np.ndarray | None = None
     largest_h: np.ndarray | None = None
+    stable: np.ndarray | None = None
 
 
 class PendingReport(StepReport):

@@ -14,15 +14,21 @@ from ..model.assembly import require_density
 from ..model.state import State
 from ..model.topology import check_static_supports
 from ..solvers import NewtonPCG
-from .checks import check_model
+from .checks import check_choice, check_model
 from .integrators import INTEGRATORS
 from .simulation import Simulation, StepReport
 from .stabilise import Springs, spring_stiffness
+from .stability import Stability, announce, judge_stability
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["StaticResult", "begin_static", "run_static", "solve_static"]
+__all__ = ["UNSTABLE", "StaticResult", "begin_static", "run_static", "solve_static"]
+
+UNSTABLE = ("warn", "refuse", "ignore")
+"""What to do about an unstable equilibrium."""
+FULL = 1e-9
+"""Part of the load that may lack where all of it counts as acting."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,6 +41,7 @@ class StaticResult:
         simulation: the loop that found it: positions, displacements, field, reaction, ...
         newton, pcg: iterations of all load steps, [world].
         stabilise: what the springs of `stabilise=` carried at the end of each load step; None without.
+        stability: whether each world is stable, why that can't be known, unstable modes; None with unstable="ignore".
     """
 
     state: State
@@ -43,10 +50,31 @@ class StaticResult:
     newton: np.ndarray
     pcg: np.ndarray
     stabilise: Springs | None = None
+    stability: Stability | None = None
 
     def __repr__(self) -> str:
         count = f"{self.simulation.steps} load step{'s' * (self.simulation.steps != 1)}"
-        return f"StaticResult({count}, {int(self.newton.max())} Newton, {int(self.pcg.max())} PCG iterations)"
+        stable = f", {self.stability.text}" if self.stability else ""
+        return f"StaticResult({count}, {int(self.newton.max())} Newton, {int(self.pcg.max())} PCG iterations{stable})"
+
+    def mode(self, body: Any) -> np.ndarray:
+        """(B, nodes, 3) unstable mode of each world, 0 where there is none; its largest displacement is 1 m.
+
+        Added to the points of a mesh, times a size in m, it is an imperfection.
+        """
+        if self.stability is None:
+            raise ModelError("solve_static(unstable='ignore') has looked for no unstable mode")
+        self.simulation.check_body(body, "mode")
+        return self.simulation._rows(body, self.stability.mode)
+
+    def perturbed(self, size: float) -> State:
+        """A copy of the state, moved by the unstable mode times a size, m: where a motion leads off the equilibrium."""
+        if self.stability is None:
+            raise ModelError("solve_static(unstable='ignore') has looked for no unstable mode")
+        out = self.state.like()
+        u = out.displacement.numpy()
+        out.displacement.assign((u + size * self.stability.mode).astype(u.dtype))
+        return out
 
     def probe(self, name: str) -> Any:
         """The probe `name`, with one entry per load step; the last is at full load."""
@@ -95,6 +123,7 @@ def solve_static(
     constraint_tol: float | None = None,
     inversion: str = "refuse",
     stabilise: bool | float = False,
+    unstable: str = "warn",
     outputs: Sequence[Any] = (),
     progress: bool | None = False,
 ) -> StaticResult:
@@ -115,6 +144,8 @@ def solve_static(
             1e-3 E / (density size^2) of the stiffest body and the model's size. A smaller value moves a body further in
             a load step and closes wider gaps, a larger one lets it lag. `StaticResult.stabilise` tells what the
             springs carried.
+        unstable: whether the equilibrium at full load is stable is judged (`StepReport.stable`), and of one that is not
+            a StabilityWarning is given ("warn") or a StabilityError raised ("refuse"); "ignore": it is not judged.
         outputs: writers (PNGWriter, USDWriter, VTUWriter, ...), which get each load step as a state; what they say of
             time is the part of the load, 0 to 1, and pictures are labelled "load 100 %".
         progress: show a bar on stderr; None: when stderr is a terminal.
@@ -124,14 +155,16 @@ def solve_static(
             explicit, or an option is out of range.
         ConvergenceError: a load step was not accepted after all halvings.
         ConstraintError: the same, and it is the constraints that can't be satisfied.
+        StabilityError: the equilibrium is unstable, with unstable="refuse".
         CapacityError: the device has too little memory.
         OutputError: an output can't be written.
         KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """
+    check_choice("unstable", unstable, *UNSTABLE)
     options: dict[str, Any] = {"load_steps": load_steps, "tol": tol, "solver": solver, "state": state}
     options |= {"constraint_tol": constraint_tol, "inversion": inversion, "stabilise": stabilise}
     sim = begin_static(model, **options)
-    return run_static(sim, outputs=outputs, progress=progress)
+    return run_static(sim, outputs=outputs, progress=progress, unstable=unstable)
 
 
 def begin_static(
@@ -178,11 +211,20 @@ def begin_static(
     )  # fmt: skip
 
 
-def run_static(sim: Simulation, *, outputs: Sequence[Any] = (), progress: bool | None = False) -> StaticResult:
+def run_static(
+    sim: Simulation, *, outputs: Sequence[Any] = (), progress: bool | None = False, unstable: str = "warn"
+) -> StaticResult:
     """Do the load steps of a simulation made by `begin_static`; see `solve_static`."""
     springs = Springs(sim.integrator.stabilise) if sim.integrator.stabilise else None
     sim.run(1.0, outputs=[*outputs, *([springs] if springs else [])], progress=progress)
     assert sim.last is not None
     sim._load = sim.time  # what is drawn of it later is at this load
+    found = None
+    if unstable != "ignore" and (sim.time >= 1.0 - FULL).all():
+        found = judge_stability(sim, every=unstable == "refuse")
+        sim.last = replace(sim.last, stable=found.stable)
     sim.model.terms.rewind(sim.state)  # what starts from the equilibrium starts at t = 0
-    return StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"], springs)
+    result = StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"], springs, found)
+    if found is not None:
+        announce(result, refuse=unstable == "refuse")
+    return result

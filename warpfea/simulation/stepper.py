@@ -136,6 +136,8 @@ class Stepper:
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
         w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
+        if isinstance(self.solver, NewtonPCG) and not self.adaptive:
+            w.step.most_newton = self.solver.most_newton(bool(self.terms.traits.walls))
         w.step.stabilise = self.integrator.stabilise
         w.step.parameter = self.integrator.parameter
         if self.integrator.takes_velocity:

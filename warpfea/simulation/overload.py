@@ -1,0 +1,60 @@
+"""Loads that a body's stiffness can't carry, told where a step is refused: mostly a wrong unit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..model.assembly import element_volumes
+from ..model.contact_points import effective_modulus
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["overload_text"]
+
+OVERLOAD = 0.3
+"""Of E: nominal stress from which a load is named."""
+
+
+def overload_text(model: Model) -> str:
+    """The load with the largest nominal stress over E of its body, where that is large; else "".
+
+    The nominal stress of a traction or pressure is its value, that of a point load its force over the body's mean
+    section (volume over longest side), that of a weight density times g times the longest side.
+    """
+    found = [(0.0, "", 0.0, "", "")]
+    d = model.description
+    for load in d.dead_loads:
+        if load.name == "traction":
+            found.append(_of(load.body, "traction", _size(load.law), _size(load.law), "Pa"))
+        else:
+            side = float(np.ptp(load.body.mesh.bounding_box(), axis=0).max())
+            section = float(element_volumes(load.body).sum()) / side
+            found.append(_of(load.body, load.name, _size(load.law), _size(load.law) / section, "N"))
+    for pressure in d.pressures:
+        found.append(_of(pressure.surface.body, "pressure", _size(pressure.law), _size(pressure.law), "Pa"))
+    g = float(np.linalg.norm(model.terms.dead.gravity.numpy(), axis=1).max())
+    for body in model.bodies if g > 0.0 else ():
+        side = float(np.ptp(body.mesh.bounding_box(), axis=0).max())
+        weight = model.masses.of_body(body) / float(element_volumes(body).sum()) * g * side
+        found.append(_of(body, "weight", weight, weight, "Pa"))
+    ratio, what, value, unit, name = max(found)
+    if ratio < OVERLOAD:
+        return ""
+    E = max(effective_modulus(body)[0] for body in model.bodies if body.name == name)
+    nominal = "" if unit == "Pa" else ", as a stress,"
+    return (
+        f"; the {what} of {value:.3g} {unit} on body {name!r}{nominal} is {ratio:.3g} times its E = {E:.3g} Pa, which "
+        "it can't carry: look at the units of both"
+    )
+
+
+def _of(body: Any, what: str, value: float, stress: float, unit: str) -> tuple[float, str, float, str, str]:
+    return stress / effective_modulus(body)[0], what, value, unit, body.name
+
+
+def _size(law: Any) -> float:
+    """Largest value of a time law, 0 of what is a function of time or a control."""
+    return float(np.linalg.norm(law.values, axis=1).max()) if len(law.times) else 0.0

@@ -1,0 +1,376 @@
+"""Stability of static equilibria: whether the tangent H is positive on what supports, joints and contact leave free.
+
+Conjugate gradients on H from a random force r_0, preconditioned by B as the solves were (Lanczos' method in the inner
+product of B). A direction p with p.H p < 0 proves an equilibrium unstable. Where all curvatures are positive, a mode
+phi with H phi = -mu B^-1 phi, mu > 0, has phi.r_k = phi.r_0 prod(1 + mu / theta_i) with positive Ritz values theta_i:
+its part of the residual never falls. Once the norm of the residual has fallen to REDUCTION, such a mode would have held
+less than that share of the random force (Kuczynski and Wozniakowski 1992 bound the probability). The coefficients of
+the solves themselves don't do: a load may not excite the mode at all.
+
+The mode is that of least w = p.H p / p.M p, by locally optimal conjugate gradients (Knyazev 2001), from the direction
+that was found. A float32 state takes a float64 tangent, that of a twin of the model.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import warp as wp
+
+from ..base.errors import StabilityError, StabilityWarning
+from ..model.state import remembered
+from ..solvers import NewtonPCG
+from ..terms.term import Term
+from .simulation import Simulation
+
+__all__ = ["Stability", "announce", "judge_stability"]
+
+REDUCTION = 1e-4
+"""Of the residual, in the norm of B, at which the search ends."""
+ITERATIONS, SHARE, MOST = 500, 0.3, 20_000
+"""After which it is given up: so many, or this share of the solve's own where that is more; where it must be known."""
+ROUNDING = 64.0
+"""Roundings of p.D p (D: diagonal of H) below which p.H p has no sign."""
+NOISE = 4.0
+"""Changes of p.H p by rounding the state once more, below which it has no sign in float32."""
+MODE_ITERATIONS, MODE_CHANGE = 60, 1e-4
+"""Of the search for the mode: at most, and the relative change of w at which it ends."""
+TANGENT = 1e-3
+"""Relative difference of the true tangent of forces without a potential and that in H, from which they are not told."""
+TWIN_SLOTS = 200_000
+"""Slots of all worlds up to which a float32 model is judged by itself: in float64 it takes about 7 kB for each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stability:
+    """Of a static equilibrium.
+
+    Attributes:
+        stable: (worlds,) objects: True, False, or None where it can't be known.
+        reasons: (worlds,) texts: why it can't be known, "" where it is.
+        mode: (worlds, slots, 3) unstable mode, largest displacement 1 m; 0 where there is none.
+        iterations: (worlds,) products H p of the search for a direction of negative curvature.
+    """
+
+    stable: np.ndarray
+    reasons: list[str]
+    mode: np.ndarray
+    iterations: np.ndarray
+
+    @property
+    def text(self) -> str:
+        """Stable, unstable, stability unknown; of several worlds how many."""
+        kinds = ((True, "stable"), (False, "unstable"), (None, "stability unknown"))
+        found = [(sum(s is value for s in self.stable), text) for value, text in kinds]
+        several = len(self.stable) > 1
+        return ", ".join(f"{count} {text}" if several else text for count, text in found if count)
+
+    def __repr__(self) -> str:
+        return f"Stability({self.text})"
+
+
+def announce(result: Any, *, refuse: bool) -> None:
+    """Warn of unstable worlds of a StaticResult, or raise StabilityError for the first."""
+    found, sim = result.stability, result.simulation
+    worlds = [world for world, s in enumerate(found.stable) if s is False]
+    if not worlds:
+        return
+    m, world = sim.model, worlds[0]
+    size = np.linalg.norm(found.mode[world], axis=1) * m.is_position_host
+    slot = int(np.argmax(size))
+    body = next(b for b in m.bodies if b.slot_offset <= slot < b.slot_offset + b.slot_count)
+    place = m.reference[slot] + body.origin + sim.state.displacement.numpy()[world, slot]
+    where = ", ".join(f"{x + 0.0:.3g}" for x in np.round(place, 12))
+    way = ", ".join(f"{x + 0.0:.2g}" for x in np.round(found.mode[world, slot], 3))
+    many = f"{len(worlds)} of {m.worlds} worlds, the first of them {world}" if len(worlds) > 1 else f"world {world}"
+    text = (
+        f"the equilibrium is unstable in {many}: body {body.name!r} buckles or snaps through; its mode is largest at "
+        f"({where}) m, along ({way}). What follows needs an imperfection: r.mode(body) times a size on the points of "
+        f"the mesh, a small load across, or a damped motion from r.perturbed({1e-3 * m.size:.1g})"
+    )
+    if refuse:
+        error = StabilityError(text, time=1.0, world=world, state=sim.state)
+        error.result = result
+        raise error
+    warnings.warn(text, StabilityWarning, stacklevel=4)
+
+
+def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
+    """Judge the equilibrium that a simulation of `begin_static` has come to, before its time is put to 0.
+
+    Args:
+        every: also judge float32 models whose twin in float64 is large, at whatever cost.
+    """
+    model = sim.model
+    out = Stability(
+        np.full(model.worlds, None), [""] * model.worlds, np.zeros((model.worlds, model.slots, 3)),
+        np.zeros(model.worlds, dtype=int),
+    )  # fmt: skip
+    for world, contact in _rubbing(sim):
+        out.reasons[world] = f"contact {contact!r} has friction"
+    single = model.dtype == "float32"
+    if single and not every and model.worlds * model.slots > TWIN_SLOTS:
+        out.reasons[:] = [text or "the float32 model is large; unstable='refuse' judges it" for text in out.reasons]
+    if all(out.reasons):
+        return out
+    # an inverse of H itself is no preconditioner where H is indefinite
+    probe = Tangent(_twin(sim) if single or sim.stepper.newton.direct else sim)
+    strange = probe.unlike()
+    for world in range(model.worlds):
+        if strange[world] and not out.reasons[world]:
+            names = ", ".join(term.name for term in model.terms if not term.potential)
+            out.reasons[world] = f"forces that no potential is known of: {names}"
+    most = MOST if every else max(ITERATIONS, int(SHARE * sim.totals["pcg"].max()))
+    curvature, p = _search(probe, out, most)
+    if single:
+        _shake(probe, sim, out, curvature, p)
+    unstable = np.array([s is False for s in out.stable])
+    if unstable.any():
+        out.mode[unstable] = _mode(probe, unstable, p)[unstable]
+    return out
+
+
+def _rubbing(sim: Simulation) -> list[tuple[int, str]]:
+    """Worlds and contacts that touch with friction."""
+    found = []
+    for term in (sim.model.terms.contact, sim.model.terms.pairs):
+        for contact in term.tables.contacts if term else ():
+            mu = term.tables.data.mu_static.numpy()[:, term.tables.number[contact.index]]
+            touching = sim.contact_record(contact).normal_force[:, -1] > 0.0
+            found += [(int(world), contact.name) for world in np.flatnonzero((mu > 0.0) & touching)]
+    return found
+
+
+class Tangent:
+    """The tangent H at the iterate of a simulation, its preconditioner B and its diagonal, as functions on the host.
+
+    Vectors are (worlds, slots, 3) float64, 0 where prescribed; `flags` (worlds,) chooses the worlds.
+    """
+
+    def __init__(self, sim: Simulation) -> None:
+        self.sim, self.model, self.stepper = sim, sim.model, sim.stepper
+        self.residual, self.work = sim.stepper.newton.residual, sim.stepper.work
+        self.free = self.model.free_host[None]
+        self.take()
+
+    def take(self) -> None:
+        """Take H at the iterate at hand, without the stress of the linear prediction."""
+        w = self.work
+        every = self.flags(np.ones(self.model.worlds))
+        w.newton.active.fill_(1)
+        w.newton.quiet.zero_()
+        w.newton.mixed.zero_()
+        self.residual.take(every)
+        self.stepper.newton.preconditioner.prepare(every)
+        self.diagonal = np.where(self.free > 0.0, w.diagonal.numpy().astype(float), 1.0)
+
+    def flags(self, chosen: np.ndarray) -> wp.array:
+        """A mask of worlds on the device."""
+        return wp.array(chosen.astype(np.int32), dtype=wp.int32, device=self.model.device)
+
+    def product(self, p: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """H p."""
+        w = self.work
+        w.p.assign(p)
+        self.residual.product(w.p, w.Hp, self.flags(chosen))
+        return self._read(w.Hp, chosen)
+
+    def precondition(self, r: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """B r."""
+        w = self.work
+        w.r.assign(r)
+        self.stepper.newton.preconditioner.apply(w.r, w.z, self.flags(chosen))
+        return self._read(w.z, chosen)
+
+    def _read(self, array: wp.array, chosen: np.ndarray) -> np.ndarray:
+        return np.where(chosen[:, None, None], array.numpy().astype(float) * self.free, 0.0)
+
+    def unlike(self) -> np.ndarray:
+        """(worlds,) whether forces without a potential change otherwise than H has it: their tangent is not symmetric
+        (of a pressure on an open surface), or not in H (of a field)."""
+        m, w, at = self.model, self.work, self.stepper.at
+        terms = [term for term in m.terms if not term.potential]
+        if not terms:
+            return np.zeros(m.worlds, dtype=bool)
+        every, u = self.flags(np.ones(m.worlds)), w.u.numpy().copy()  # on the CPU a view
+        gather = self.residual.gather.gather_force
+
+        def gathered(call: str, pool: wp.array, *more: Any) -> np.ndarray:
+            pool.zero_()
+            for term in terms:
+                if call != "product" or type(term).product is not Term.product:
+                    getattr(term, call)(at, *more, every)
+            at.launch(gather, (m.worlds, m.slots), [m.terms.side_topology, pool, every, w.Hp])
+            return self._read(w.Hp, np.ones(m.worlds, dtype=bool))
+
+        step = 1e-5 * m.size
+        p = step * np.random.default_rng(2).standard_normal(u.shape) * self.free
+        forces = []
+        for sign in (1.0, -1.0, 0.0):
+            w.u.assign(u + sign * p)
+            forces.append(gathered("force", w.nonpotential_contribution))
+        true = 0.5 * (forces[0] - forces[1])
+        w.p.assign(p)
+        taken = gathered("product", w.nonpotential_tangent, w.p) if m.terms.traits.tangent else 0.0 * true
+        size = _norm(true) + _norm(taken) + 1e-3 * step / m.size * _norm(forces[2])
+        return _norm(true - taken) > TANGENT * size
+
+
+def _norm(x: np.ndarray) -> np.ndarray:
+    """(worlds,) norms of vectors."""
+    return np.sqrt(np.einsum("bsc,bsc->b", x, x))
+
+
+def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.einsum("bsc,bsc->b", x, y)
+
+
+def _search(probe: Tangent, out: Stability, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Look for a direction of negative curvature in the worlds without a reason; sets `stable` and `reasons`.
+
+    Returns (worlds,) p.H p and the directions p that it is judged by: the first negative one or the softest.
+    """
+    m = probe.model
+    kappa = probe.sim.solver.penalty if m.constraints else 0.0
+    rounding = ROUNDING * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
+    going = np.array([not reason for reason in out.reasons])
+    random = np.random.default_rng(1).standard_normal((m.slots, 3))
+    r = np.where(going[:, None, None], random * probe.free, 0.0)  # the same in all worlds
+    z = probe.precondition(r, going)
+    p, rz = z.copy(), _dot(r, z)
+    first, softest, curvature = rz.copy(), np.full(m.worlds, np.inf), np.zeros(m.worlds)
+    best = np.zeros_like(p)
+    for count in range(1, most + 1):
+        Hp = probe.product(p, going)
+        pHp, pDp = _dot(p, Hp), _dot(p, probe.diagonal * p)
+        ratio = pHp / np.where(pDp > 0.0, pDp, 1.0)
+        soft = going & (ratio < softest)
+        softest, curvature = np.where(soft, ratio, softest), np.where(soft, pHp, curvature)
+        best[soft] = p[soft]
+        out.iterations[going] = count
+        for world in np.flatnonzero(going & ~(ratio > rounding)):
+            if ratio[world] < -rounding:
+                out.stable[world] = False
+            else:
+                out.reasons[world] = "a motion meets no resistance above rounding (a body that is free to move?)"
+        going = going & (ratio > rounding)
+        alpha = np.where(going, rz / np.where(going, pHp, 1.0), 0.0)[:, None, None]
+        r = r - alpha * Hp
+        z = probe.precondition(r, going)
+        new = _dot(r, z)
+        done = going & (new <= REDUCTION**2 * first)
+        out.stable[done] = True
+        going = going & ~done
+        if not going.any():
+            break
+        p = z + np.where(going, new / np.where(going, rz, 1.0), 0.0)[:, None, None] * p
+        rz = new
+    for world in np.flatnonzero(going):
+        out.reasons[world] = f"not resolved in {most} iterations; unstable='refuse' takes up to {MOST}"
+    return curvature, best
+
+
+def _shake(probe: Tangent, sim: Simulation, out: Stability, curvature: np.ndarray, p: np.ndarray) -> None:
+    """Where the sign of p.H p does not outlive one more rounding of the state to float32, it is not known."""
+    state, u = probe.sim.state, sim.state.displacement.numpy().astype(float)
+    shift = np.random.default_rng(3).uniform(-0.5, 0.5, u.shape) * np.finfo("float32").eps * np.abs(u) * probe.free
+    state.displacement.assign(u + shift)
+    _open(probe.stepper)
+    probe.take()
+    change = np.abs(_dot(p, probe.product(p, np.ones(len(u), dtype=bool))) - curvature)
+    for world in range(len(u)):
+        if out.stable[world] is not None and abs(curvature[world]) <= NOISE * change[world]:
+            out.stable[world], out.reasons[world] = None, "within the rounding of float32"
+    if all(s is not False for s in out.stable):
+        return
+    state.displacement.assign(u)
+    _open(probe.stepper)
+    probe.take()
+
+
+def _mode(probe: Tangent, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Modes of least p.H p / p.M p (worlds, slots, 3), largest displacement 1 m, from directions x."""
+    m = probe.model
+    x = np.where(chosen[:, None, None], x, 0.0)
+    masses = [m.masses.of_world(world) if m.masses.varied else m.mass_host for world in range(m.worlds)]
+
+    def mass(v: np.ndarray) -> np.ndarray:
+        return np.stack([masses[b] @ v[b] if chosen[b] else v[b] for b in range(m.worlds)]) * probe.free
+
+    before, basis, going = np.full(m.worlds, np.inf), [x], chosen.copy()
+    H, M = [probe.product(x, going)], [mass(x)]
+    for _ in range(MODE_ITERATIONS):
+        value = np.zeros(m.worlds)
+        new: list[list[np.ndarray]] = [[np.zeros_like(x) for _ in range(3)] for _ in range(2)]
+        for b in np.flatnonzero(chosen):
+            V, HV, MV = (np.stack([v[b].ravel() for v in of]) for of in (basis, H, M))
+            size = np.sqrt(np.maximum(np.einsum("ij,ij->i", V, MV), 1e-300))
+            V, HV, MV = V / size[:, None], HV / size[:, None], MV / size[:, None]
+            s, Q = np.linalg.eigh(V @ MV.T)
+            T = Q[:, s > 1e-10 * s[-1]] / np.sqrt(s[s > 1e-10 * s[-1]])
+            values, y = scipy.linalg.eigh(T.T @ (V @ HV.T) @ T)
+            value[b], y = values[0], T @ y[:, 0]
+            last = y.copy()
+            last[0] = 0.0
+            for k, of in enumerate((V, HV, MV)):
+                for j, weights in enumerate((y, last)):
+                    new[j][k][b] = (weights @ of).reshape(m.slots, 3)
+        (x, Hx, Mx), (p, Hp, Mp) = new
+        going = chosen & (np.abs(value - before) > MODE_CHANGE * np.abs(value))
+        if not going.any():
+            break
+        before = value
+        r = Hx - value[:, None, None] * Mx
+        w = probe.precondition(r, chosen)
+        basis, H, M = [x, w], [Hx, probe.product(w, chosen)], [Mx, mass(w)]
+        if (_norm(p)[chosen] > 0.0).all():
+            basis, H, M = [*basis, p], [*H, Hp], [*M, Mp]
+    largest = (np.linalg.norm(x, axis=2) * m.is_position_host).max(axis=1)
+    return x / np.where(largest > 0.0, largest, 1.0)[:, None, None]
+
+
+def _twin(sim: Simulation) -> Simulation:
+    """The same equilibrium in float64, with the forces at it, as conjugate gradients want it."""
+    model = sim.model
+    twin = model.resized(model.worlds, dtype="float64")
+    if model.terms.written:
+        twin.parameters.take(model.parameters.values)
+        arrays = twin.terms.parameter_arrays()
+        for name, array in model.terms.parameter_arrays().items():
+            arrays[name].assign(array.numpy().astype(arrays[name].numpy().dtype))
+        for term in twin.terms:
+            term.parameters_taken()
+    state = twin.state()
+    assert isinstance(sim.solver, NewtonPCG)
+    solver = NewtonPCG(multipliers=sim.solver.multipliers, penalty=sim.solver.penalty)
+    out = Simulation(twin, state, dt=sim.dt, integrator=sim.integrator, solver=solver, ledger=False, capture=False)
+    for name in state.names:
+        if name in sim.state.names and not remembered(name):
+            array = getattr(state, name)
+            array.assign(getattr(sim.state, name).numpy().astype(array.numpy().dtype))
+    out.stepper.start_terms()
+    _open(out.stepper)
+    return out
+
+
+def _open(stepper: Any) -> None:
+    """Evaluate all at the state as it is: an attempt at a step of no length, which is not solved."""
+    w, m, state = stepper.work, stepper.model, stepper.state
+    k, launch = stepper.kernels, stepper.launch
+    w.step.dt.zero_()
+    launch(k.begin_step, m.worlds, [w.step, w.newton, w.pcg])
+    launch(k.begin_attempt, m.worlds, [w.step, w.newton])
+    running = w.step.running
+    stepper._laws(running)
+    args = [w.step, m.is_position, m.topology.free, state.displacement, state.velocity]
+    args += [stepper.u_before, stepper.v_before, w.q_tilde, w.v_tilde, w.v]
+    launch(k.predict, stepper.dim, args)
+    m.terms.supports.drive(stepper.at, running)
+    for term in m.terms:
+        term.begin(stepper.at, running)
+    stepper.newton._clear_direction(running)
+    stepper.newton._open(running)
