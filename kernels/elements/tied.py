@@ -12,7 +12,7 @@ import warp as wp
 
 from ..common.types import kernel_module, precision
 from .load import load_functions, local_type
-from .matrix import UNROLL, panels_of, row_of, rows_type
+from .matrix import UNROLL, panels_of, row_of, rows_type, stage_name
 from .tied_block import coupling_function, tied_struct
 
 __all__ = ["tied_kernels"]
@@ -20,7 +20,13 @@ __all__ = ["tied_kernels"]
 
 @functools.cache
 def tied_kernels(
-    dtype: str, slots: int, ties: int, width: int, midpoint: bool = False, worlds: bool = False
+    dtype: str,
+    slots: int,
+    ties: int,
+    width: int,
+    midpoint: bool = False,
+    worlds: bool = False,
+    dissipative: bool = False,
 ) -> _types.SimpleNamespace:
     """Kernels of tied elements; they take the arguments of `element_kernels`, so that one loop launches both.
 
@@ -30,15 +36,16 @@ def tied_kernels(
         width: A couples the ties of each run of `width`.
         midpoint: of the conserving scheme: u is half-way through the step, v half of what u changes by; the shears in
             forces and products are the mean of those at both ends, and the energy is that at the end.
+        dissipative: with (chi/2) of what they change by added to the mean, see conserving.py.
         worlds: A of each world, those of one next to each other.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
-    Block = tied_struct(dtype)
-    name = f"tied_{dtype}_{slots}_{ties}_{width}{'_midpoint' if midpoint else ''}{'_worlds' if worlds else ''}"
+    Block = tied_struct(dtype, dissipative)
+    name = f"tied_{dtype}_{slots}_{ties}_{width}{stage_name(midpoint, dissipative)}{'_worlds' if worlds else ''}"
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
-    coupled = coupling_function(dtype, worlds)
+    coupled = coupling_function(dtype, worlds, dissipative)
     Local = local_type(dtype, slots)
     load, store = load_functions(dtype, slots, Block)
     Ties = wp.types.vector(length=ties, dtype=T)
@@ -92,12 +99,30 @@ def tied_kernels(
         return out
 
     @wp.func
+    def step_shears(block: Block, x1: TieVectors, x2: TieVectors, D: Local, e: Ties, elem: int) -> Ties:
+        """The shears that the stresses of a step belong to, m^2: their mean, and chi/2 of what they change by."""
+        out = mean_shears(block, D, e, elem)
+        if wp.static(dissipative):
+            for t in range(NT):
+                change = wp.dot(x1[t], line(block.second, D, t, elem)) + wp.dot(x2[t], line(block.first, D, t, elem))
+                out[t] = out[t] + block.dissipation * change
+        return out
+
+    @wp.func
     def half(x: T) -> T:
         """Of a stiffness: `midpoint`: what it is taken at moves by half of the end."""
         if wp.static(midpoint):
             return T(0.5) * x
         else:
             return x
+
+    @wp.func
+    def slope(block: Block, mu: T) -> T:
+        """Modulus in a matrix: `half`, and of a dissipative step (1 + chi) times that."""
+        if wp.static(dissipative):
+            return (T(1.0) + block.dissipation) * half(mu)
+        else:
+            return half(mu)
 
     @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
@@ -113,11 +138,23 @@ def tied_kernels(
         return s
 
     @wp.func
-    def tangent_force(block: Block, P: Local, x1: TieVectors, x2: TieVectors, e: Ties, world: int, elem: int) -> Local:
-        """Forces for a change P of the slots, with x_a, x_b and the shears e of the geometric part, N."""
+    def tangent_force(
+        block: Block, P: Local, D: Local, x1: TieVectors, x2: TieVectors, e: Ties, world: int, elem: int
+    ) -> Local:
+        """Forces for a change P of the slots, with x_a, x_b and the shears e of the geometric part, N.
+
+        `midpoint`: shears change along x_a and x_b at the end of the step, which D leads to.
+        """
         de = Ties()
         for t in range(NT):
-            de[t] = wp.dot(x1[t], line(block.second, P, t, elem)) + wp.dot(x2[t], line(block.first, P, t, elem))
+            a = x1[t]
+            d = x2[t]
+            if wp.static(midpoint):
+                a += line(block.first, D, t, elem)
+                d += line(block.second, D, t, elem)
+            de[t] = wp.dot(a, line(block.second, P, t, elem)) + wp.dot(d, line(block.first, P, t, elem))
+            if wp.static(dissipative):
+                de[t] = (T(1.0) + block.dissipation) * de[t]
         s = stresses(block, e, world, elem)
         ds = stresses(block, de, world, elem)
         f = Local()
@@ -153,7 +190,7 @@ def tied_kernels(
         s = Ties()
         if wp.static(midpoint):
             D = load(block, v, world, elem)
-            s = stresses(block, mean_shears(block, D, e, elem), world, elem)
+            s = stresses(block, step_shears(block, x1, x2, D, e, elem), world, elem)
             _, _, e = kinematics(block, U + D, elem)
         else:
             s = stresses(block, e, world, elem)
@@ -187,9 +224,11 @@ def tied_kernels(
         U = load(block, u, world, elem)
         P = load(block, direction, world, elem)
         x1, x2, e = kinematics(block, U, elem)
+        D = Local()
         if wp.static(midpoint):
-            e = mean_shears(block, load(block, v, world, elem), e, elem)
-        store(block, tangent_force(block, P, x1, x2, e, world, elem), world, elem, contribution)
+            D = load(block, v, world, elem)
+            e = step_shears(block, x1, x2, D, e, elem)
+        store(block, tangent_force(block, P, D, x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=mixed_module)
     def mixed_product(
@@ -216,7 +255,7 @@ def tied_kernels(
         if mixed[world] == 2:
             e = Ties()
         P = load(block, direction, world, elem)
-        store(block, tangent_force(block, P, x1, x2, e, world, elem), world, elem, contribution)
+        store(block, tangent_force(block, P, Local(), x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=module)
     def diagonal_blocks(
@@ -246,7 +285,7 @@ def tied_kernels(
                     row += coupled(block, t, k, world, elem) * b[first + k]
                 K += wp.outer(b[t], row)
             entry = block.contribution_offset + i * block.count + elem
-            contribution[world, entry] = half(mu) * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
+            contribution[world, entry] = slope(block, mu) * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
 
     @wp.kernel(module=matrix_module)
     def prepare_matrix(
@@ -280,7 +319,11 @@ def tied_kernels(
         shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
         if wp.static(midpoint):
             D = load(block, v, world, elem)
-            shear += wp.dot(line(block.first, D, tie, elem), line(block.second, D, tie, elem))
+            change = line(block.first, D, tie, elem)
+            other = line(block.second, D, tie, elem)
+            shear += wp.dot(change, other)
+            if wp.static(dissipative):
+                shear += block.dissipation * (wp.dot(a, other) + wp.dot(d, change))
         if mixed[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
             factor = T(dq_dv[world]) * T(dq_dv[world])
@@ -328,7 +371,7 @@ def tied_kernels(
         elem = index % block.count
         b = column / 3
         axis = column % 3
-        mu = half(block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
+        mu = slope(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         unit = vec3()
         unit[axis] = T(1.0)
         change = Ties()
@@ -376,7 +419,7 @@ def tied_kernels(
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        mu = half(block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
+        mu = slope(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         U = load(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         first, second, B = Slots(), Slots(), Changes()
@@ -396,7 +439,7 @@ def tied_kernels(
             e = foreseen(block, T(dq_dv[world]) * change, e, elem)
         stress = Ties()
         if wp.static(midpoint):
-            e = mean_shears(block, load(block, v, world, elem), e, elem)
+            e = step_shears(block, x1, x2, load(block, v, world, elem), e, elem)
         if form != 1 and mixed[world] != 2:
             stress = stresses(block, e, world, elem)
         if add == 0:

@@ -10,8 +10,8 @@ __all__ = ["coupling_function", "tied_struct"]
 
 
 @functools.cache
-def tied_struct(dtype: str):
-    """The constant data of a block of tied elements, in one precision."""
+def tied_struct(dtype: str, dissipative: bool = False):
+    """The constant data of a block of tied elements, in one precision; `dissipative`: see `tied_kernels`."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
@@ -30,14 +30,16 @@ def tied_struct(dtype: str):
         element_offset: wp.int32
         history_offset: wp.int32
         count: wp.int32
+        if dissipative:
+            dissipation: T  # chi of conserving.py
 
     return TiedBlock
 
 
 @functools.cache
-def coupling_function(dtype: str, worlds: bool) -> wp.Function:
+def coupling_function(dtype: str, worlds: bool, dissipative: bool = False) -> wp.Function:
     """The device function of an entry of A; `worlds`: of a world's own."""
-    T, Block = precision(dtype).T, tied_struct(dtype)
+    T, Block = precision(dtype).T, tied_struct(dtype, dissipative)
 
     @wp.func
     def coupled(block: Block, tie: int, k: int, world: int, elem: int) -> T:

@@ -106,7 +106,8 @@ class Residual:
             self.pool = make_pool(model, work, midpoint=at.midpoint)
             forms = [block.key.damping if at.inertia else None for block in model.blocks]
             self.products = [
-                block.with_mass_product(model.dtype, form, at.midpoint) for block, form in zip(model.blocks, forms)
+                block.with_mass_product(model.dtype, form, at.midpoint, at.dissipation > 0.0)
+                for block, form in zip(model.blocks, forms)
             ]
         self.keep, self.lasting = 0, False
         self.on_matrix: Callable[[wp.array, wp.array], None] | None = None
@@ -283,7 +284,7 @@ class Residual:
         if self.clusters:
             for block, kernel, (data, count) in zip(m.blocks, self.products, self.clusters.blocks):
                 lanes = block.cluster if m.device.is_cuda else 1
-                args = [block.data, data, w.u_stage, w.v_stage, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
+                args = [w.data_of(block), data, w.u_stage, w.v_stage, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
                 args += [lanes, self.pool, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
         elif self.mixed:
