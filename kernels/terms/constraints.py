@@ -89,7 +89,8 @@ def multiplier_struct():
         value: wp.array2d(dtype=wp.float64)  # c, m
         target: wp.array2d(dtype=wp.float64)  # f
         last: wp.array2d(dtype=wp.float64)  # f of the last accepted step
-        gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector
+        gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector, where forces are taken
+        ahead: wp.array2d(dtype=wp.vec3d)  # the same at the end of the step, along which c changes
         scale: wp.array2d(dtype=wp.float64)  # of the row, negative where a turn is more than a right angle off
         force: wp.array2d(dtype=wp.float64)  # lambda, N
         change: wp.array2d(dtype=wp.float64)  # of lambda with a full Newton step
@@ -147,12 +148,14 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
         return s
 
     @wp.func
-    def directional(con: Constraints, mul: Multipliers, x: wp.array2d(dtype=vec3), world: int, row: int) -> f64:
+    def directional(
+        con: Constraints, gradient: wp.array2d(dtype=vec3d), x: wp.array2d(dtype=vec3), world: int, row: int
+    ) -> f64:
         """(J x) of a row."""
-        s = wp.dot(mul.gradient[world, 3 * row], combine(con, 3 * row, x, world))
-        s += wp.dot(mul.gradient[world, 3 * row + 1], combine(con, 3 * row + 1, x, world))
+        s = wp.dot(gradient[world, 3 * row], combine(con, 3 * row, x, world))
+        s += wp.dot(gradient[world, 3 * row + 1], combine(con, 3 * row + 1, x, world))
         if con.kind[row] == TURN:
-            s += wp.dot(mul.gradient[world, 3 * row + 2], combine(con, 3 * row + 2, x, world))
+            s += wp.dot(gradient[world, 3 * row + 2], combine(con, 3 * row + 2, x, world))
         return s
 
     return _types.SimpleNamespace(combine=combine, directional=directional)
@@ -239,6 +242,9 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
         turn = f
         if wp.static(midpoint):
+            ahead = gradients(kind, scale, f, slope, b, a2)
+            for side in range(3):
+                mul.ahead[world, 3 * row + side] = ahead[side]
             middle = A + combine(con, 3 * row, u_stage, world)
             if kind == DISTANCE:
                 slope = middle * (f64(2.0) / (wp.length(a) + wp.length(f64(2.0) * middle - a)))
@@ -295,6 +301,9 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         Gb = mul.gradient[world, 3 * row + 1]
         Gc = mul.gradient[world, 3 * row + 2]
         change = wp.dot(Ga, a) + wp.dot(Gb, b) + wp.dot(Gc, a2)
+        if wp.static(midpoint):
+            change = wp.dot(mul.ahead[world, 3 * row], a) + wp.dot(mul.ahead[world, 3 * row + 1], b)
+            change += wp.dot(mul.ahead[world, 3 * row + 2], a2)
         f = mul.target[world, row]
         scale = mul.scale[world, row]
         if kind == DISTANCE:
@@ -342,7 +351,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             return
         mul.change[world, row] = f64(0.0)
         if quiet[world, con.component[row]] == 0:
-            after = mul.value[world, row] + dq_dv[world] * directional(con, mul, direction, world, row)
+            after = mul.value[world, row] + dq_dv[world] * directional(con, mul.ahead, direction, world, row)
             mul.change[world, row] = mul.stiffness[world, row] * after
 
     @wp.kernel(module=module)

@@ -95,6 +95,8 @@ class Residual:
             cheaper = assembled
         elif banded:  # and their factors solve with it
             cheaper = True
+        if at.midpoint:  # the matrix is symmetric, and the operator of a mid-point step is not
+            cheaper = False
         self.by_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
         self.clusters: ModelClusters | None = None
         # an equilibrium takes few products per iterate, and fewer iterates with the stress of the linear prediction
