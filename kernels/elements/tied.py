@@ -11,9 +11,9 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from .load import load_functions, local_type
+from .load import load_functions
 from .matrix import UNROLL, panels_of, row_of, rows_type, stage_name
-from .tied_block import coupling_function, tied_struct
+from .tied_block import coupling_function, shear_functions, tied_struct
 
 __all__ = ["tied_kernels"]
 
@@ -46,10 +46,11 @@ def tied_kernels(
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
     coupled = coupling_function(dtype, worlds, dissipative)
-    Local = local_type(dtype, slots)
+    shears = shear_functions(dtype, slots, ties, dissipative)
+    Local, Ties, TieVectors = shears.Local, shears.Ties, shears.TieVectors
+    line, kinematics = shears.line, shears.kinematics
+    foreseen, step_shears = shears.foreseen, shears.step_shears
     load, store = load_functions(dtype, slots, Block)
-    Ties = wp.types.vector(length=ties, dtype=T)
-    TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
     NS, NT, W = slots, ties, width
     PANELS, P, _ = panels_of(NS)
     Row = wp.types.vector(length=P, dtype=T)
@@ -60,53 +61,6 @@ def tied_kernels(
     Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
     rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
     mixed_module = kernel_module(f"{name}_mixed")
-
-    @wp.func
-    def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
-        """sum_i s_i,a u_i at a tie, with `table` the derivatives along one direction: what U adds to x_a, m."""
-        out = vec3()
-        for i in range(NS):
-            out += table[tie, i, elem] * U[i]
-        return out
-
-    @wp.func
-    def kinematics(block: Block, U: Local, elem: int):
-        """x_a, x_b (m) and the shears e (m^2) at the ties; e is formed without subtracting nearly equal numbers."""
-        first, second = TieVectors(), TieVectors()
-        e = Ties()
-        for t in range(NT):
-            a = line(block.first, U, t, elem)
-            d = line(block.second, U, t, elem)
-            first[t] = block.X_first[t, elem] + a
-            second[t] = block.X_second[t, elem] + d
-            e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, second[t])
-        return first, second, e
-
-    @wp.func
-    def foreseen(block: Block, step: Local, e: Ties, elem: int) -> Ties:
-        """The shears of the linear prediction from the iterate before, m^2; `step`: the last change of the slots, m."""
-        out = e
-        for t in range(NT):
-            out[t] = out[t] - wp.dot(line(block.first, step, t, elem), line(block.second, step, t, elem))
-        return out
-
-    @wp.func
-    def mean_shears(block: Block, D: Local, e: Ties, elem: int) -> Ties:
-        """The mean of the shears at both ends of a step, m^2: e half-way, and the slots' half change D."""
-        out = e
-        for t in range(NT):
-            out[t] = out[t] + wp.dot(line(block.first, D, t, elem), line(block.second, D, t, elem))
-        return out
-
-    @wp.func
-    def step_shears(block: Block, x1: TieVectors, x2: TieVectors, D: Local, e: Ties, elem: int) -> Ties:
-        """The shears that the stresses of a step belong to, m^2: their mean, and chi/2 of what they change by."""
-        out = mean_shears(block, D, e, elem)
-        if wp.static(dissipative):
-            for t in range(NT):
-                change = wp.dot(x1[t], line(block.second, D, t, elem)) + wp.dot(x2[t], line(block.first, D, t, elem))
-                out[t] = out[t] + block.dissipation * change
-        return out
 
     @wp.func
     def half(x: T) -> T:
@@ -319,11 +273,11 @@ def tied_kernels(
         shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
         if wp.static(midpoint):
             D = load(block, v, world, elem)
-            change = line(block.first, D, tie, elem)
-            other = line(block.second, D, tie, elem)
-            shear += wp.dot(change, other)
+            half_a = line(block.first, D, tie, elem)
+            half_d = line(block.second, D, tie, elem)
+            shear += wp.dot(half_a, half_d)
             if wp.static(dissipative):
-                shear += block.dissipation * (wp.dot(a, other) + wp.dot(d, change))
+                shear += block.dissipation * (wp.dot(a, half_d) + wp.dot(d, half_a))
         if mixed[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
             factor = T(dq_dv[world]) * T(dq_dv[world])

@@ -56,9 +56,7 @@ class Block:
         """Whether the mass of an element is one table times a number."""
         return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
 
-    def kernels_for(
-        self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False
-    ) -> Any:
+    def kernels_for(self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False) -> Any:
         """The kernels of this kind of element with another form of damping; `midpoint`: of the conserving scheme,
         `dissipative`: of its dissipative form."""
         k = self.key

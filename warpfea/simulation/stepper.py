@@ -89,9 +89,7 @@ class Stepper:
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
         midpoint = integrator.midpoint
         loss = integrator.dissipation
-        self.work = Workspace(
-            model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint, dissipation=loss
-        )
+        self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint, dissipation=loss)
         self.at = At(
             model, self.work, self.launch, state, self.u_before,
             inertia=not integrator.static, midpoint=midpoint, dissipation=loss,

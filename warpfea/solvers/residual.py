@@ -286,7 +286,17 @@ class Residual:
         if self.clusters:
             for block, kernel, (data, count) in zip(m.blocks, self.products, self.clusters.blocks):
                 lanes = block.cluster if m.device.is_cuda else 1
-                args = [w.data_of(block), data, w.u_stage, w.v_stage, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
+                args = [
+                    w.data_of(block),
+                    data,
+                    w.u_stage,
+                    w.v_stage,
+                    w.history,
+                    w.step.mass_factor,
+                    w.step.dq_dv,
+                    active,
+                    p,
+                ]
                 args += [lanes, self.pool, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
         elif self.mixed:
