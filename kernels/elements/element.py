@@ -179,7 +179,10 @@ def element_kernels(
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); of damping of the rate form only the symmetric part."""
+        """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); of damping of the rate form only the symmetric part.
+
+        `active` 2: see `point_increment`.
+        """
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -188,7 +191,7 @@ def element_kernels(
         V = Local()
         if wp.static(fn.uses_v):
             V = fn.load(block, v, world, elem)
-        f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), world, elem)
+        f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), active[world], world, elem)
         fn.store(block, f, world, elem, contribution)
 
     @wp.kernel(module=module)

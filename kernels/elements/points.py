@@ -245,6 +245,14 @@ def point_functions(
         return dS
 
     @wp.func
+    def start_stress(G: mat33, c: coef) -> mat33:
+        """S at the start of a mid-point step, Pa, with G there."""
+        if wp.static(needs_J):
+            return t.sym(wp.inverse(t.identity() + G) * m.stress(G, c))
+        else:
+            return m.stiffness(t.green(G), c)
+
+    @wp.func
     def hardening(block: Block) -> T:
         """Factor on moduli in a matrix: of a mid-point step what they are multiplied with by its dissipation."""
         if wp.static(dissipative):
@@ -299,11 +307,15 @@ def point_functions(
         history: wp.array2d(dtype=sym6),
         c: coef,
         dq: T,
+        form: int,
         world: int,
         point: int,
         elem: int,
     ) -> mat33:
-        """dP of a change dG at a point in the body's axes, damping included: the integrand of the tangent product."""
+        """dP of a change dG at a point in the body's axes, damping included: the integrand of the tangent product.
+
+        `form` 2, of mid-point schemes: with the stress at the start of the step in the geometric part.
+        """
         local = into_axes(block, G, point, elem)
         change = into_axes(block, dG, point, elem)
         dP = mat33()
@@ -311,7 +323,11 @@ def point_functions(
         if wp.static(midpoint):
             along = along + Fdot
             F = t.identity() + local
-            S = step_stress(block, local, Fdot, c)
+            S = mat33()
+            if form == 2:
+                S = start_stress(local - Fdot, c)
+            else:
+                S = step_stress(block, local, Fdot, c)
             dP = change * S + F * step_increment(block, local, t.sym(wp.transpose(along) * change), c)
         else:
             dP = m.increment(local, change, c)
@@ -319,6 +335,9 @@ def point_functions(
             F = t.identity() + local
             S = t.isotropic(strain_rate(block, local, Fdot, history, dq, world, point, elem), c[LAMBDA_V], c[ETA])
             dS = t.isotropic(t.sym(wp.transpose(along) * change), c[LAMBDA_V] / dq, c[ETA] / dq)
+            if wp.static(midpoint):
+                if form == 2:
+                    S = mat33()
             dP = dP + change * S + F * dS
         if wp.static(midpoint):
             dP = T(0.5) * dP
@@ -332,17 +351,21 @@ def point_functions(
         V: Local,
         history: wp.array2d(dtype=sym6),
         dq: T,
+        form: int,
         world: int,
         elem: int,
     ) -> Local:
-        """K dU of an element: its forces for a change dU of its slots, Eqs. (35) and (54) applied to a vector."""
+        """K dU of an element: its forces for a change dU of its slots, Eqs. (35) and (54) applied to a vector.
+
+        `form`: see `point_increment`.
+        """
         c = coefficients(block, world, elem)
         f = Local()
         for point in range(block.gradient.shape[0]):
             G = gradient_of(block, U, point, elem)
             dG = gradient_of(block, dU, point, elem)
             Fdot = velocity_gradient(block, V, point, elem)
-            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, point, elem)
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, form, world, point, elem)
             f = scatter(block, f, dP, point, elem)
         return f
 

@@ -171,7 +171,7 @@ def tied_kernels(
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p (N): the change of `internal_force` with a change p of the slots."""
+        """K p (N): the change of `internal_force` with a change p of the slots; `active` 2: see `point_increment`."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -181,7 +181,10 @@ def tied_kernels(
         D = Local()
         if wp.static(midpoint):
             D = load(block, v, world, elem)
-            e = step_shears(block, x1, x2, D, e, elem)
+            if active[world] == 2:
+                _, _, e = kinematics(block, U - D, elem)
+            else:
+                e = step_shears(block, x1, x2, D, e, elem)
         store(block, tangent_force(block, P, D, x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=mixed_module)

@@ -61,7 +61,15 @@ def with_mass_kernel(
 
         @wp.func
         def product(
-            block: Block, pool: Pool, history: wp.array2d(dtype=sym6), dq: T, scale: T, world: int, elem: int, at: int
+            block: Block,
+            pool: Pool,
+            history: wp.array2d(dtype=sym6),
+            dq: T,
+            scale: T,
+            form: int,
+            world: int,
+            elem: int,
+            at: int,
         ):
             """Set the forces (scale M + dq K) p of element `at` of a cluster."""
             u = fetch_all(block, pool, U, at)
@@ -69,7 +77,7 @@ def with_mass_kernel(
             v = Local()
             if wp.static(fn.uses_v):
                 v = fetch_all(block, pool, V, at)
-            f = fn.tangent_force(block, u, du, v, history, dq, world, elem)
+            f = fn.tangent_force(block, u, du, v, history, dq, form, world, elem)
             first = shared.fetch(pool, DIRECTION, 0, at)
             for i in range(NS):
                 a = vec3()

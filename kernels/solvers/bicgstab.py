@@ -18,6 +18,10 @@ __all__ = ["BICGSTAB_ROWS", "bicgstab_kernels", "bicgstab_struct"]
 
 BICGSTAB_ROWS = 4
 """Rows of `second_rows`."""
+FAR, CLOSE = 0.1, 1.0e-8
+"""Relative residual from which the stress of an iterate says nothing: a rotation that is off by delta strains a stiff body
+by delta^2, and E delta^2 in the geometric part would lead astray. Products have the stress at the start of the step
+there, and solves go to CLOSE, for what is to be turned hides behind what is to be unstrained."""
 STRICT = 1.0e-6
 """Relative residual of solves that tell an error."""
 
@@ -32,6 +36,7 @@ def bicgstab_struct():
         alpha: wp.array(dtype=wp.float64)
         beta: wp.array(dtype=wp.float64)
         omega: wp.array(dtype=wp.float64)
+        going: wp.array(dtype=wp.int32)  # the solve goes on after this iteration
         sums: wp.array2d(dtype=wp.float64)  # [BICGSTAB_ROWS, world]; after the first product r^.v alone
 
     return BiCGStab
@@ -74,8 +79,10 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             ctl.target[world] = newton.forcing[world] * norm
         if newton.strict[world] != 0:
             ctl.target[world] = f64(STRICT) * norm
+        elif newton.relative[world] > f64(FAR) and newton.fixed_forcing == 0:
+            ctl.target[world] = wp.max(f64(CLOSE) * norm, least)
         if norm > ctl.target[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
-            ctl.active[world] = 1
+            ctl.active[world] = wp.where(newton.relative[world] > f64(FAR), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
         elif newton.strict[world] != 0:
             ctl.negative[world] = 1  # no error was found
@@ -172,10 +179,10 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         bi.rho[world] = rho
         more = norm > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations
         if more and wp.isfinite(beta) and wp.isfinite(norm) and rho != f64(0.0):
-            ctl.active[world] = 2
+            bi.going[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)
         else:
-            ctl.active[world] = 3
+            bi.going[world] = 0
 
     @wp.kernel(module=module)
     def second_step(
@@ -196,14 +203,14 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         x[world, slot] = x[world, slot] + omega * z[world, slot]
         new = r[world, slot] - omega * t[world, slot]
         r[world, slot] = new
-        if ctl.active[world] == 2:
+        if bi.going[world] != 0:
             p_out[world, slot] = new + T(bi.beta[world]) * (p_out[world, slot] - omega * v[world, slot])
 
     @wp.kernel(module=module)
-    def close(ctl: Control):
+    def close(ctl: Control, bi: Recursion):
         """Worlds that are done are no longer active."""
         world = wp.tid()
-        if ctl.active[world] == 3:
+        if bi.going[world] == 0:
             ctl.active[world] = 0
 
     return _types.SimpleNamespace(

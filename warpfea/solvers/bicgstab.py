@@ -52,4 +52,4 @@ class BiCGStab(PCG):
         reduce(w.rows, BICGSTAB_ROWS, active, bi.sums)
         launch(k.second_length, m.worlds, [w.pcg, bi])
         launch(k.second_step, self.dim, [w.pcg, bi, w.z, self.t, w.Hp, w.direction, w.r, w.p])
-        launch(k.close, m.worlds, [w.pcg])
+        launch(k.close, m.worlds, [w.pcg, bi])
