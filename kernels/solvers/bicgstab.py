@@ -22,6 +22,8 @@ FAR, CLOSE = 0.1, 1.0e-8
 """Relative residual from which the stress of an iterate says nothing: a rotation that is off by delta strains a stiff body
 by delta^2, and E delta^2 in the geometric part would lead astray. Products have the stress at the start of the step
 there, and solves go to CLOSE, for what is to be turned hides behind what is to be unstrained."""
+STALLED = 50
+"""Iterations without half of the best residual after which a solve ends, with the best: from then on it may grow."""
 STRICT = 1.0e-6
 """Relative residual of solves that tell an error."""
 
@@ -36,6 +38,9 @@ def bicgstab_struct():
         alpha: wp.array(dtype=wp.float64)
         beta: wp.array(dtype=wp.float64)
         omega: wp.array(dtype=wp.float64)
+        best: wp.array(dtype=wp.float64)  # least D^-1 norm of the residual so far
+        mark: wp.array(dtype=wp.float64)  # when it last halved, and the iterations since
+        since: wp.array(dtype=wp.int32)
         going: wp.array(dtype=wp.int32)  # the solve goes on after this iteration
         sums: wp.array2d(dtype=wp.float64)  # [BICGSTAB_ROWS, world]; after the first product r^.v alone
 
@@ -64,8 +69,9 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.iterations[world] = 0
         ctl.negative[world] = 0
         bi.rho[world] = ctl.sums[0, world]
-        bi.omega[world] = f64(0.0)
-        bi.beta[world] = f64(0.0)
+        bi.best[world] = norm
+        bi.mark[world] = norm
+        bi.since[world] = 0
         goal = newton.forcing[world] * newton.solve_norm[world]
         least = f64(0.1) * newton.solve_accept[world]
         if wp.static(gated):
@@ -89,14 +95,22 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def first_direction(
-        ctl: Control, z: wp.array2d(dtype=vec3), r: wp.array2d(dtype=vec3),
-        shadow: wp.array2d(dtype=vec3), p_out: wp.array2d(dtype=vec3),
-    ):  # fmt: skip
-        """r^ = B r, p = r."""
+        ctl: Control,
+        z: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+        shadow: wp.array2d(dtype=vec3),
+        p_out: wp.array2d(dtype=vec3),
+        best_x: wp.array2d(dtype=vec3),
+        best_r: wp.array2d(dtype=vec3),
+    ):
+        """r^ = B r, p = r; the best so far is the start."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             shadow[world, slot] = z[world, slot]
             p_out[world, slot] = r[world, slot]
+            best_x[world, slot] = x[world, slot]
+            best_r[world, slot] = r[world, slot]
 
     @wp.kernel(module=module)
     def first_length(ctl: Control, bi: Recursion):
@@ -132,13 +146,14 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             r[world, slot] = r[world, slot] - alpha * v[world, slot]
 
     @wp.kernel(module=module)
-    def look(ctl: Control):
+    def look(ctl: Control, bi: Recursion):
         """End the solve where half of the iteration was enough."""
         world = wp.tid()
         if ctl.active[world] != 0:
             norm = wp.sqrt(ctl.sums[1, world])
             ctl.norm[world] = norm
             if not norm > ctl.target[world]:
+                bi.best[world] = norm
                 ctl.active[world] = 0
 
     @wp.kernel(module=module)
@@ -177,7 +192,14 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         bi.omega[world] = omega
         bi.beta[world] = beta
         bi.rho[world] = rho
+        if norm < bi.best[world]:
+            bi.best[world] = norm
+        bi.since[world] = bi.since[world] + 1
+        if norm <= f64(0.5) * bi.mark[world]:
+            bi.mark[world] = norm
+            bi.since[world] = 0
         more = norm > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations
+        more = more and bi.since[world] < STALLED
         if more and wp.isfinite(beta) and wp.isfinite(norm) and rho != f64(0.0):
             bi.going[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)
@@ -194,15 +216,21 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         x: wp.array2d(dtype=vec3),
         r: wp.array2d(dtype=vec3),
         p_out: wp.array2d(dtype=vec3),
+        best_x: wp.array2d(dtype=vec3),
+        best_r: wp.array2d(dtype=vec3),
     ):
         """x += omega z, r -= omega t, p = r + beta (p - omega v) where the solve goes on."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
         omega = T(bi.omega[world])
-        x[world, slot] = x[world, slot] + omega * z[world, slot]
+        place = x[world, slot] + omega * z[world, slot]
         new = r[world, slot] - omega * t[world, slot]
+        x[world, slot] = place
         r[world, slot] = new
+        if ctl.norm[world] == bi.best[world]:
+            best_x[world, slot] = place
+            best_r[world, slot] = new
         if bi.going[world] != 0:
             p_out[world, slot] = new + T(bi.beta[world]) * (p_out[world, slot] - omega * v[world, slot])
 
@@ -212,6 +240,22 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         world = wp.tid()
         if bi.going[world] == 0:
             ctl.active[world] = 0
+
+    @wp.kernel(module=module)
+    def take_best(
+        newton: Newton,
+        ctl: Control,
+        bi: Recursion,
+        best_x: wp.array2d(dtype=vec3),
+        best_r: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """x and r of the least residual."""
+        world, slot = wp.tid()
+        if newton.active[world] != 0 and not ctl.norm[world] <= bi.best[world]:
+            x[world, slot] = best_x[world, slot]
+            r[world, slot] = best_r[world, slot]
 
     return _types.SimpleNamespace(
         module=module,
@@ -224,4 +268,5 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         second_length=second_length,
         second_step=second_step,
         close=close,
+        take_best=take_best,
     )

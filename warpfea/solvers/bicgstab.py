@@ -26,6 +26,7 @@ class BiCGStab(PCG):
         self.control = w.struct(bicgstab_struct(), m.worlds, sums=(BICGSTAB_ROWS, m.worlds))
         field = (m.worlds, m.slots), m.types.vec3
         self.shadow, self.y, self.t = (w.array(f"bicgstab {name}", *field) for name in ("shadow", "y", "t"))
+        self.best = [w.array(f"bicgstab best {name}", *field) for name in ("x", "r")]
 
     def modules(self) -> set[wp.Module]:
         return super().modules() | {self.recursion.module}
@@ -33,8 +34,9 @@ class BiCGStab(PCG):
     def _run(self) -> None:
         w, k, launch = self.work, self.recursion, self.launch
         launch(k.begin, self.model.worlds, [w.newton, w.pcg, self.control])
-        launch(k.first_direction, self.dim, [w.pcg, w.z, w.r, self.shadow, w.p])
+        launch(k.first_direction, self.dim, [w.pcg, w.z, w.r, w.direction, self.shadow, w.p, *self.best])
         wp.capture_while(w.pcg.any_active, self._iterate)
+        launch(k.take_best, self.dim, [w.newton, w.pcg, self.control, *self.best, w.direction, w.r])
 
     def _iterate(self) -> None:
         w, k, launch, bi = self.work, self.recursion, self.launch, self.control
@@ -46,10 +48,10 @@ class BiCGStab(PCG):
         launch(k.first_length, m.worlds, [w.pcg, bi])
         launch(k.first_step, self.dim, [w.pcg, bi, self.y, w.Hp, w.direction, w.r])
         self._precondition(w.r, w.z, active)
-        launch(k.look, m.worlds, [w.pcg])
+        launch(k.look, m.worlds, [w.pcg, bi])
         self.residual.product(w.z, self.t, active)
         launch(k.second_rows, self.dim, [w.pcg, w.diagonal, w.r, self.t, self.shadow, w.rows])
         reduce(w.rows, BICGSTAB_ROWS, active, bi.sums)
         launch(k.second_length, m.worlds, [w.pcg, bi])
-        launch(k.second_step, self.dim, [w.pcg, bi, w.z, self.t, w.Hp, w.direction, w.r, w.p])
+        launch(k.second_step, self.dim, [w.pcg, bi, w.z, self.t, w.Hp, w.direction, w.r, w.p, *self.best])
         launch(k.close, m.worlds, [w.pcg, bi])
