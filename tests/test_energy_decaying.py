@@ -1,4 +1,4 @@
-"""energy_momentum(rho_inf=...): never any growth of energy, momenta, theory of a mode, order; stiff bodies that spin."""
+"""energy_momentum(rho_inf=...): no growth of energy, momenta, theory of a mode, order; stiff bodies that spin."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def spun(E, law=None, cells=(2, 1, 1), worlds=1):
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     law = law or wf.SVK(E=E, nu=0.3, density=1000.0)
     bar = b.add_solid(wf.mesh.box((0.5, 0.2, 0.1), cells=cells), material=law, name="bar")
-    b.set_initial(bar, velocity=lambda X: np.cross(OMEGA, X - (0.25, 0.1, 0.05)))
+    b.set_initial(bar, velocity=lambda X: np.cross(OMEGA, X - (0.25, 0.1, 0.05)) + (1.0, -0.5, 0.3))
     return b.finalize(device="cpu", worlds=worlds)
 
 
@@ -66,7 +66,8 @@ def test_a_free_bar_gains_no_energy_and_keeps_its_momenta(E, turn, steps):
     assert abs(e["ledger_residual"]) < 1e-10 * start
 
 
-@pytest.mark.parametrize("turn", [0.2, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("turn", [0.2, 1.0])
 def test_a_rotor_on_a_joint_gains_no_energy(turn):
     sim = wf.Simulation(rotor(1e9), dt=turn / SPEED, integrator=LOSSY, solver=TIGHT, constraint_tol=1e-13)
     last = energy(sim)
@@ -87,11 +88,11 @@ def strains(body, u, rule):
     return 0.5 * (np.swapaxes(F, 2, 3) @ F - np.eye(3)), det * rule.weights
 
 
-@pytest.mark.parametrize("rho", [0.8, 0.0])
-def test_the_integrator_takes_chi_half_of_the_strains_change(rho):
+@pytest.mark.parametrize(("rho", "eta"), [(0.8, 0.0), (0.0, 0.0), pytest.param(0.8, 50.0, marks=pytest.mark.slow)])
+def test_the_integrator_takes_chi_half_of_the_strains_change(rho, eta):
     """The ledger against (chi/2) int dE : C : dE by numpy, step by step, beside damping, which stays `viscous`."""
     E, nu = 1e6, 0.3
-    law = wf.SVK(E=E, nu=nu, density=1000.0, damping=wf.KelvinVoigt(50.0, 30.0))
+    law = wf.SVK(E=E, nu=nu, density=1000.0, damping=wf.KelvinVoigt(eta, 0.6 * eta) if eta else None)
     model = spun(E, law, cells=(1, 1, 1))
     sim = wf.Simulation(model, dt=0.3 / SPEED, integrator=wf.EnergyMomentum(rho_inf=rho), solver=TIGHT)
     (body,), (block,) = model.bodies, model.blocks
@@ -104,7 +105,7 @@ def test_the_integrator_takes_chi_half_of_the_strains_change(rho):
         dE = now - before
         square, trace = np.einsum("eqij,eqij->eq", dE, dE), np.trace(dE, axis1=2, axis2=3)
         expected += 0.5 * chi * np.sum(w * (lam * trace**2 + 2 * mu * square))
-        damped += np.sum(w * (30.0 * trace**2 + 2 * 50.0 * square)) / sim.dt
+        damped += np.sum(w * (0.6 * eta * trace**2 + 2 * eta * square)) / sim.dt
         before = now
     e = {name: values[0] for name, values in sim.energies().items()}
     assert e["integrator"] == pytest.approx(expected, rel=1e-8)
@@ -113,7 +114,7 @@ def test_the_integrator_takes_chi_half_of_the_strains_change(rho):
 
 @pytest.mark.parametrize(
     ("family", "law"),
-    [("T4", "neo_hookean"), pytest.param("3243 tied", "svk", marks=pytest.mark.slow),
+    [("T10", "svk"), pytest.param("T4", "neo_hookean", marks=pytest.mark.slow), pytest.param("3243 tied", "svk", marks=pytest.mark.slow),
      pytest.param("T10", "mooney_rivlin", marks=pytest.mark.slow),
      pytest.param("3443 tied", "svk", marks=pytest.mark.slow)],
 )  # fmt: skip
@@ -169,7 +170,7 @@ def test_a_step_damps_a_mode_as_theory_says(rho, turn):
 
 
 def test_theory_has_its_radius_and_no_step_grows():
-    """The least radius lies near omega h = 2/sqrt(chi); far beyond it velocities alone are left, which nothing damps."""
+    """Far beyond the step strains fall by rho a step, and velocities, which nothing damps there, change their sign."""
     for rho in (0.0, 0.5, 0.8, 0.9):
         chi = (1 - rho) / (1 + rho)
         radii = {
@@ -254,7 +255,7 @@ def most_newton(model, turn, steps, **options):
     return max(int(report.newton[0]) for report in reports)
 
 
-@pytest.mark.parametrize(("E", "most"), [(1e6, 4), (1e9, 6), (1e12, 10)])
+@pytest.mark.parametrize(("E", "most"), [(1e6, 4), (1e9, 5), (1e12, 7)])
 def test_stiff_bodies_take_few_iterations(E, most):
     """A bar that spins by 0.1 rad a step; fails on 8934ce7: 7, 32 and 151 iterations, the last in halved steps."""
     assert most_newton(spun(E, cells=(4, 2, 1)), 0.1, 10) <= most
@@ -268,7 +269,7 @@ def test_every_way_to_solve_takes_few_iterations(options):
 
 
 def test_a_stiff_rotor_on_a_joint_takes_few_iterations():
-    assert most_newton(rotor(1e12), 0.1, 10) <= 12
+    assert most_newton(rotor(1e12), 0.1, 10) <= 7
 
 
 @pytest.mark.slow
@@ -277,16 +278,16 @@ def test_stiff_bodies_of_every_family_take_few_iterations(family, monkeypatch):
     monkeypatch.setitem(tumble.__globals__["LAWS"], "svk", wf.SVK(E=1e12, nu=0.3, density=1000.0))
     model = tumble(family, "svk", stretch=0.0)
     sim = wf.Simulation(model, dt=0.1 / RATE, integrator="energy_momentum")
-    assert max(int(sim.step().newton[0]) for _ in range(10)) <= 12
+    assert max(int(sim.step().newton[0]) for _ in range(10)) <= 8
 
 
 def test_a_slow_spin_takes_few_iterations():
-    """The same stiffness over the forces at h = 1 s: 0.1 rad/s at 1e7 Pa; fails on 8934ce7, at 1e9 Pa with 447."""
+    """0.1 rad/s and h = 1 s: as stiff beside its own forces as 1e13 Pa at 10 rad/s."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     bar = b.add_solid(wf.mesh.box((0.5, 0.2, 0.1), cells=(2, 1, 1)), material=wf.SVK(E=1e9, nu=0.3, density=1000.0))
     b.set_initial(bar, velocity=lambda X: np.cross(0.1 / SPEED * OMEGA, X - (0.25, 0.1, 0.05)))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1.0, integrator="energy_momentum")
-    assert max(int(sim.step().newton[0]) for _ in range(5)) <= 12
+    assert max(int(sim.step().newton[0]) for _ in range(5)) <= 8
 
 
 @pytest.mark.cuda
