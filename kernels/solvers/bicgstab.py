@@ -24,6 +24,8 @@ by delta^2, and E delta^2 in the geometric part would lead astray. Products have
 there, and solves go to CLOSE, for what is to be turned hides behind what is to be unstrained."""
 STALLED = 50
 """Iterations without half of the best residual after which a solve ends, with the best: from then on it may grow."""
+FOUND = 0.1
+"""Relative residual to which a solve that tells an error has to come, or it tells none."""
 STRICT = 1.0e-6
 """Relative residual of solves that tell an error."""
 
@@ -41,6 +43,8 @@ def bicgstab_struct():
         best: wp.array(dtype=wp.float64)  # least D^-1 norm of the residual so far
         mark: wp.array(dtype=wp.float64)  # when it last halved, and the iterations since
         since: wp.array(dtype=wp.int32)
+        again: wp.array(dtype=wp.int32)  # the solve stalled, and begins once more from its best
+        any_again: wp.array(dtype=wp.int32)  # [1]
         going: wp.array(dtype=wp.int32)  # the solve goes on after this iteration
         sums: wp.array2d(dtype=wp.float64)  # [BICGSTAB_ROWS, world]; after the first product r^.v alone
 
@@ -242,6 +246,32 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             ctl.active[world] = 0
 
     @wp.kernel(module=module)
+    def finish(newton: Newton, ctl: Control, bi: Recursion, first: int):
+        """Which worlds begin once more; `first`: they may."""
+        world = wp.tid()
+        bi.again[world] = 0
+        if newton.active[world] == 0 or ctl.iterations[world] == 0:
+            return
+        if not ctl.norm[world] <= bi.best[world]:
+            ctl.norm[world] = bi.best[world]
+        if first != 0 and ctl.norm[world] > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations:
+            bi.again[world] = 1
+            wp.atomic_max(bi.any_again, 0, 1)
+        elif newton.strict[world] != 0 and not ctl.norm[world] <= f64(FOUND) * ctl.first_norm[world]:
+            ctl.negative[world] = 1
+
+    @wp.kernel(module=module)
+    def begin_again(newton: Newton, ctl: Control, bi: Recursion):
+        """r^ = B r anew, with r of the best."""
+        world = wp.tid()
+        if bi.again[world] != 0 and ctl.sums[0, world] != f64(0.0) and wp.isfinite(ctl.sums[0, world]):
+            bi.rho[world] = ctl.sums[0, world]
+            bi.mark[world] = bi.best[world]
+            bi.since[world] = 0
+            ctl.active[world] = wp.where(newton.relative[world] > f64(FAR), 2, 1)
+            wp.atomic_max(ctl.any_active, 0, 1)
+
+    @wp.kernel(module=module)
     def take_best(
         newton: Newton,
         ctl: Control,
@@ -269,4 +299,6 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         second_step=second_step,
         close=close,
         take_best=take_best,
+        finish=finish,
+        begin_again=begin_again,
     )

@@ -23,7 +23,7 @@ class BiCGStab(PCG):
         super().__init__(*args, **options)
         m, w = self.model, self.work
         self.recursion = bicgstab_kernels(m.dtype, m.terms.traits.gated)
-        self.control = w.struct(bicgstab_struct(), m.worlds, sums=(BICGSTAB_ROWS, m.worlds))
+        self.control = w.struct(bicgstab_struct(), m.worlds, sums=(BICGSTAB_ROWS, m.worlds), any_again=(1,))
         field = (m.worlds, m.slots), m.types.vec3
         self.shadow, self.y, self.t = (w.array(f"bicgstab {name}", *field) for name in ("shadow", "y", "t"))
         self.best = [w.array(f"bicgstab best {name}", *field) for name in ("x", "r")]
@@ -32,8 +32,26 @@ class BiCGStab(PCG):
         return super().modules() | {self.recursion.module}
 
     def _run(self) -> None:
+        w, k, launch, bi = self.work, self.recursion, self.launch, self.control
+        launch(k.begin, self.model.worlds, [w.newton, w.pcg, bi])
+        self._recur()
+        bi.any_again.zero_()
+        launch(k.finish, self.model.worlds, [w.newton, w.pcg, bi, 1])
+        with launch.rare():
+            wp.capture_if(bi.any_again, self._begin_again)
+
+    def _begin_again(self) -> None:
+        """Go on from the best of a solve that stalled."""
+        w, k, launch, bi = self.work, self.recursion, self.launch, self.control
+        self._precondition(w.r, w.z, bi.again)
+        w.pcg.any_active.zero_()
+        launch(k.begin_again, self.model.worlds, [w.newton, w.pcg, bi])
+        self._recur()
+        launch(k.finish, self.model.worlds, [w.newton, w.pcg, bi, 0])
+
+    def _recur(self) -> None:
+        """Iterate from r and z = B r, and take the best."""
         w, k, launch = self.work, self.recursion, self.launch
-        launch(k.begin, self.model.worlds, [w.newton, w.pcg, self.control])
         launch(k.first_direction, self.dim, [w.pcg, w.z, w.r, w.direction, self.shadow, w.p, *self.best])
         wp.capture_while(w.pcg.any_active, self._iterate)
         launch(k.take_best, self.dim, [w.newton, w.pcg, self.control, *self.best, w.direction, w.r])
