@@ -1,8 +1,9 @@
 """BiCGStab (van der Vorst 1992) on H p = -g with an unsymmetric H, preconditioned from the right, per world.
 
-With r^ = B r_0 its first half is a step of conjugate gradients where H is symmetric; the second takes the least D^-1 norm
-of the residual, which Newton's method judges by. Vector kernels run over [world, slot]; scalar logic runs with one thread
-per world. The conjugate gradients' control serves: sums[0] is r.B r of the vector last preconditioned, sums[1] r.D^-1 r.
+With r^ = B r_0 its first half is a step of conjugate gradients where H is symmetric; the second takes the least D^-1
+norm of the residual, which Newton's method judges by. Vector kernels run over [world, slot]; scalar logic runs with one
+thread per world. The conjugate gradients' control serves: sums[0] is r.B r of the vector last preconditioned, sums[1]
+r.D^-1 r; `active` is 2 where products take the stress at the start of the step.
 """
 
 import functools
@@ -19,9 +20,9 @@ __all__ = ["BICGSTAB_ROWS", "bicgstab_kernels", "bicgstab_struct"]
 BICGSTAB_ROWS = 4
 """Rows of `second_rows`."""
 FAR, CLOSE = 0.1, 1.0e-8
-"""Relative residual from which the stress of an iterate says nothing: a rotation that is off by delta strains a stiff body
-by delta^2, and E delta^2 in the geometric part would lead astray. Products have the stress at the start of the step
-there, and solves go to CLOSE, for what is to be turned hides behind what is to be unstrained."""
+"""Relative residual above which the stress of an iterate is no guide: a rotation that is off by delta strains a stiff
+body by delta^2, and E delta^2 in the geometric part would lead astray. Products have the stress at the start of the
+step there, and solves go to CLOSE, as the residual of a rotation is small beside that of strains."""
 STALLED = 50
 """Iterations without half of the best residual after which a solve ends, with the best: from then on it may grow."""
 FOUND = 0.1

@@ -302,8 +302,9 @@ class Constraints(Term):
         mul = multiplier_struct()()
         for name in ("value", "target", "last", "scale", "force", "change", "trial", "merit", "excess", "stiffness"):
             setattr(mul, name, zeros((B, con.count), wp.float64))
-        for name in ("gradient", "ahead", "product"):
+        for name in ("gradient", "product"):
             setattr(mul, name, zeros((B, 3 * con.count), wp.vec3d))
+        mul.ahead = mul.gradient
         mul.rows = zeros((TERM_ROWS, B, con.count), wp.float64)
         mul.violation = zeros((B, m.component_count), wp.float64)
         if multipliers is not None:

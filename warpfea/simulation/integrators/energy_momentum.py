@@ -4,8 +4,8 @@ M (v - v_n)/h + f(q_n, q) = f(t_n + h/2) with q = q_n + h/2 (v_n + v), and inter
 which the strain energy changes: see kernels/elements/conserving.py. Constraints hold at the end of the step and act
 along their gradient in its middle.
 
-With rho_inf < 1 stresses have (chi/2) C0 : (E_{n+1} - E_n) besides, chi = (1 - rho_inf)/(1 + rho_inf): the dissipation of
-stresses of the energy-decaying scheme of Armero and Romero (2001), without that of velocities.
+With rho_inf < 1 stresses have (chi/2) C0 : (E_{n+1} - E_n) besides, chi = (1 - rho_inf)/(1 + rho_inf): the dissipation
+of stresses of the energy-decaying scheme of Armero and Romero (2001), without that of velocities.
 """
 
 import math
