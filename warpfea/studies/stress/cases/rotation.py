@@ -159,13 +159,13 @@ def _energy(setting: Setting, body: str, scheme: str, turn: float, E: float, ste
     limits = {}
     bound = GROWTH
     if scheme.startswith("energy_momentum"):
-        bound = 1e-2 if setting.single else 1e-8
+        bound = 1e-2 if setting.single else 1e-6
         if body == "free" and not setting.single:
             now = momenta()
             size = float(np.linalg.norm(L))
             limits = {
                 "momentum": (float(np.linalg.norm(now[0] - p)) / size, 1e-10),
-                "angular momentum": (float(np.linalg.norm(now[1] - L)) / size, 1e-8),
+                "angular momentum": (float(np.linalg.norm(now[1] - L)) / size, 1e-6),
             }
     return Answer(most, bound, "its energy at the start", **effort.told, limits=limits, drift=energy() / first - 1.0,
                   note=f"keeps {energy() / first:.6f} of its energy")  # fmt: skip
