@@ -19,7 +19,7 @@ def marked(cases):
 
 
 def simulate(model, dt=DT, solver=TIGHT, **options):
-    return wf.Simulation(model, dt=dt, integrator="energy_momentum", solver=solver, **options)
+    return wf.Simulation(model, dt=dt, solver=solver, **{"integrator": "energy_momentum", **options})
 
 
 # the operator
@@ -34,15 +34,12 @@ def residual_at(sim, v):
     return w.g.numpy()[0].copy()
 
 
-@pytest.mark.parametrize("operator", ["elements", "matrix"])
-@pytest.mark.parametrize(
-    ("family", "law"), marked([("T10", "svk"), ("T4", "neo_hookean"), ("3243 tied", "svk"), ("3443 tied", "svk")])
-)
-def test_the_operator_differs_from_the_derivative_by_the_turn_of_a_step(family, law, operator):
-    """H - dg/dv is B_mid^T D (B_mid - B_1)/2: it falls with the step at a fixed spin, and all else is exact."""
+def errors_of_operator(family, law, operator, integrator="energy_momentum"):
+    """|H p - dg/dv p| over |dg/dv p| without the mass, for steps of DT and DT / 4."""
     far = []
     for dt in (DT, DT / 4):
-        sim = simulate(tumble(family, law), dt=dt, solver=wf.NewtonPCG(operator=operator), capture=False)
+        solver = wf.NewtonPCG(operator=operator)
+        sim = simulate(tumble(family, law), dt=dt, solver=solver, capture=False, integrator=integrator)
         sim.step(round(0.02 / dt))
         w, residual = sim.stepper.work, sim.stepper.newton.residual
         v = sim.state.velocity.numpy()[0]
@@ -64,13 +61,36 @@ def test_the_operator_differs_from_the_derivative_by_the_turn_of_a_step(family, 
         H = w.Hp.numpy()[0]
         mass = (sim.model.mass_matrix() @ p.ravel()).reshape(p.shape) / dt
         far.append(np.linalg.norm(H - numeric) / np.linalg.norm(numeric - mass))
+    return far
+
+
+@pytest.mark.parametrize("integrator", ["energy_momentum", "energy_momentum(rho_inf=0.5)"])
+@pytest.mark.parametrize(
+    ("family", "law"), marked([("T10", "svk"), ("T4", "svk"), ("3243 tied", "svk"), ("3443 tied", "svk")])
+)
+def test_the_operator_is_the_derivative(family, law, integrator):
+    """B_mid^T D B_1 of stresses that are linear in E; 8934ce7 has B_mid on both sides, off by 0.1 here."""
+    assert max(errors_of_operator(family, law, "elements", integrator)) < 1e-8
+
+
+def test_the_operator_of_a_discrete_gradient_differs_by_the_strain_of_a_step():
+    """Its derivative has the moduli half-way in the place of their mean: an error of the second order in the step."""
+    far = errors_of_operator("T4", "neo_hookean", "elements")
+    assert far[0] < 0.05
+    assert far[0] > 3.0 * far[1]
+
+
+@pytest.mark.parametrize(("family", "law"), marked([("T10", "svk"), ("3243 tied", "svk"), ("3443 tied", "svk")]))
+def test_the_matrix_differs_from_the_derivative_by_the_turn_of_a_step(family, law):
+    """H - dg/dv is B_mid^T D (B_mid - B_1)/2: it falls with the step at a fixed spin, and all else is exact."""
+    far = errors_of_operator(family, law, "matrix")
     assert far[0] < 0.15
     assert 3.0 < far[0] / far[1] < 5.5
 
 
 @pytest.mark.parametrize(("family", "law"), [("T10", "svk"), ("T4", "neo_hookean"), ("3243 tied", "svk")])
 def test_columns_and_whole_elements_give_one_matrix(family, law):
-    """What a GPU launches and what the CPU does, here on the CPU both; and the product with it."""
+    """What a GPU launches and what the CPU does, here on the CPU both."""
     sim = simulate(tumble(family, law), solver=wf.NewtonPCG(operator="matrix"), capture=False)
     sim.step(3)
     w, residual = sim.stepper.work, sim.stepper.newton.residual
@@ -84,20 +104,6 @@ def test_columns_and_whole_elements_give_one_matrix(family, law):
             matrix.assemble(w.u_stage, factors, active, values, projected=projected)
             made.append(matrix.matrix(values))
         assert abs(made[0] - made[1]).max() < 2e-14 * abs(made[0]).max()
-    p = np.random.default_rng(2).uniform(-1, 1, (1, sim.model.slots, 3))
-    by_elements = simulate(sim.model, solver=wf.NewtonPCG(operator="elements"), capture=False)
-    other = by_elements.stepper.work
-    for name in ("u", "u_stage", "v_stage", "v"):
-        getattr(other, name).assign(getattr(w, name))
-    for name in ("mass_factor", "dq_dv"):
-        getattr(other.step, name).assign(getattr(w.step, name))
-    residual.take(active)
-    results = []
-    for work, of in ((w, residual), (other, by_elements.stepper.newton.residual)):
-        work.p.assign(p)
-        of.product(work.p, work.Hp, active)
-        results.append(work.Hp.numpy())
-    np.testing.assert_allclose(results[0], results[1], atol=1e-12 * np.abs(results[0]).max())
 
 
 # conservation
@@ -173,7 +179,7 @@ def test_a_loose_tolerance_shows_as_unbalanced_work():
 
 def test_halved_steps_conserve():
     """Steps that Newton's method is not given enough iterations for are halved."""
-    sim = simulate(tumble("T10", "neo_hookean"), solver=wf.NewtonPCG(tol=1e-12, max_newton=8))
+    sim = simulate(tumble("T10", "neo_hookean"), solver=wf.NewtonPCG(tol=1e-12, max_newton=3))
     watch, halvings = Conserved(sim), 0
     for _ in range(40):
         halvings += int(sim.step().halvings[0])

@@ -69,7 +69,7 @@ from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
 from .simulation.checkpoint import Checkpoint  # noqa: E402
-from .simulation.integrators import GeneralizedAlpha  # noqa: E402
+from .simulation.integrators import EnergyMomentum, GeneralizedAlpha  # noqa: E402
 from .simulation.observations import Observations  # noqa: E402
 from .simulation.simulation import Simulation, StepReport  # noqa: E402
 from .simulation.statics import solve_static  # noqa: E402
@@ -89,6 +89,7 @@ __all__ = [
     "ConvergenceError",
     "Cylinder",
     "ElementSet",
+    "EnergyMomentum",
     "Error",
     "GIFWriter",
     "GeneralizedAlpha",

@@ -297,7 +297,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
             for elem in range(first_elem + lane, clusters.start[cluster + 1], lanes):
                 dq = T(dq_dv[world])
                 scale = T(mass_factor[world]) * block.density[world % block.density.shape[0], elem]
-                product(block, pool, history, dq, scale, world, elem, elem - first_elem)
+                product(block, pool, history, dq, scale, active[world], world, elem, elem - first_elem)
             sync()
             for k in range(lane, count, lanes):
                 f = vec3()

@@ -6,6 +6,9 @@ subtracting nearly equal numbers. Of laws whose S is linear in E, S at the mean 
 of the others Gonzalez' discrete gradient (2000),
 
     S = S(E_m) + (W(E1) - W(E0) - S(E_m) : dE) dE / |dE|^2.
+
+The dissipative scheme adds (chi/2) C0 : dE (Armero and Romero 2001), which takes (chi/2) dE : C0 : dE >= 0 from a step,
+nothing from a rigid motion, and leaves both momenta alone, as any S does.
 """
 
 import functools
@@ -26,7 +29,8 @@ TINY = {"float64": 1.0e-60, "float32": 1.0e-30}
 def conserving_law(name: str, dtype: str) -> _types.SimpleNamespace:
     """Device functions of the law `name`.
 
-    mean_stress(G, D, c) is S, Pa; mean_increment(G, dE, c) approximates twice dS/dE1 : dE by the moduli at G, Pa.
+    mean_stress(G, D, c) is S, Pa; mean_increment(G, dE, c) approximates twice dS/dE1 : dE by the moduli at G, Pa;
+    rest_increment(dE, c) is C0 : dE, with moduli C0 that are positive, Pa.
     """
     p, t, m = precision(dtype), materials.tensors(dtype), materials.law(name, dtype)
     T, mat33 = p.T, p.mat33
@@ -45,7 +49,7 @@ def conserving_law(name: str, dtype: str) -> _types.SimpleNamespace:
         """S is linear in E."""
         return m.stiffness(dE, c)
 
-    return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment)
+    return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment, rest_increment=m.stiffness)
 
 
 def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNamespace:
@@ -163,4 +167,10 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
             change = change + c2 * (dA - four_thirds * trL * bent(E))
         return t.sym(Ci * (change - T(2.0) * dE * (Ci * weighted(E, c))))
 
-    return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment)
+    @wp.func
+    def rest_increment(dE: mat33, c: coef) -> mat33:
+        """C0 : dE with the moduli at rest, Pa."""
+        mu = T(2.0) * (c[0] + c[2])
+        return t.isotropic(dE, c[1] - two_thirds * mu, mu)
+
+    return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment, rest_increment=rest_increment)

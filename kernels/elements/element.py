@@ -11,7 +11,7 @@ import warp as wp
 from ..common.lanes import lane_functions, warp_low
 from ..common.types import kernel_module
 from . import materials
-from .matrix import matrix_kernels
+from .matrix import matrix_kernels, stage_name
 from .output import output_kernels
 from .points import point_functions
 
@@ -28,6 +28,7 @@ def element_kernels(
     damping: str | None,
     framed: bool = False,
     midpoint: bool = False,
+    dissipative: bool = False,
 ) -> _types.SimpleNamespace:
     """Kernels of one kind of element block.
 
@@ -40,8 +41,9 @@ def element_kernels(
         framed: the law has axes of its own at each point, `block.frame`.
         midpoint: of the conserving scheme, see `point_functions` and conserving.py; u is half-way through the step and
             v half of what u changes by. Energies and J are those at its end.
+        dissipative: of its dissipative form.
     """
-    fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint)
+    fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint, dissipative)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     NS, needs_J = fn.slots, fn.needs_J
@@ -50,7 +52,7 @@ def element_kernels(
     viscous = materials.svk(dtype)
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     form = "affine" if affine else "framed" if framed else "table"
-    name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}{'_midpoint' if midpoint else ''}"
+    name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}{stage_name(midpoint, dissipative)}"
     module = kernel_module(name)
 
     @wp.kernel(module=module)
@@ -95,7 +97,7 @@ def element_kernels(
             P = mat33()
             if wp.static(midpoint):
                 J_low = wp.min(J_low, T(1.0) + t.volume_change(local + Fdot))
-                mean = fn.mean.mean_stress(local, Fdot, c)
+                mean = fn.step_stress(block, local, Fdot, c)
                 P = mean + local * mean
                 psi += w * m.energy(local + Fdot, c)
             else:
@@ -177,7 +179,10 @@ def element_kernels(
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); of damping of the rate form only the symmetric part."""
+        """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); of damping of the rate form only the symmetric part.
+
+        `active` 2: see `point_increment`.
+        """
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -186,7 +191,7 @@ def element_kernels(
         V = Local()
         if wp.static(fn.uses_v):
             V = fn.load(block, v, world, elem)
-        f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), world, elem)
+        f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), active[world], world, elem)
         fn.store(block, f, world, elem, contribution)
 
     @wp.kernel(module=module)
@@ -224,6 +229,8 @@ def element_kernels(
                     )
                 else:
                     K = m.block(G, a, c)
+                if wp.static(dissipative):
+                    K = fn.hardening(block) * K
                 if wp.static(damping == "incremental" or damping == "rate"):
                     K = K + viscous.block(mat33() + G, a, cv)
                 entry = block.contribution_offset + i * block.count + elem
@@ -236,6 +243,6 @@ def element_kernels(
         largest_turn=largest_turn,
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,
-        **vars(matrix_kernels(dtype, law, slots, affine, damping, framed, midpoint)),
+        **vars(matrix_kernels(dtype, law, slots, affine, damping, framed, midpoint, dissipative)),
         **vars(output_kernels(fn, name, points)),
     )

@@ -14,7 +14,7 @@ from ..common.types import kernel_module, precision
 from . import materials
 from .points import point_functions
 
-__all__ = ["UNROLL", "matrix_kernels", "panels_of", "row_of", "rows_type"]
+__all__ = ["UNROLL", "matrix_kernels", "panels_of", "row_of", "rows_type", "stage_name"]
 
 WIDEST = 8
 """Most slots of a panel: eight 64-bit numbers fill the widest vector registers."""
@@ -40,18 +40,30 @@ def rows_type(dtype: str, slots: int):
     return wp.types.matrix(shape=(9, slots), dtype=precision(dtype).T)
 
 
+def stage_name(midpoint: bool, dissipative: bool) -> str:
+    """End of the names of modules of a mid-point scheme."""
+    return "_dissipative" if dissipative else "_midpoint" if midpoint else ""
+
+
 @functools.cache
 def matrix_kernels(
-    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool, midpoint: bool = False
+    dtype: str,
+    law: str,
+    slots: int,
+    affine: bool,
+    damping: str | None,
+    framed: bool,
+    midpoint: bool = False,
+    dissipative: bool = False,
 ) -> _types.SimpleNamespace:
     """Kernels `prepare_matrix`, `element_matrix` and `element_rows` of one kind of element block (see element.py)."""
-    fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint)
+    fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint, dissipative)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     t, m, Block, Local, coef = fn.tensors, fn.law, fn.Block, fn.Local, fn.coef
     NS, needs_J = fn.slots, fn.needs_J
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
     form = "affine" if affine else "framed" if framed else "table"
-    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{'_midpoint' if midpoint else ''}"
+    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{stage_name(midpoint, dissipative)}"
     module = kernel_module(f"{name}_matrix", max_unroll=16)
     rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
     PANELS, P, _ = panels_of(NS)
@@ -89,7 +101,7 @@ def matrix_kernels(
         S = mat33()
         if wp.static(midpoint):
             if form == 0:
-                S = fn.mean.mean_stress(local, fn.velocity_gradient(block, V, point, elem), c)
+                S = fn.step_stress(block, local, fn.velocity_gradient(block, V, point, elem), c)
         if wp.static(not needs_J):
             if wp.static(midpoint):
                 if form == 1:
@@ -114,10 +126,10 @@ def matrix_kernels(
         return F, S
 
     @wp.func
-    def elastic(F: mat33, dF: mat33, c: coef) -> mat33:
+    def elastic(block: Block, F: mat33, dF: mat33, c: coef) -> mat33:
         """dP of a law that needs J > 0; `midpoint`: without the part of S, which `point_state` gives."""
         if wp.static(midpoint):
-            return F * fn.mean.mean_increment(F - t.identity(), t.sym(wp.transpose(F) * dF), c)
+            return F * fn.step_increment(block, F - t.identity(), t.sym(wp.transpose(F) * dF), c)
         else:
             return m.increment(F - t.identity(), dF, c)
 
@@ -224,6 +236,8 @@ def matrix_kernels(
             dP = wp.outer(unit, S * h)
             if wp.static(not needs_J):
                 dS = m.stiffness(B, c)
+                if wp.static(dissipative):
+                    dS = fn.hardening(block) * dS
                 if wp.static(damping == "incremental" or damping == "rate"):
                     dS += t.isotropic(B, cv[0], cv[1])
                 dP += F * dS
@@ -233,7 +247,7 @@ def matrix_kernels(
                 if form == 1 or mixed[world] == 2:
                     dP += fn.stand_in(F, wp.outer(unit, h), c)
                 else:
-                    dP += elastic(F, wp.outer(unit, h), c)
+                    dP += elastic(block, F, wp.outer(unit, h), c)
             if wp.static(framed):
                 dP = dP * wp.transpose(block.frame[point, elem])
             dP = fn.tangent_weight(block, point, elem) * dP
@@ -253,7 +267,7 @@ def matrix_kernels(
                 matrix[world, 3 * pair + axis, elem] = out[a]
 
     @wp.func
-    def elasticity(F: mat33, S: mat33, moduli: moduli9, c: coef, positive: bool, w: T) -> Tensor:
+    def elasticity(block: Block, F: mat33, S: mat33, moduli: moduli9, c: coef, positive: bool, w: T) -> Tensor:
         """w dP_ik/dF_jl at [3 i + k, 3 j + l]: of S, of stresses linear in E (`moduli`), and of laws that need J > 0.
 
         With the shear moduli G and the other moduli D of `moduli`, the first two give S_kl delta_ij + D_kl F_ik F_jl +
@@ -297,7 +311,7 @@ def matrix_kernels(
                     if positive:
                         dP = fn.stand_in(F, dF, c)
                     else:
-                        dP = elastic(F, dF, c)
+                        dP = elastic(block, F, dF, c)
                     for i in range(3):
                         for k in range(3):
                             A[3 * i + k, 3 * j + l] = A[3 * i + k, 3 * j + l] + dP[i, k]
@@ -333,6 +347,8 @@ def matrix_kernels(
         moduli = t.moduli9()
         if wp.static(not needs_J):
             moduli = m.moduli(c)
+            if wp.static(dissipative):
+                moduli = fn.hardening(block) * moduli
         if wp.static(damping == "incremental" or damping == "rate"):
             moduli += t.isotropic_moduli(cv[0], cv[1])
         U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
@@ -357,7 +373,8 @@ def matrix_kernels(
                     h[a] = block.gradient[point, a, elem]
                 for l in range(3):
                     H[3 * (a / P) + l, a % P] = h[a][l]
-            A = elasticity(F, S, moduli, c, form == 1 or mixed[world] == 2, fn.tangent_weight(block, point, elem))
+            w = fn.tangent_weight(block, point, elem)
+            A = elasticity(block, F, S, moduli, c, form == 1 or mixed[world] == 2, w)
             for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
                 D = Products()
                 for i in range(9):

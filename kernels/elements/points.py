@@ -19,8 +19,8 @@ __all__ = ["block_struct", "point_functions"]
 
 
 @functools.cache
-def block_struct(dtype: str):
-    """The constant data of one element block, in one precision."""
+def block_struct(dtype: str, dissipative: bool = False):
+    """The constant data of one element block, in one precision; `dissipative`: see `point_functions`."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
 
@@ -46,18 +46,29 @@ def block_struct(dtype: str):
         element_offset: wp.int32
         history_offset: wp.int32
         count: wp.int32  # elements
+        if dissipative:
+            dissipation: T  # chi of conserving.py
 
     return ElementBlock
 
 
 @functools.cache
 def point_functions(
-    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool, midpoint: bool = False
+    dtype: str,
+    law: str,
+    slots: int,
+    affine: bool,
+    damping: str | None,
+    framed: bool,
+    midpoint: bool = False,
+    dissipative: bool = False,
 ) -> _types.SimpleNamespace:
     """Device functions for one kind of element block; the arguments are those of `element_kernels`.
 
-    With `midpoint` the slots' values are those half-way between both ends of a step, in the place of velocities stands
-    half of what they change by, and K is the symmetric approximation of the derivative by the values at the end.
+    With `midpoint` the slots' values are those half-way between both ends of a step, and in the place of velocities
+    stands half of what they change by. Products K p are those of the derivative by the values at the end, of stresses
+    linear in E to the last digit: forces are taken along the strains' gradients half-way, strains change along those at
+    the end. Matrices take the former for both, and are symmetric.
     """
     p = precision(dtype)
     T, mat33, sym6 = p.T, p.mat33, p.sym
@@ -65,7 +76,7 @@ def point_functions(
     m = materials.law(law, dtype)
     mean = conserving_law(law, dtype)
     uses_v = midpoint or damping == "rate"
-    Block = block_struct(dtype)
+    Block = block_struct(dtype, dissipative)
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
     Local = local_type(dtype, slots)
@@ -218,6 +229,38 @@ def point_functions(
         return J
 
     @wp.func
+    def step_stress(block: Block, G: mat33, D: mat33, c: coef) -> mat33:
+        """S of a mid-point step, Pa: that of conserving.py with its dissipation."""
+        S = mean.mean_stress(G, D, c)
+        if wp.static(dissipative):
+            S += block.dissipation * mean.rest_increment(t.sym(D + wp.transpose(G) * D), c)
+        return S
+
+    @wp.func
+    def step_increment(block: Block, G: mat33, dE: mat33, c: coef) -> mat33:
+        """What S of a mid-point step changes by, Pa, with twice a change dE of the strain at its end."""
+        dS = mean.mean_increment(G, dE, c)
+        if wp.static(dissipative):
+            dS += block.dissipation * mean.rest_increment(dE, c)
+        return dS
+
+    @wp.func
+    def start_stress(G: mat33, c: coef) -> mat33:
+        """S at the start of a mid-point step, Pa, with G there."""
+        if wp.static(needs_J):
+            return t.sym(wp.inverse(t.identity() + G) * m.stress(G, c))
+        else:
+            return m.stiffness(t.green(G), c)
+
+    @wp.func
+    def hardening(block: Block) -> T:
+        """Factor on moduli in a matrix: of a mid-point step what they are multiplied with by its dissipation."""
+        if wp.static(dissipative):
+            return T(1.0) + block.dissipation
+        else:
+            return T(1.0)
+
+    @wp.func
     def foreseen(G: mat33, dG: mat33, c: coef, dq: T) -> mat33:
         """S of the linear prediction from the iterate before, G - dG, over S at G, Pa; both in the law's axes.
 
@@ -264,24 +307,37 @@ def point_functions(
         history: wp.array2d(dtype=sym6),
         c: coef,
         dq: T,
+        form: int,
         world: int,
         point: int,
         elem: int,
     ) -> mat33:
-        """dP of a change dG at a point in the body's axes, damping included: the integrand of the tangent product."""
+        """dP of a change dG at a point in the body's axes, damping included: the integrand of the tangent product.
+
+        `form` 2, of mid-point schemes: with the stress at the start of the step in the geometric part.
+        """
         local = into_axes(block, G, point, elem)
         change = into_axes(block, dG, point, elem)
         dP = mat33()
+        along = t.identity() + local
         if wp.static(midpoint):
+            along = along + Fdot
             F = t.identity() + local
-            S = mean.mean_stress(local, Fdot, c)
-            dP = change * S + F * mean.mean_increment(local, t.sym(wp.transpose(F) * change), c)
+            S = mat33()
+            if form == 2:
+                S = start_stress(local - Fdot, c)
+            else:
+                S = step_stress(block, local, Fdot, c)
+            dP = change * S + F * step_increment(block, local, t.sym(wp.transpose(along) * change), c)
         else:
             dP = m.increment(local, change, c)
         if wp.static(damping == "incremental" or damping == "rate"):
             F = t.identity() + local
             S = t.isotropic(strain_rate(block, local, Fdot, history, dq, world, point, elem), c[LAMBDA_V], c[ETA])
-            dS = t.isotropic(t.sym(wp.transpose(F) * change), c[LAMBDA_V] / dq, c[ETA] / dq)
+            dS = t.isotropic(t.sym(wp.transpose(along) * change), c[LAMBDA_V] / dq, c[ETA] / dq)
+            if wp.static(midpoint):
+                if form == 2:
+                    S = mat33()
             dP = dP + change * S + F * dS
         if wp.static(midpoint):
             dP = T(0.5) * dP
@@ -295,17 +351,21 @@ def point_functions(
         V: Local,
         history: wp.array2d(dtype=sym6),
         dq: T,
+        form: int,
         world: int,
         elem: int,
     ) -> Local:
-        """K dU of an element: its forces for a change dU of its slots, Eqs. (35) and (54) applied to a vector."""
+        """K dU of an element: its forces for a change dU of its slots, Eqs. (35) and (54) applied to a vector.
+
+        `form`: see `point_increment`.
+        """
         c = coefficients(block, world, elem)
         f = Local()
         for point in range(block.gradient.shape[0]):
             G = gradient_of(block, U, point, elem)
             dG = gradient_of(block, dU, point, elem)
             Fdot = velocity_gradient(block, V, point, elem)
-            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, point, elem)
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, form, world, point, elem)
             f = scatter(block, f, dP, point, elem)
         return f
 
@@ -317,6 +377,7 @@ def point_functions(
         weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
         into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,
         strain_rate=strain_rate, vertex_jacobian=vertex_jacobian, point_increment=point_increment,
-        foreseen=foreseen, compression=compression, stand_in=stand_in,
+        foreseen=foreseen, compression=compression, stand_in=stand_in, step_stress=step_stress,
+        step_increment=step_increment, hardening=hardening,
         tangent_force=tangent_force,
     )  # fmt: skip

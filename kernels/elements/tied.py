@@ -11,16 +11,22 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from .load import load_functions, local_type
-from .matrix import UNROLL, panels_of, row_of, rows_type
-from .tied_block import coupling_function, tied_struct
+from .load import load_functions
+from .matrix import UNROLL, panels_of, row_of, rows_type, stage_name
+from .tied_block import coupling_function, shear_functions, tied_struct
 
 __all__ = ["tied_kernels"]
 
 
 @functools.cache
 def tied_kernels(
-    dtype: str, slots: int, ties: int, width: int, midpoint: bool = False, worlds: bool = False
+    dtype: str,
+    slots: int,
+    ties: int,
+    width: int,
+    midpoint: bool = False,
+    worlds: bool = False,
+    dissipative: bool = False,
 ) -> _types.SimpleNamespace:
     """Kernels of tied elements; they take the arguments of `element_kernels`, so that one loop launches both.
 
@@ -30,19 +36,21 @@ def tied_kernels(
         width: A couples the ties of each run of `width`.
         midpoint: of the conserving scheme: u is half-way through the step, v half of what u changes by; the shears in
             forces and products are the mean of those at both ends, and the energy is that at the end.
+        dissipative: with (chi/2) of what they change by added to the mean, see conserving.py.
         worlds: A of each world, those of one next to each other.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
-    Block = tied_struct(dtype)
-    name = f"tied_{dtype}_{slots}_{ties}_{width}{'_midpoint' if midpoint else ''}{'_worlds' if worlds else ''}"
+    Block = tied_struct(dtype, dissipative)
+    name = f"tied_{dtype}_{slots}_{ties}_{width}{stage_name(midpoint, dissipative)}{'_worlds' if worlds else ''}"
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
-    coupled = coupling_function(dtype, worlds)
-    Local = local_type(dtype, slots)
+    coupled = coupling_function(dtype, worlds, dissipative)
+    shears = shear_functions(dtype, slots, ties, dissipative)
+    Local, Ties, TieVectors = shears.Local, shears.Ties, shears.TieVectors
+    line, kinematics = shears.line, shears.kinematics
+    foreseen, step_shears = shears.foreseen, shears.step_shears
     load, store = load_functions(dtype, slots, Block)
-    Ties = wp.types.vector(length=ties, dtype=T)
-    TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
     NS, NT, W = slots, ties, width
     PANELS, P, _ = panels_of(NS)
     Row = wp.types.vector(length=P, dtype=T)
@@ -55,49 +63,20 @@ def tied_kernels(
     mixed_module = kernel_module(f"{name}_mixed")
 
     @wp.func
-    def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
-        """sum_i s_i,a u_i at a tie, with `table` the derivatives along one direction: what U adds to x_a, m."""
-        out = vec3()
-        for i in range(NS):
-            out += table[tie, i, elem] * U[i]
-        return out
-
-    @wp.func
-    def kinematics(block: Block, U: Local, elem: int):
-        """x_a, x_b (m) and the shears e (m^2) at the ties; e is formed without subtracting nearly equal numbers."""
-        first, second = TieVectors(), TieVectors()
-        e = Ties()
-        for t in range(NT):
-            a = line(block.first, U, t, elem)
-            d = line(block.second, U, t, elem)
-            first[t] = block.X_first[t, elem] + a
-            second[t] = block.X_second[t, elem] + d
-            e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, second[t])
-        return first, second, e
-
-    @wp.func
-    def foreseen(block: Block, step: Local, e: Ties, elem: int) -> Ties:
-        """The shears of the linear prediction from the iterate before, m^2; `step`: the last change of the slots, m."""
-        out = e
-        for t in range(NT):
-            out[t] = out[t] - wp.dot(line(block.first, step, t, elem), line(block.second, step, t, elem))
-        return out
-
-    @wp.func
-    def mean_shears(block: Block, D: Local, e: Ties, elem: int) -> Ties:
-        """The mean of the shears at both ends of a step, m^2: e half-way, and the slots' half change D."""
-        out = e
-        for t in range(NT):
-            out[t] = out[t] + wp.dot(line(block.first, D, t, elem), line(block.second, D, t, elem))
-        return out
-
-    @wp.func
     def half(x: T) -> T:
         """Of a stiffness: `midpoint`: what it is taken at moves by half of the end."""
         if wp.static(midpoint):
             return T(0.5) * x
         else:
             return x
+
+    @wp.func
+    def slope(block: Block, mu: T) -> T:
+        """Modulus in a matrix: `half`, and of a dissipative step (1 + chi) times that."""
+        if wp.static(dissipative):
+            return (T(1.0) + block.dissipation) * half(mu)
+        else:
+            return half(mu)
 
     @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
@@ -113,11 +92,23 @@ def tied_kernels(
         return s
 
     @wp.func
-    def tangent_force(block: Block, P: Local, x1: TieVectors, x2: TieVectors, e: Ties, world: int, elem: int) -> Local:
-        """Forces for a change P of the slots, with x_a, x_b and the shears e of the geometric part, N."""
+    def tangent_force(
+        block: Block, P: Local, D: Local, x1: TieVectors, x2: TieVectors, e: Ties, world: int, elem: int
+    ) -> Local:
+        """Forces for a change P of the slots, with x_a, x_b and the shears e of the geometric part, N.
+
+        `midpoint`: shears change along x_a and x_b at the end of the step, which D leads to.
+        """
         de = Ties()
         for t in range(NT):
-            de[t] = wp.dot(x1[t], line(block.second, P, t, elem)) + wp.dot(x2[t], line(block.first, P, t, elem))
+            a = x1[t]
+            d = x2[t]
+            if wp.static(midpoint):
+                a += line(block.first, D, t, elem)
+                d += line(block.second, D, t, elem)
+            de[t] = wp.dot(a, line(block.second, P, t, elem)) + wp.dot(d, line(block.first, P, t, elem))
+            if wp.static(dissipative):
+                de[t] = (T(1.0) + block.dissipation) * de[t]
         s = stresses(block, e, world, elem)
         ds = stresses(block, de, world, elem)
         f = Local()
@@ -153,7 +144,7 @@ def tied_kernels(
         s = Ties()
         if wp.static(midpoint):
             D = load(block, v, world, elem)
-            s = stresses(block, mean_shears(block, D, e, elem), world, elem)
+            s = stresses(block, step_shears(block, x1, x2, D, e, elem), world, elem)
             _, _, e = kinematics(block, U + D, elem)
         else:
             s = stresses(block, e, world, elem)
@@ -180,16 +171,21 @@ def tied_kernels(
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p (N): the change of `internal_force` with a change p of the slots."""
+        """K p (N): the change of `internal_force` with a change p of the slots; `active` 2: see `point_increment`."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
         U = load(block, u, world, elem)
         P = load(block, direction, world, elem)
         x1, x2, e = kinematics(block, U, elem)
+        D = Local()
         if wp.static(midpoint):
-            e = mean_shears(block, load(block, v, world, elem), e, elem)
-        store(block, tangent_force(block, P, x1, x2, e, world, elem), world, elem, contribution)
+            D = load(block, v, world, elem)
+            if active[world] == 2:
+                _, _, e = kinematics(block, U - D, elem)
+            else:
+                e = step_shears(block, x1, x2, D, e, elem)
+        store(block, tangent_force(block, P, D, x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=mixed_module)
     def mixed_product(
@@ -216,7 +212,7 @@ def tied_kernels(
         if mixed[world] == 2:
             e = Ties()
         P = load(block, direction, world, elem)
-        store(block, tangent_force(block, P, x1, x2, e, world, elem), world, elem, contribution)
+        store(block, tangent_force(block, P, Local(), x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=module)
     def diagonal_blocks(
@@ -246,7 +242,7 @@ def tied_kernels(
                     row += coupled(block, t, k, world, elem) * b[first + k]
                 K += wp.outer(b[t], row)
             entry = block.contribution_offset + i * block.count + elem
-            contribution[world, entry] = half(mu) * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
+            contribution[world, entry] = slope(block, mu) * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
 
     @wp.kernel(module=matrix_module)
     def prepare_matrix(
@@ -280,7 +276,11 @@ def tied_kernels(
         shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
         if wp.static(midpoint):
             D = load(block, v, world, elem)
-            shear += wp.dot(line(block.first, D, tie, elem), line(block.second, D, tie, elem))
+            half_a = line(block.first, D, tie, elem)
+            half_d = line(block.second, D, tie, elem)
+            shear += wp.dot(half_a, half_d)
+            if wp.static(dissipative):
+                shear += block.dissipation * (wp.dot(a, half_d) + wp.dot(d, half_a))
         if mixed[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
             factor = T(dq_dv[world]) * T(dq_dv[world])
@@ -328,7 +328,7 @@ def tied_kernels(
         elem = index % block.count
         b = column / 3
         axis = column % 3
-        mu = half(block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
+        mu = slope(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         unit = vec3()
         unit[axis] = T(1.0)
         change = Ties()
@@ -376,7 +376,7 @@ def tied_kernels(
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        mu = half(block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
+        mu = slope(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         U = load(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         first, second, B = Slots(), Slots(), Changes()
@@ -396,7 +396,7 @@ def tied_kernels(
             e = foreseen(block, T(dq_dv[world]) * change, e, elem)
         stress = Ties()
         if wp.static(midpoint):
-            e = mean_shears(block, load(block, v, world, elem), e, elem)
+            e = step_shears(block, x1, x2, load(block, v, world, elem), e, elem)
         if form != 1 and mixed[world] != 2:
             stress = stresses(block, e, world, elem)
         if add == 0:

@@ -1,17 +1,19 @@
-"""The tables of elements with tied shears, see tied.py."""
+"""The tables of elements with tied shears, see tied.py, and the shears at their tying points."""
 
 import functools
+import types as _types
 
 import warp as wp
 
 from ..common.types import precision
+from .load import local_type
 
-__all__ = ["coupling_function", "tied_struct"]
+__all__ = ["coupling_function", "shear_functions", "tied_struct"]
 
 
 @functools.cache
-def tied_struct(dtype: str):
-    """The constant data of a block of tied elements, in one precision."""
+def tied_struct(dtype: str, dissipative: bool = False):
+    """The constant data of a block of tied elements, in one precision; `dissipative`: see `tied_kernels`."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
@@ -30,14 +32,16 @@ def tied_struct(dtype: str):
         element_offset: wp.int32
         history_offset: wp.int32
         count: wp.int32
+        if dissipative:
+            dissipation: T  # chi of conserving.py
 
     return TiedBlock
 
 
 @functools.cache
-def coupling_function(dtype: str, worlds: bool) -> wp.Function:
+def coupling_function(dtype: str, worlds: bool, dissipative: bool = False) -> wp.Function:
     """The device function of an entry of A; `worlds`: of a world's own."""
-    T, Block = precision(dtype).T, tied_struct(dtype)
+    T, Block = precision(dtype).T, tied_struct(dtype, dissipative)
 
     @wp.func
     def coupled(block: Block, tie: int, k: int, world: int, elem: int) -> T:
@@ -48,3 +52,66 @@ def coupling_function(dtype: str, worlds: bool) -> wp.Function:
             return block.coupling[tie, k, elem]
 
     return coupled
+
+
+@functools.cache
+def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False) -> _types.SimpleNamespace:
+    """Device functions of the shears; arguments as those of `tied_kernels`."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    Block, Local = tied_struct(dtype, dissipative), local_type(dtype, slots)
+    Ties = wp.types.vector(length=ties, dtype=T)
+    TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
+    NS, NT = slots, ties
+
+    @wp.func
+    def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
+        """sum_i s_i,a u_i at a tie, with `table` the derivatives along one direction: what U adds to x_a, m."""
+        out = vec3()
+        for i in range(NS):
+            out += table[tie, i, elem] * U[i]
+        return out
+
+    @wp.func
+    def kinematics(block: Block, U: Local, elem: int):
+        """x_a, x_b (m) and the shears e (m^2) at the ties; e is formed without subtracting nearly equal numbers."""
+        first, second = TieVectors(), TieVectors()
+        e = Ties()
+        for t in range(NT):
+            a = line(block.first, U, t, elem)
+            d = line(block.second, U, t, elem)
+            first[t] = block.X_first[t, elem] + a
+            second[t] = block.X_second[t, elem] + d
+            e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, second[t])
+        return first, second, e
+
+    @wp.func
+    def foreseen(block: Block, step: Local, e: Ties, elem: int) -> Ties:
+        """The shears of the linear prediction from the iterate before, m^2; `step`: the last change of the slots, m."""
+        out = e
+        for t in range(NT):
+            out[t] = out[t] - wp.dot(line(block.first, step, t, elem), line(block.second, step, t, elem))
+        return out
+
+    @wp.func
+    def mean_shears(block: Block, D: Local, e: Ties, elem: int) -> Ties:
+        """The mean of the shears at both ends of a step, m^2: e half-way, and the slots' half change D."""
+        out = e
+        for t in range(NT):
+            out[t] = out[t] + wp.dot(line(block.first, D, t, elem), line(block.second, D, t, elem))
+        return out
+
+    @wp.func
+    def step_shears(block: Block, x1: TieVectors, x2: TieVectors, D: Local, e: Ties, elem: int) -> Ties:
+        """The shears that the stresses of a step belong to, m^2: their mean, and chi/2 of what they change by."""
+        out = mean_shears(block, D, e, elem)
+        if wp.static(dissipative):
+            for t in range(NT):
+                change = wp.dot(x1[t], line(block.second, D, t, elem)) + wp.dot(x2[t], line(block.first, D, t, elem))
+                out[t] = out[t] + block.dissipation * change
+        return out
+
+    return _types.SimpleNamespace(
+        Local=Local, Ties=Ties, TieVectors=TieVectors, line=line, kinematics=kinematics, foreseen=foreseen,
+        step_shears=step_shears,
+    )  # fmt: skip

@@ -131,6 +131,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
         history: wp.array2d(dtype=sym6),
         dq: T,
         scale: T,
+        form: int,
         world: int,
         elem: int,
         at: int,
@@ -158,7 +159,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
             Fdot = mat33()
             if wp.static(rate):
                 Fdot = (rate_H + T(4.0) * s * spokes(pool, V, at, e)) * J0_inv
-            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, point, elem)
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, form, world, point, elem)
             w = T(4.0) * dq * s * block.weight[point, 0] * block.det_J0[elem]
             Q = w * dP * wp.transpose(J0_inv)
             B += T(0.25) * Q
@@ -175,7 +176,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
             Fdot = mat33()
             if wp.static(rate):
                 Fdot = central(pool, V, at) * inverse_jacobian(block, elem)
-            dP = point_increment(block, G, dG, Fdot, history, c, dq, world, 0, elem)
+            dP = point_increment(block, G, dG, Fdot, history, c, dq, form, world, 0, elem)
             R += dq * block.weight[0, 0] * block.det_J0[elem] * dP * wp.transpose(inverse_jacobian(block, elem))
         finish(block, pool, scale, B, R, at)
 

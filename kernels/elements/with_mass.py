@@ -6,6 +6,7 @@ import warp as wp
 
 from ..common.types import kernel_module
 from .cluster import DIRECTION, U, V, cluster_functions
+from .matrix import stage_name
 from .points import point_functions
 from .vertex import vertex_product
 
@@ -22,6 +23,7 @@ def with_mass_kernel(
     vertex: bool,
     size: int,
     midpoint: bool = False,
+    dissipative: bool = False,
 ) -> wp.Kernel:
     """The kernel `with_mass_product` of one kind of straight elements.
 
@@ -32,16 +34,16 @@ def with_mass_kernel(
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         vertex: 10-node tetrahedra with a rule that kernels/elements/vertex.py handles.
         size: elements of a cluster.
-        midpoint: of the conserving scheme, see `point_functions`.
+        midpoint, dissipative: of the conserving scheme, see `point_functions`.
     """
-    fn = point_functions(dtype, law, slots, True, damping, False, midpoint)
+    fn = point_functions(dtype, law, slots, True, damping, False, midpoint, dissipative)
     T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
     Block, Local, NS = fn.Block, fn.Local, fn.slots
     shared = cluster_functions(dtype, size, slots, 3 if fn.uses_v else 2)
     Pool = shared.Pool
     # unrolled loops over slots keep them in registers; the loops over points are longer and stay loops
     form = "vertex" if vertex else "affine"
-    name = f"with_mass_{dtype}_{law}_{slots}_{points}_{form}_{damping}_{size}{'_midpoint' if midpoint else ''}"
+    name = f"with_mass_{dtype}_{law}_{slots}_{points}_{form}_{damping}_{size}{stage_name(midpoint, dissipative)}"
     module = kernel_module(name, max_unroll=16, block_dim=size)
 
     if vertex:
@@ -59,7 +61,15 @@ def with_mass_kernel(
 
         @wp.func
         def product(
-            block: Block, pool: Pool, history: wp.array2d(dtype=sym6), dq: T, scale: T, world: int, elem: int, at: int
+            block: Block,
+            pool: Pool,
+            history: wp.array2d(dtype=sym6),
+            dq: T,
+            scale: T,
+            form: int,
+            world: int,
+            elem: int,
+            at: int,
         ):
             """Set the forces (scale M + dq K) p of element `at` of a cluster."""
             u = fetch_all(block, pool, U, at)
@@ -67,7 +77,7 @@ def with_mass_kernel(
             v = Local()
             if wp.static(fn.uses_v):
                 v = fetch_all(block, pool, V, at)
-            f = fn.tangent_force(block, u, du, v, history, dq, world, elem)
+            f = fn.tangent_force(block, u, du, v, history, dq, form, world, elem)
             first = shared.fetch(pool, DIRECTION, 0, at)
             for i in range(NS):
                 a = vec3()

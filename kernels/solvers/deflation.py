@@ -184,7 +184,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         """J z."""
         world, row = wp.tid()
         if active[world] != 0:
-            mul.restricted[world, row] = directional(con, mul, z, world, row)
+            mul.restricted[world, row] = directional(con, mul.gradient, z, world, row)
 
     @wp.kernel(module=module)
     def solve_clusters(con: Constraints, mul: Multipliers, active: wp.array(dtype=wp.int32)):

@@ -27,6 +27,8 @@ CLOSING = 4
 """Iterations in which constraints are closed to what accelerations need, where `constraint_tol` asks for less."""
 NEAR = 1.0e3
 """Roundings of the positions, as they change the residual, within which a stall may be put down to rounding."""
+NEAR_MIDPOINT = 4.0
+"""The same of mid-point schemes, whose unsymmetric linear solves may stall long before rounding does."""
 SETTLING = 10.0
 """A residual can only be at its floor when the last step was below this many accepted errors."""
 FAR = 3
@@ -50,6 +52,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     f64 = wp.float64
     Control = control_struct()
     stored, gated, midpoint, walls = traits.stored, traits.gated, traits.midpoint, traits.walls
+    BOUND = NEAR_MIDPOINT if midpoint else NEAR
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
@@ -218,8 +221,8 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         limit = ctl.max_iterations * patience(ctl, world)
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
         alike = f64(ALIKE) * ctl.eps
-        near = ctl.floor_excess[world] <= f64(NEAR)
-        if not near and ctl.floor_excess[world] < f64(1.0e300):
+        near = ctl.floor_excess[world] <= f64(BOUND)
+        if wp.static(not midpoint) and not near and ctl.floor_excess[world] < f64(1.0e300):  # there g.p is no energy
             near = step <= alike * alike * energy
         if wp.static(walls):
             # gaps of bodies that glide are rounded as places are, and there may be no other force
@@ -239,7 +242,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def fail(ctl: Control, world: int, why: int):
         """No step was found. Where rounding alone may explain that, stand still and ask for the error that is left."""
-        near = ctl.floor_excess[world] <= f64(NEAR) and ctl.strict_count[world] < TRIES
+        near = ctl.floor_excess[world] <= f64(BOUND) and ctl.strict_count[world] < TRIES
         enough = False
         if wp.static(gated):  # only accelerations ask for more, and rounding does not give it
             if ctl.constraint_pace > f64(0.0) and ctl.relative[world] <= ctl.tol + f64(FLOOR) * ctl.eps:

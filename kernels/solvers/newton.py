@@ -168,7 +168,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 ctl.mixed[world] = wp.where(lost(ctl, world), 0, 2)
                 ctl.tame[world] = 1
                 ctl.alpha[world] = f64(0.0)
-        elif ctl.slope[world] >= f64(0.0):
+        elif ctl.slope[world] >= f64(0.0) and wp.static(not midpoint):  # |g| may fall where g.p does not
             if ctl.reused[world] != 0:
                 ctl.alpha[world] = f64(0.0)
             elif ctl.leaps[world] > 0:

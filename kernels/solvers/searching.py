@@ -53,7 +53,8 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             if wp.static(walls):
                 ctl.excursions[world] = ctl.excursions[world] + 1
             ctl.best_norm[world] = old_norm
-        ctl.mixed[world] = 1
+        if wp.static(not midpoint):
+            ctl.mixed[world] = 1
         counts = True
         if wp.static(walls):  # the way back out of an obstacle goes down in Phi all along
             counts = ctl.leaps[world] == 0 or not ctl.phi[world] < old_phi
@@ -100,13 +101,15 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
                 ctl.restoring[world] = 0
                 ctl.radius[world] = f64(SHRINK) * ctl.radius[world]
                 ctl.leaps[world] = 0
-                ctl.mixed[world] = wp.where(lost(ctl, world), 0, 2)
+                if wp.static(not midpoint):
+                    ctl.mixed[world] = wp.where(lost(ctl, world), 0, 2)
                 ctl.tame[world] = 1
         else:
             ctl.iterations[world] = ctl.iterations[world] + 1
             if ctl.tame[world] != 0:
                 ctl.tame[world] = 0
-                ctl.mixed[world] = wp.where(lost(ctl, world), 0, 1)
+                if wp.static(not midpoint):
+                    ctl.mixed[world] = wp.where(lost(ctl, world), 0, 1)
         ctl.total_iterations[world] = ctl.total_iterations[world] + 1
         ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
         ctl.reduction[world] = ratio
@@ -191,8 +194,6 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         wishes = finite and not (good or stands or reused) and ctl.searches[world] == 0
         wishes = wishes and ctl.wish[world] == 0 and ctl.negative[world] == 0
         wishes = wishes and (ctl.tame[world] == 0 or ctl.mixed[world] == 2)
-        if wp.static(midpoint):
-            wishes = False
         if wp.static(walls):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
             wishes = wishes and ctl.refreshed[world] == 0 and ctl.excursions[world] < EXCURSIONS
         if wp.static(walls and not midpoint):  # sticking sets in where Phi rises again

@@ -37,8 +37,6 @@ JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
 MOST_TURN = 1.0
 """rad that a driven angle may change by in a substep: from further off, a body may be crushed instead of turned."""
-"""Rows summed per world with an evaluation: the augmented potential with the multipliers held, with the new ones, and
-its magnitude."""
 
 
 @functools.cache
@@ -89,7 +87,8 @@ def multiplier_struct():
         value: wp.array2d(dtype=wp.float64)  # c, m
         target: wp.array2d(dtype=wp.float64)  # f
         last: wp.array2d(dtype=wp.float64)  # f of the last accepted step
-        gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector
+        gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector, where forces are taken
+        ahead: wp.array2d(dtype=wp.vec3d)  # the same at the end of the step, along which c changes
         scale: wp.array2d(dtype=wp.float64)  # of the row, negative where a turn is more than a right angle off
         force: wp.array2d(dtype=wp.float64)  # lambda, N
         change: wp.array2d(dtype=wp.float64)  # of lambda with a full Newton step
@@ -136,7 +135,7 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
     """Functions of terms and rows that several kernels share."""
     vec3 = precision(dtype).vec3
     f64, vec3d = wp.float64, wp.vec3d
-    Constraints, Multipliers = constraint_struct(), multiplier_struct()
+    Constraints = constraint_struct()
 
     @wp.func
     def combine(con: Constraints, term: int, x: wp.array2d(dtype=vec3), world: int) -> vec3d:
@@ -147,12 +146,14 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
         return s
 
     @wp.func
-    def directional(con: Constraints, mul: Multipliers, x: wp.array2d(dtype=vec3), world: int, row: int) -> f64:
+    def directional(
+        con: Constraints, slope: wp.array2d(dtype=vec3d), x: wp.array2d(dtype=vec3), world: int, row: int
+    ) -> f64:
         """(J x) of a row."""
-        s = wp.dot(mul.gradient[world, 3 * row], combine(con, 3 * row, x, world))
-        s += wp.dot(mul.gradient[world, 3 * row + 1], combine(con, 3 * row + 1, x, world))
+        s = wp.dot(slope[world, 3 * row], combine(con, 3 * row, x, world))
+        s += wp.dot(slope[world, 3 * row + 1], combine(con, 3 * row + 1, x, world))
         if con.kind[row] == TURN:
-            s += wp.dot(mul.gradient[world, 3 * row + 2], combine(con, 3 * row + 2, x, world))
+            s += wp.dot(slope[world, 3 * row + 2], combine(con, 3 * row + 2, x, world))
         return s
 
     return _types.SimpleNamespace(combine=combine, directional=directional)
@@ -184,6 +185,12 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             c = scale * wp.cos(f)
             return wp.matrix_from_rows(-s * b, c * a2 - s * a, c * b)
         return wp.matrix_from_rows(scale * b, scale * a, vec3d())
+
+    @wp.func
+    def put(into: wp.array2d(dtype=vec3d), world: int, row: int, G: wp.mat33d):
+        """Store what `gradients` gives."""
+        for side in range(3):
+            into[world, 3 * row + side] = G[side]
 
     @wp.kernel(module=module)
     def reset_violation(active: wp.array(dtype=wp.int32), mul: Multipliers):
@@ -239,34 +246,30 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
         turn = f
         if wp.static(midpoint):
+            put(mul.ahead, world, row, gradients(kind, scale, f, slope, b, a2))
             middle = A + combine(con, 3 * row, u_stage, world)
+            slope = middle
             if kind == DISTANCE:
                 slope = middle * (f64(2.0) / (wp.length(a) + wp.length(f64(2.0) * middle - a)))
-            else:
-                slope = middle
             b = B + combine(con, 3 * row + 1, u_stage, world)
             if kind == TURN:
                 a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u_stage, world)
                 if wp.isfinite(mul.last[world, row]):
                     turn = f64(0.5) * (mul.last[world, row] + f)
-        G = gradients(kind, scale, turn, slope, b, a2)
-        for side in range(3):
-            mul.gradient[world, 3 * row + side] = G[side]
+        put(mul.gradient, world, row, gradients(kind, scale, turn, slope, b, a2))
         rho = mul.stiffness[world, row]
         held = mul.force[world, row]
         new = held
-        if mul.classical == 0:
-            new = held + alpha[world] * mul.change[world, row]
         mul.value[world, row] = c
         mul.scale[world, row] = scale
         mul.target[world, row] = f
         mul.merit[world, row] = held + rho * c
+        mul.trial[world, row] = held + rho * c
+        mul.excess[world, row] = f64(0.0)
         if mul.classical == 0:
+            new = held + alpha[world] * mul.change[world, row]
             mul.trial[world, row] = new
             mul.excess[world, row] = rho * c
-        else:
-            mul.trial[world, row] = held + rho * c
-            mul.excess[world, row] = f64(0.0)
         squeeze = f64(0.5) * rho * c * c
         mul.rows[0, world, row] = held * c + squeeze
         mul.rows[1, world, row] = new * c + squeeze
@@ -294,7 +297,8 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         Ga = mul.gradient[world, 3 * row]
         Gb = mul.gradient[world, 3 * row + 1]
         Gc = mul.gradient[world, 3 * row + 2]
-        change = wp.dot(Ga, a) + wp.dot(Gb, b) + wp.dot(Gc, a2)
+        change = wp.dot(mul.ahead[world, 3 * row], a) + wp.dot(mul.ahead[world, 3 * row + 1], b)
+        change += wp.dot(mul.ahead[world, 3 * row + 2], a2)
         f = mul.target[world, row]
         scale = mul.scale[world, row]
         if kind == DISTANCE:
@@ -342,7 +346,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             return
         mul.change[world, row] = f64(0.0)
         if quiet[world, con.component[row]] == 0:
-            after = mul.value[world, row] + dq_dv[world] * directional(con, mul, direction, world, row)
+            after = mul.value[world, row] + dq_dv[world] * directional(con, mul.ahead, direction, world, row)
             mul.change[world, row] = mul.stiffness[world, row] * after
 
     @wp.kernel(module=module)
@@ -382,9 +386,8 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         if accepted[world] == 0:
             return
         moved = f64(0.0)
-        for side in range(3):
+        for term in range(3 * row, 3 * row + 3):
             s = vec3d()
-            term = 3 * row + side
             for k in range(con.start[term], con.start[term + 1]):
                 slot = con.slot[k]
                 s += con.weight[k] * vec3d(u[world, slot] - u_n[world, slot])
@@ -416,8 +419,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         worst = f64(0.0)
         for row in range(joints.first[joint], joints.last[joint]):
             worst = wp.max(worst, wp.abs(mul.value[world, row]))
-            for side in range(3):
-                term = 3 * row + side
+            for term in range(3 * row, 3 * row + 3):
                 for k in range(con.start[term], con.start[term + 1]):
                     role = joints.role[k]
                     if role != 0:

@@ -153,7 +153,7 @@ def _add_model(to: argparse.ArgumentParser) -> None:
         "--integrator",
         metavar="NAME",
         help="backward_euler, bdf2, energy_momentum or generalized_alpha, also with its option: "
-        "generalized_alpha(rho_inf=0.5)",
+        "generalized_alpha(rho_inf=0.5), energy_momentum(rho_inf=0.8)",
     )
     how.add_argument(
         "--solver",

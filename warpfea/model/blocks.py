@@ -56,18 +56,27 @@ class Block:
         """Whether the mass of an element is one table times a number."""
         return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
 
-    def kernels_for(self, dtype: str, damping: str | None, midpoint: bool = False) -> Any:
-        """The kernels of this kind of element with another form of damping; `midpoint`: of the conserving scheme."""
+    def kernels_for(self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False) -> Any:
+        """The kernels of this kind of element with another form of damping; `midpoint`: of the conserving scheme,
+        `dissipative`: of its dissipative form."""
         k = self.key
         if k.tying and midpoint:
-            return tied_kernels(dtype, self.slots, self.points, k.tying.width, midpoint, self.coupled)
+            return tied_kernels(dtype, self.slots, self.points, k.tying.width, midpoint, self.coupled, dissipative)
         if k.tying:
             return self.kernels
         if midpoint:
-            return element_kernels(
-                dtype, k.law, self.slots, self.points, k.affine, mean_damping(damping), k.framed, midpoint
-            )
+            kind = (k.law, self.slots, self.points, k.affine, mean_damping(damping), k.framed)
+            return element_kernels(dtype, *kind, midpoint, dissipative)
         return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
+
+    def dissipative_data(self, dtype: str, dissipation: float) -> Any:
+        """Its constants for the dissipative mid-point scheme, with chi of that."""
+        kind = tied_struct if self.key.tying else block_struct
+        out = kind(dtype, True)()
+        for name in kind(dtype).vars:
+            setattr(out, name, getattr(self.data, name))
+        out.dissipation = dissipation
+        return out
 
     def take_couplings(self, dtype: str) -> None:
         """Use the kernels that read couplings of each world."""
@@ -82,12 +91,14 @@ class Block:
             return self.kernels.mixed_product
         return mixed_product(dtype, k.law, self.slots, self.points, k.affine, k.framed)
 
-    def with_mass_product(self, dtype: str, damping: str | None, midpoint: bool = False) -> wp.Kernel:
-        """The kernel of the product of a with_mass block, with a form of damping; `midpoint`: see `kernels_for`."""
+    def with_mass_product(
+        self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False
+    ) -> wp.Kernel:
+        """The kernel of the product of a with_mass block, with a form of damping; others: see `kernels_for`."""
         k = self.key
         if midpoint:
-            damping = mean_damping(damping)
-            return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster, midpoint)
+            kind = (k.law, self.slots, self.points, mean_damping(damping), k.vertex, self.cluster)
+            return with_mass_kernel(dtype, *kind, midpoint, dissipative)
         return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster)
 
 

@@ -62,7 +62,7 @@ class Simulation(Digests):
             time laws and the ends of runs. None: a 64th of the first run, 1/60 s of steps without one.
         horizon: of dt="auto": s over which the error may build up. None: the first run, or 64 intervals.
         integrator: "backward_euler", "bdf2", "energy_momentum", or wf.GeneralizedAlpha(rho_inf=0.5), as a text
-            "generalized_alpha(rho_inf=0.5)".
+            "generalized_alpha(rho_inf=0.5)", or wf.EnergyMomentum(rho_inf=0.8), likewise.
         solver: "newton-pcg", "jacobi" or "direct", or options: wf.NewtonPCG(...), wf.Jacobi(...).
         constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
             float64, 1e-5 in float32.

@@ -88,10 +88,12 @@ class Stepper:
         state.register("status", wp.int32)
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
         midpoint = integrator.midpoint
-        self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint)
+        loss = integrator.dissipation
+        self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint, dissipation=loss)
         self.at = At(
             model, self.work, self.launch, state, self.u_before,
-            inertia=not integrator.static, midpoint=midpoint, accelerated=integrator.accelerated,
+            inertia=not integrator.static, midpoint=midpoint, dissipation=loss,
+            accelerated=integrator.accelerated,
         )  # fmt: skip
         self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)

@@ -237,7 +237,8 @@ class Assembled:
             mass = mass[first_world : first_world + count]
         for first, parts in enumerate(self.runs):
             for k, (block, elements) in enumerate(parts):
-                given = [block.data, u, v, base, mixed, history, dq_dv, int(projected), active]
+                data = self.work.data_of(block)
+                given = [data, u, v, base, mixed, history, dq_dv, int(projected), active]
                 if self.whole:
                     _, width, rows = panels_of(block.slots)
                     matrix = shaped(self.scratch, (count, block.count, rows), rows_type(m.dtype, width))
@@ -250,8 +251,8 @@ class Assembled:
                 points = (count, block.points, block.count)
                 launch(elements.prepare_matrix, points, [*given, lines])
                 if block.key.tying and not projected:
-                    launch(elements.prepare_stress, points, [block.data, mixed, active, lines])
-                args = [block.data, dq_dv, lines, mixed, int(projected), int(k > 0), active, matrix]
+                    launch(elements.prepare_stress, points, [data, mixed, active, lines])
+                args = [data, dq_dv, lines, mixed, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (count, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
             args += [mass, int(first == 0), mass_factor, dq_dv, active, out]

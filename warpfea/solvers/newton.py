@@ -15,6 +15,7 @@ from ..base.launch import labelled
 from ..kernels.elements.materials import ANY_J
 from ..kernels.solvers.control import FLOOR_LANES
 from ..kernels.solvers.newton import newton_kernels
+from .bicgstab import BiCGStab
 from .direct import Direct
 from .pcg import PCG
 from .preconditioner import NAMES, choose, make
@@ -178,7 +179,7 @@ class NewtonLoop:
             term.configure(at)
         operator = options.operator
         if direct and operator == "auto":  # factors are kept as long as the matrix, where nothing is added to it
-            operator = "elements" if model.terms.products else "matrix"
+            operator = "elements" if model.terms.products or at.midpoint else "matrix"
         banded = kind == "banded" and model.device.is_cuda
         assembled = kind not in ("deflated", "block-jacobi")
         self.residual = Residual(at, operator=operator, assembled=assembled, banded=banded)
@@ -186,7 +187,8 @@ class NewtonLoop:
         self.preconditioner = self.direct or make(
             kind, options.preconditioner_dtype, model, work, launch, self.residual
         )
-        self.pcg = PCG(
+        kind_of_solver = BiCGStab if at.midpoint else PCG  # its operator is unsymmetric
+        self.pcg = kind_of_solver(
             model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
         )
         self.methods = {
@@ -246,7 +248,7 @@ class NewtonLoop:
 
     def modules(self) -> set[wp.Module]:
         """Modules that the loop launches, except those of the reductions and of the terms."""
-        out = {self.kernels.module, self.pcg.kernels.module}
+        out = {self.kernels.module} | self.pcg.modules()
         return out | self.preconditioner.modules() | self.residual.modules()
 
     def run(self) -> None:

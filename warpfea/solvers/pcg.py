@@ -47,13 +47,22 @@ class PCG:
             launch(k.silence, self.dim, [w.newton, m.component_of_slot, active, w.r])
         self.translate(active)
         self.preconditioner.prepare(active)
-        self._precondition(active)
+        self._precondition(w.r, w.z, active)
         w.pcg.any_active.zero_()
+        self._run()
+        self.preconditioner.judge(active)
+        self.translate(active)
+
+    def modules(self) -> set[wp.Module]:
+        """Modules that it launches, except those of the operator and of the preconditioner."""
+        return {self.kernels.module}
+
+    def _run(self) -> None:
+        """The iteration from r and z = B r."""
+        m, w, k, launch = self.model, self.work, self.kernels, self.launch
         launch(k.begin, m.worlds, [w.newton, w.pcg])
         launch(k.first_direction, self.dim, [w.pcg, w.z, w.p, w.direction])
         wp.capture_while(w.pcg.any_active, self._iterate)
-        self.preconditioner.judge(active)
-        self.translate(active)
 
     def _iterate(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
@@ -61,12 +70,13 @@ class PCG:
         self.residual.product(w.p, w.Hp, active)
         self.residual.reduce(self.residual.curvature_rows, 1, active, w.pcg.curvature)
         launch(k.update, self.dim, [w.pcg, w.p, w.Hp, w.direction, w.r])
-        self._precondition(active)
+        self._precondition(w.r, w.z, active)
         launch(k.new_direction, self.dim, [w.pcg, w.z, w.p])
 
-    def _precondition(self, active: wp.array) -> None:
+    def _precondition(self, r: wp.array, z: wp.array, active: wp.array) -> None:
+        """z = B r; r.z and r.D^-1 r in pcg.sums."""
         w = self.work
-        self.preconditioner.apply(w.r, w.z, active)
+        self.preconditioner.apply(r, z, active)
         self.residual.reduce(w.warp_rows, 2, active, w.pcg.sums)
 
     def translate(self, active: wp.array) -> None:

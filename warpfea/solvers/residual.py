@@ -95,6 +95,8 @@ class Residual:
             cheaper = assembled
         elif banded:  # and their factors solve with it
             cheaper = True
+        if at.midpoint:  # the matrix is symmetric, and the operator of a mid-point step is not
+            cheaper = False
         self.by_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
         self.clusters: ModelClusters | None = None
         # an equilibrium takes few products per iterate, and fewer iterates with the stress of the linear prediction
@@ -106,7 +108,8 @@ class Residual:
             self.pool = make_pool(model, work, midpoint=at.midpoint)
             forms = [block.key.damping if at.inertia else None for block in model.blocks]
             self.products = [
-                block.with_mass_product(model.dtype, form, at.midpoint) for block, form in zip(model.blocks, forms)
+                block.with_mass_product(model.dtype, form, at.midpoint, at.dissipation > 0.0)
+                for block, form in zip(model.blocks, forms)
             ]
         self.keep, self.lasting = 0, False
         self.on_matrix: Callable[[wp.array, wp.array], None] | None = None
@@ -283,7 +286,17 @@ class Residual:
         if self.clusters:
             for block, kernel, (data, count) in zip(m.blocks, self.products, self.clusters.blocks):
                 lanes = block.cluster if m.device.is_cuda else 1
-                args = [block.data, data, w.u_stage, w.v_stage, w.history, w.step.mass_factor, w.step.dq_dv, active, p]
+                args = [
+                    w.data_of(block),
+                    data,
+                    w.u_stage,
+                    w.v_stage,
+                    w.history,
+                    w.step.mass_factor,
+                    w.step.dq_dv,
+                    active,
+                    p,
+                ]
                 args += [lanes, self.pool, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
         elif self.mixed:

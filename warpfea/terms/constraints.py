@@ -98,6 +98,7 @@ class Constraints(Term):
         B, M = model.worlds, con.count
         shapes: dict[str, tuple[tuple[int, ...], Any]] = {
             "gradient": ((B, 3 * M), wp.vec3d),
+            "ahead": ((B, 3 * M), wp.vec3d),
             "product": ((B, 3 * M), wp.vec3d),
             "violation": ((B, model.component_count), wp.float64),
             "block": ((B, max(con.block_count, 1)), wp.mat33d),
@@ -105,7 +106,9 @@ class Constraints(Term):
             "coupling": ((B, max(con.couple_count, 1)), wp.float64),
         }
         for name, var in multiplier_struct().vars.items():
-            if isinstance(var.type, wp.array) and name != "rows":
+            if name == "ahead" and not at.midpoint:
+                mul.ahead = mul.gradient
+            elif isinstance(var.type, wp.array) and name != "rows":
                 shape, dtype = shapes.get(name, ((B, M), wp.float64))
                 setattr(mul, name, work.array(f"Multipliers.{name}", shape, dtype))
         mul.rows = work.rows_of(self)
@@ -301,6 +304,7 @@ class Constraints(Term):
             setattr(mul, name, zeros((B, con.count), wp.float64))
         for name in ("gradient", "product"):
             setattr(mul, name, zeros((B, 3 * con.count), wp.vec3d))
+        mul.ahead = mul.gradient
         mul.rows = zeros((TERM_ROWS, B, con.count), wp.float64)
         mul.violation = zeros((B, m.component_count), wp.float64)
         if multipliers is not None:

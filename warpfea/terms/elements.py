@@ -38,7 +38,8 @@ class Elements(Term):
         """Kernels of the blocks; statics has no rates, so those without damping serve there."""
         dtype, blocks = self.model.dtype, self.model.blocks
         if at.midpoint:
-            return [b.kernels_for(dtype, b.key.damping, midpoint=True) for b in blocks]
+            lossy = at.dissipation > 0.0
+            return [b.kernels_for(dtype, b.key.damping, midpoint=True, dissipative=lossy) for b in blocks]
         return [b.kernels if at.inertia else b.kernels_for(dtype, None) for b in blocks]
 
     def modules(self, at: At) -> Iterable[wp.Module]:
@@ -51,7 +52,7 @@ class Elements(Term):
         for block, kernels in zip(m.blocks, self.kernels(at)):
             lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1
             args = [
-                block.data,
+                w.data_of(block),
                 w.u_stage,
                 w.v_stage,
                 w.history,
@@ -69,14 +70,14 @@ class Elements(Term):
         w = at.work
         for block, kernels in zip(self.model.blocks, self.kernels(at)):
             if not block.key.tying:
-                args = [block.data, at.state.displacement, w.u, active, w.newton.turned]
+                args = [w.data_of(block), at.state.displacement, w.u, active, w.newton.turned]
                 at.launch(kernels.turned_over, (w.u.shape[0], block.count), args)
 
     def measure_turn(self, at: At, p: wp.array, active: wp.array) -> None:
         """Largest gradient of a direction, into newton.turn."""
         for block, kernels in zip(self.model.blocks, self.kernels(at)):
             if not block.key.tying:
-                args = [block.data, p, active, at.work.newton.turn]
+                args = [at.work.data_of(block), p, active, at.work.newton.turn]
                 at.launch(kernels.largest_turn, (p.shape[0], block.count), args)
 
     def mixed_kernels(self) -> list[wp.Kernel]:
@@ -94,11 +95,11 @@ class Elements(Term):
         """K p of all elements into work.contribution, where products go by the elements one by one."""
         m, w = self.model, at.work
         for block, kernels in zip(m.blocks, self.kernels(at)):
-            args = [block.data, w.u_stage, w.v_stage, w.history, w.step.dq_dv, active, p, w.contribution]
+            args = [w.data_of(block), w.u_stage, w.v_stage, w.history, w.step.dq_dv, active, p, w.contribution]
             at.launch(kernels.tangent_product, (p.shape[0], block.count), args)
 
     def diagonal(self, at: At, active: wp.array) -> None:
         m, w = self.model, at.work
         for block, kernels in zip(m.blocks, self.kernels(at)):
-            args = [block.data, w.u_stage, w.step.dq_dv, active, w.block_contribution]
+            args = [w.data_of(block), w.u_stage, w.step.dq_dv, active, w.block_contribution]
             at.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)

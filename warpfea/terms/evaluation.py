@@ -61,6 +61,7 @@ class Evaluation:
             u=u,
             u_stage=u,
             v_stage=u,
+            data_of=lambda block: block.data,
             history=self._zeros((1, 1), m.types.sym),
             step=SimpleNamespace(dq_dv=wp.ones(B, dtype=wp.float64, device=m.device)),
             contribution=self._zeros((B, m.contributions), m.types.vec3),

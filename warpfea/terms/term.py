@@ -53,6 +53,7 @@ class At:
             accelerations of schemes that keep them.
         inertia: the step is dynamic; in statics there are no rates.
         midpoint: forces are those of the middle of a step, at work.u_stage and work.stage_time.
+        dissipation: chi of the dissipative form of that, see kernels/elements/conserving.py.
         accelerated: the scheme keeps accelerations.
         moved: forces are taken at another place than those before; where not, only what terms hold has changed.
         options: of the solver.
@@ -66,6 +67,7 @@ class At:
     u_before: wp.array
     inertia: bool
     midpoint: bool = False
+    dissipation: float = 0.0
     accelerated: bool = False
     moved: bool = True
     options: Any = None

@@ -22,6 +22,7 @@ from ..kernels.step.ledger import LEDGER_ROWS
 from ..kernels.terms.constraints import multiplier_struct
 
 if TYPE_CHECKING:
+    from ..model.blocks import Block
     from ..model.model import Model
 
 __all__ = ["Workspace"]
@@ -30,8 +31,11 @@ __all__ = ["Workspace"]
 class Workspace:
     """Scratch of a simulation. Features that a scene does not use get an array of one item."""
 
-    def __init__(self, model: Model, *, max_newton: int, ledger: bool, midpoint: bool = False) -> None:
+    def __init__(
+        self, model: Model, *, max_newton: int, ledger: bool, midpoint: bool = False, dissipation: float = 0.0
+    ) -> None:
         self.device = model.device
+        self.dissipation, self._dtype = dissipation, model.dtype
         self.bytes: dict[str, int] = {}
         # of arrays for some of the worlds: for how many, of so many in all
         self.chunks: dict[str, Callable[[int], int]] = {}
@@ -135,6 +139,10 @@ class Workspace:
         for name in balance_struct(model.dtype).vars:
             of_step = name in ("mass_factor", "dq_dv")
             setattr(self.balance, name, getattr(self.step if of_step else self, name))
+
+    def data_of(self, block: Block) -> Any:
+        """The constants of a block of elements as the kernels of the scheme take them."""
+        return block.dissipative_data(self._dtype, self.dissipation) if self.dissipation else block.data
 
     def reserve_blocks(self) -> None:
         """Make room for the blocks on the diagonal of elements' matrices."""

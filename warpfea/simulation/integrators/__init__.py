@@ -18,13 +18,13 @@ from ...base.errors import ModelError
 from ...base.names import did_you_mean
 from .backward_euler import BACKWARD_EULER, STATIC
 from .bdf2 import BDF2
-from .energy_momentum import ENERGY_MOMENTUM
+from .energy_momentum import EnergyMomentum
 from .generalized_alpha import GeneralizedAlpha
 from .scheme import Integrator
 
-__all__ = ["INTEGRATORS", "GeneralizedAlpha", "Integrator", "get"]
+__all__ = ["INTEGRATORS", "EnergyMomentum", "GeneralizedAlpha", "Integrator", "get"]
 
-SCHEMES = (BACKWARD_EULER, BDF2, ENERGY_MOMENTUM, GeneralizedAlpha(), STATIC)
+SCHEMES = (BACKWARD_EULER, BDF2, EnergyMomentum(), GeneralizedAlpha(), STATIC)
 INTEGRATORS = {scheme.name: scheme for scheme in SCHEMES}
 CALL = re.compile(r"(\w+)\s*\((.*)\)")
 """A name with options."""

@@ -3,14 +3,20 @@
 M (v - v_n)/h + f(q_n, q) = f(t_n + h/2) with q = q_n + h/2 (v_n + v), and internal forces that do exactly the work by
 which the strain energy changes: see kernels/elements/conserving.py. Constraints hold at the end of the step and act
 along their gradient in its middle.
+
+With rho_inf < 1 stresses have (chi/2) C0 : (E_{n+1} - E_n) besides, chi = (1 - rho_inf)/(1 + rho_inf): the dissipation
+of stresses of the energy-decaying scheme of Armero and Romero (2001), without that of velocities.
 """
+
+import math
 
 import warp as wp
 
+from ...base.errors import ModelError
 from ...kernels.step.control import Coefficients
 from .scheme import Integrator
 
-__all__ = ["ENERGY_MOMENTUM", "energy_momentum"]
+__all__ = ["EnergyMomentum", "energy_momentum"]
 
 
 @wp.func
@@ -24,4 +30,38 @@ def energy_momentum(h: wp.float64, previous: wp.float64, parameter: wp.float64):
     return c
 
 
-ENERGY_MOMENTUM = Integrator("energy_momentum", energy_momentum, order=2, takes_velocity=True, midpoint=True)
+class EnergyMomentum(Integrator):
+    """Mid-point scheme that keeps both momenta, and energy too or loses some of it, never gaining any.
+
+    Args:
+        rho_inf: factor by which a step damps strains that it does not resolve, 0 to 1: 1 keeps energy, of order 2; less
+            is of order 1 in deformations, and takes nothing from rigid motions.
+
+    Raises:
+        ModelError: rho_inf is not between 0 and 1.
+    """
+
+    def __init__(self, *, rho_inf: float = 1.0) -> None:
+        known = isinstance(rho_inf, (int, float)) and not isinstance(rho_inf, bool)
+        if not (known and math.isfinite(rho_inf) and 0.0 <= rho_inf <= 1.0):
+            raise ModelError(f"EnergyMomentum: rho_inf = {rho_inf!r} must lie between 0 and 1")
+        super().__init__(
+            "energy_momentum", energy_momentum, order=2 if rho_inf == 1.0 else 1, takes_velocity=True, midpoint=True,
+            parameter=float(rho_inf),
+        )  # fmt: skip
+
+    @property
+    def rho_inf(self) -> float:
+        """Factor on strains that a step does not resolve."""
+        return self.parameter
+
+    @property
+    def dissipation(self) -> float:
+        return (1.0 - self.parameter) / (1.0 + self.parameter)
+
+    @property
+    def label(self) -> str:
+        return self.name if self.parameter == 1.0 else f"{self.name}(rho_inf={self.parameter!r})"
+
+    def __repr__(self) -> str:
+        return f"EnergyMomentum(rho_inf={self.parameter!r})"

@@ -46,6 +46,11 @@ class Integrator:
         return self.name
 
     @property
+    def dissipation(self) -> float:
+        """chi of the dissipative mid-point scheme, see kernels/elements/conserving.py; 0 of others."""
+        return 0.0
+
+    @property
     def kept(self) -> tuple[str, str]:
         """Arrays of the state beside q_n and v_n that it takes: those of the step before, or accelerations."""
         if self.accelerated:

@@ -107,3 +107,81 @@ def _rotor(omega: float, h: float, steps: int, second: bool) -> tuple[float, flo
         v.append((x[-1] - x_free) / (beta * h))
     (a, b), (c, d) = x[-1], v[-1]
     return float(a * d - b * c) / omega, float(v[-1] @ v[-1]) / omega**2
+
+
+SCHEMES = (
+    "backward_euler", "bdf2", "generalized_alpha", "generalized_alpha(rho_inf=0)", "energy_momentum",
+    "energy_momentum(rho_inf=0.8)",
+)  # fmt: skip
+GROWN = {dtype: ("has added",) for dtype in ("float64", "float32")}
+"""How a scheme that adds energy is refused."""
+GROWTH = 0.1
+"""Part of its energy that a rotating body may gain before it has to be refused."""
+SPIN = np.array([1.0, 2.0, 10.0])
+"""rad/s."""
+
+
+def _turning(setting: Setting, body: str, E: float) -> wf.Model:
+    """A T10 bar of 0.5 x 0.2 x 0.1 m that is free, or a 3243 arm of 0.5 m on a revolute joint, at |SPIN| rad/s."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    law = wf.SVK(E=E, nu=0.3, density=1000.0)
+    if body == "free":
+        solid = b.add_solid(wf.mesh.box((0.5, 0.2, 0.1), cells=(2, 1, 1), element="T10"), material=law)
+        b.set_initial(solid, velocity=lambda X: np.cross(SPIN, X - (0.25, 0.1, 0.05)))
+        return finalize(b, setting)
+    ends = [(0.0, 0.0, 0.0), (0.5, 0.0, 0.0)]
+    arm = b.add_beam(ends, elements=2, section=wf.Rectangle(0.05, 0.05), normal=(0, 0, 1), material=law)
+    b.add_joint("revolute", parent=wf.GROUND, child=arm.start, axis=(0, 0, 1))
+    b.set_initial(arm, angular_velocity=(0.0, 0.0, float(np.linalg.norm(SPIN))))
+    return finalize(b, setting)
+
+
+def _energy(setting: Setting, body: str, scheme: str, turn: float, E: float, steps: int) -> Answer:
+    """Largest growth of the energy in so many steps of `turn` radians; energy_momentum's own bounds are tight."""
+    model = _turning(setting, body, E)
+    sim = wf.Simulation(model, dt=turn / float(np.linalg.norm(SPIN)), integrator=scheme)
+    M = model.mass_matrix()[::3, ::3]
+    (solid,) = model.bodies
+
+    def energy() -> float:
+        e = sim.energies()
+        return float(e["kinetic"][0] + e["strain"][0])
+
+    def momenta() -> tuple[np.ndarray, np.ndarray]:
+        u, v = (a.numpy()[0].astype(float) for a in (sim.state.displacement, sim.state.velocity))
+        p = M @ v
+        return p[solid.slot_kind == 0].sum(axis=0), np.cross(solid.reference + u, p).sum(axis=0)
+
+    first, (p, L), effort, most = energy(), momenta(), Effort(), 0.0
+    for _ in range(steps):
+        effort.step(sim)
+        most = max(most, energy() / first - 1.0)
+    limits = {}
+    bound = GROWTH
+    if scheme.startswith("energy_momentum"):
+        bound = 1e-2 if setting.single else 1e-6
+        if body == "free" and not setting.single:
+            now = momenta()
+            size = float(np.linalg.norm(L))
+            limits = {
+                "momentum": (float(np.linalg.norm(now[0] - p)) / size, 1e-10),
+                "angular momentum": (float(np.linalg.norm(now[1] - L)) / size, 1e-6),
+            }
+    return Answer(most, bound, "its energy at the start", **effort.told, limits=limits, drift=energy() / first - 1.0,
+                  note=f"keeps {energy() / first:.6f} of its energy")  # fmt: skip
+
+
+@case("turning", "Rotation", quick="float64", refusal=GROWN, values=(
+    ("generalized_alpha", 0.2, 1e9), ("energy_momentum", 0.2, 1e9), ("energy_momentum(rho_inf=0.8)", 0.2, 1e7),
+    ("energy_momentum(rho_inf=0.8)", 0.2, 1e9)))  # fmt: skip
+def turning(setting: Setting, value: tuple[str, float, float]) -> Answer:
+    """A free bar spins 300 steps of so many radians with E in Pa: energy does not grow, or the scheme is refused."""
+    return _energy(setting, "free", *value, steps=300)
+
+
+@case("turning-all", "Rotation", refusal=GROWN, dtypes=("float64",), values=[
+    (body, scheme, turn, E) for body in ("free", "rotor") for scheme in SCHEMES for turn in (0.1, 0.3, 0.6)
+    for E in (1e7, 1e9, 2e11)])  # fmt: skip
+def turning_all(setting: Setting, value: tuple[str, str, float, float]) -> Answer:
+    """The same of a free bar and a rotor on a joint, with every scheme, 100 steps."""
+    return _energy(setting, *value, steps=100)

@@ -1,0 +1,305 @@
+"""BiCGStab (van der Vorst 1992) on H p = -g with an unsymmetric H, preconditioned from the right, per world.
+
+With r^ = B r_0 its first half is a step of conjugate gradients where H is symmetric; the second takes the least D^-1
+norm of the residual, which Newton's method judges by. Vector kernels run over [world, slot]; scalar logic runs with one
+thread per world. The conjugate gradients' control serves: sums[0] is r.B r of the vector last preconditioned, sums[1]
+r.D^-1 r; `active` is 2 where products take the stress at the start of the step.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module, precision
+from .control import control_struct
+from .pcg import TIGHTER, pcg_struct
+
+__all__ = ["BICGSTAB_ROWS", "bicgstab_kernels", "bicgstab_struct"]
+
+BICGSTAB_ROWS = 4
+"""Rows of `second_rows`."""
+FAR, CLOSE = 0.1, 1.0e-8
+"""Relative residual above which the stress of an iterate is no guide: a rotation that is off by delta strains a stiff
+body by delta^2, and E delta^2 in the geometric part would lead astray. Products have the stress at the start of the
+step there, and solves go to CLOSE, as the residual of a rotation is small beside that of strains."""
+STALLED = 50
+"""Iterations without half of the best residual after which a solve ends, with the best: from then on it may grow."""
+FOUND = 0.1
+"""Relative residual to which a solve that tells an error has to come, or it tells none."""
+STRICT = 1.0e-6
+"""Relative residual of solves that tell an error."""
+
+
+@functools.cache
+def bicgstab_struct():
+    """The recursion's scalars of each world."""
+
+    @wp.struct
+    class BiCGStab:
+        rho: wp.array(dtype=wp.float64)  # r^.r
+        alpha: wp.array(dtype=wp.float64)
+        beta: wp.array(dtype=wp.float64)
+        omega: wp.array(dtype=wp.float64)
+        best: wp.array(dtype=wp.float64)  # least D^-1 norm of the residual so far
+        mark: wp.array(dtype=wp.float64)  # when it last halved, and the iterations since
+        since: wp.array(dtype=wp.int32)
+        again: wp.array(dtype=wp.int32)  # the solve stalled, and begins once more from its best
+        any_again: wp.array(dtype=wp.int32)  # [1]
+        going: wp.array(dtype=wp.int32)  # the solve goes on after this iteration
+        sums: wp.array2d(dtype=wp.float64)  # [BICGSTAB_ROWS, world]; after the first product r^.v alone
+
+    return BiCGStab
+
+
+@functools.cache
+def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
+    """Kernels in one precision; `gated`: with constraints, see Traits."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Newton, Control, Recursion = control_struct(), pcg_struct(), bicgstab_struct()
+    module = kernel_module(f"bicgstab_{dtype}{'_gated' if gated else ''}")
+
+    @wp.kernel(module=module)
+    def begin(newton: Newton, ctl: Control, bi: Recursion):
+        """Set the norm at which the solve ends: by Eisenstat and Walker, but no tighter than Newton's method needs."""
+        world = wp.tid()
+        ctl.active[world] = 0
+        if newton.active[world] == 0:
+            return
+        norm = wp.sqrt(ctl.sums[1, world])
+        ctl.norm[world] = norm
+        ctl.first_norm[world] = norm
+        ctl.iterations[world] = 0
+        ctl.negative[world] = 0
+        bi.rho[world] = ctl.sums[0, world]
+        bi.best[world] = norm
+        bi.mark[world] = norm
+        bi.since[world] = 0
+        goal = newton.forcing[world] * newton.solve_norm[world]
+        least = f64(0.1) * newton.solve_accept[world]
+        if wp.static(gated):
+            goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
+            least = f64(TIGHTER) * least
+            if newton.classical == 0:
+                goal = f64(TIGHTER) * goal
+                least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
+        ctl.target[world] = wp.max(goal, least)
+        if newton.fixed_forcing != 0:
+            ctl.target[world] = newton.forcing[world] * norm
+        if newton.strict[world] != 0:
+            ctl.target[world] = f64(STRICT) * norm
+        elif newton.relative[world] > f64(FAR) and newton.fixed_forcing == 0:
+            ctl.target[world] = wp.max(f64(CLOSE) * norm, least)
+        if norm > ctl.target[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
+            ctl.active[world] = wp.where(newton.relative[world] > f64(FAR), 2, 1)
+            wp.atomic_max(ctl.any_active, 0, 1)
+        elif newton.strict[world] != 0:
+            ctl.negative[world] = 1  # no error was found
+
+    @wp.kernel(module=module)
+    def first_direction(
+        ctl: Control,
+        z: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+        shadow: wp.array2d(dtype=vec3),
+        p_out: wp.array2d(dtype=vec3),
+        best_x: wp.array2d(dtype=vec3),
+        best_r: wp.array2d(dtype=vec3),
+    ):
+        """r^ = B r, p = r; the best so far is the start."""
+        world, slot = wp.tid()
+        if ctl.active[world] != 0:
+            shadow[world, slot] = z[world, slot]
+            p_out[world, slot] = r[world, slot]
+            best_x[world, slot] = x[world, slot]
+            best_r[world, slot] = r[world, slot]
+
+    @wp.kernel(module=module)
+    def first_length(ctl: Control, bi: Recursion):
+        """alpha = rho / r^.v, v = H y; where that is none the solve ends."""
+        world = wp.tid()
+        if world == 0:
+            ctl.any_active[0] = 0
+        if ctl.active[world] == 0:
+            return
+        ctl.iterations[world] = ctl.iterations[world] + 1
+        ctl.total[world] = ctl.total[world] + 1
+        alpha = bi.rho[world] / bi.sums[0, world]
+        bi.alpha[world] = alpha
+        if not wp.isfinite(alpha):
+            ctl.active[world] = 0
+            if ctl.iterations[world] == 1:
+                ctl.negative[world] = 1
+
+    @wp.kernel(module=module)
+    def first_step(
+        ctl: Control,
+        bi: Recursion,
+        y: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """x += alpha y, r -= alpha v."""
+        world, slot = wp.tid()
+        if ctl.active[world] != 0:
+            alpha = T(bi.alpha[world])
+            x[world, slot] = x[world, slot] + alpha * y[world, slot]
+            r[world, slot] = r[world, slot] - alpha * v[world, slot]
+
+    @wp.kernel(module=module)
+    def look(ctl: Control, bi: Recursion):
+        """End the solve where half of the iteration was enough."""
+        world = wp.tid()
+        if ctl.active[world] != 0:
+            norm = wp.sqrt(ctl.sums[1, world])
+            ctl.norm[world] = norm
+            if not norm > ctl.target[world]:
+                bi.best[world] = norm
+                ctl.active[world] = 0
+
+    @wp.kernel(module=module)
+    def second_rows(
+        ctl: Control,
+        diagonal: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+        t: wp.array2d(dtype=vec3),
+        shadow: wp.array2d(dtype=vec3),
+        rows: wp.array3d(dtype=f64),
+    ):
+        """t.D^-1 r, t.D^-1 t, r^.r, r^.t per slot."""
+        world, slot = wp.tid()
+        if ctl.active[world] != 0:
+            a = t[world, slot]
+            b = wp.cw_div(a, diagonal[world, slot])
+            rows[0, world, slot] = f64(wp.dot(b, r[world, slot]))
+            rows[1, world, slot] = f64(wp.dot(b, a))
+            rows[2, world, slot] = f64(wp.dot(shadow[world, slot], r[world, slot]))
+            rows[3, world, slot] = f64(wp.dot(shadow[world, slot], a))
+
+    @wp.kernel(module=module)
+    def second_length(ctl: Control, bi: Recursion):
+        """omega of the least |r - omega t|, beta of the next direction, and whether to go on."""
+        world = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        along = bi.sums[0, world]
+        omega = along / bi.sums[1, world]
+        if not wp.isfinite(omega):
+            omega = f64(0.0)
+        rho = bi.sums[2, world] - omega * bi.sums[3, world]
+        beta = (rho / bi.rho[world]) * (bi.alpha[world] / omega)
+        norm = wp.sqrt(wp.max(ctl.sums[1, world] - omega * along, f64(0.0)))
+        ctl.norm[world] = norm
+        bi.omega[world] = omega
+        bi.beta[world] = beta
+        bi.rho[world] = rho
+        if norm < bi.best[world]:
+            bi.best[world] = norm
+        bi.since[world] = bi.since[world] + 1
+        if norm <= f64(0.5) * bi.mark[world]:
+            bi.mark[world] = norm
+            bi.since[world] = 0
+        more = norm > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations
+        more = more and bi.since[world] < STALLED
+        if more and wp.isfinite(beta) and wp.isfinite(norm) and rho != f64(0.0):
+            bi.going[world] = 1
+            wp.atomic_max(ctl.any_active, 0, 1)
+        else:
+            bi.going[world] = 0
+
+    @wp.kernel(module=module)
+    def second_step(
+        ctl: Control,
+        bi: Recursion,
+        z: wp.array2d(dtype=vec3),
+        t: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+        p_out: wp.array2d(dtype=vec3),
+        best_x: wp.array2d(dtype=vec3),
+        best_r: wp.array2d(dtype=vec3),
+    ):
+        """x += omega z, r -= omega t, p = r + beta (p - omega v) where the solve goes on."""
+        world, slot = wp.tid()
+        if ctl.active[world] == 0:
+            return
+        omega = T(bi.omega[world])
+        place = x[world, slot] + omega * z[world, slot]
+        new = r[world, slot] - omega * t[world, slot]
+        x[world, slot] = place
+        r[world, slot] = new
+        if ctl.norm[world] == bi.best[world]:
+            best_x[world, slot] = place
+            best_r[world, slot] = new
+        if bi.going[world] != 0:
+            p_out[world, slot] = new + T(bi.beta[world]) * (p_out[world, slot] - omega * v[world, slot])
+
+    @wp.kernel(module=module)
+    def close(ctl: Control, bi: Recursion):
+        """Worlds that are done are no longer active."""
+        world = wp.tid()
+        if bi.going[world] == 0:
+            ctl.active[world] = 0
+
+    @wp.kernel(module=module)
+    def finish(newton: Newton, ctl: Control, bi: Recursion, first: int):
+        """Which worlds begin once more; `first`: they may."""
+        world = wp.tid()
+        bi.again[world] = 0
+        if newton.active[world] == 0 or ctl.iterations[world] == 0:
+            return
+        if not ctl.norm[world] <= bi.best[world]:
+            ctl.norm[world] = bi.best[world]
+        if first != 0 and ctl.norm[world] > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations:
+            bi.again[world] = 1
+            wp.atomic_max(bi.any_again, 0, 1)
+        elif newton.strict[world] != 0 and not ctl.norm[world] <= f64(FOUND) * ctl.first_norm[world]:
+            ctl.negative[world] = 1
+
+    @wp.kernel(module=module)
+    def begin_again(newton: Newton, ctl: Control, bi: Recursion):
+        """r^ = B r anew, with r of the best."""
+        world = wp.tid()
+        if bi.again[world] != 0 and ctl.sums[0, world] != f64(0.0) and wp.isfinite(ctl.sums[0, world]):
+            bi.rho[world] = ctl.sums[0, world]
+            bi.mark[world] = bi.best[world]
+            bi.since[world] = 0
+            ctl.active[world] = wp.where(newton.relative[world] > f64(FAR), 2, 1)
+            wp.atomic_max(ctl.any_active, 0, 1)
+
+    @wp.kernel(module=module)
+    def take_best(
+        newton: Newton,
+        ctl: Control,
+        bi: Recursion,
+        best_x: wp.array2d(dtype=vec3),
+        best_r: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+        r: wp.array2d(dtype=vec3),
+    ):
+        """x and r of the least residual."""
+        world, slot = wp.tid()
+        if newton.active[world] != 0 and not ctl.norm[world] <= bi.best[world]:
+            x[world, slot] = best_x[world, slot]
+            r[world, slot] = best_r[world, slot]
+
+    return _types.SimpleNamespace(
+        module=module,
+        begin=begin,
+        first_direction=first_direction,
+        first_length=first_length,
+        first_step=first_step,
+        look=look,
+        second_rows=second_rows,
+        second_length=second_length,
+        second_step=second_step,
+        close=close,
+        take_best=take_best,
+        finish=finish,
+        begin_again=begin_again,
+    )

@@ -1,0 +1,75 @@
+"""BiCGStab on an unsymmetric operator H, per world, on the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from ..kernels.solvers.bicgstab import BICGSTAB_ROWS, bicgstab_kernels, bicgstab_struct
+from .pcg import PCG
+
+__all__ = ["BiCGStab"]
+
+
+class BiCGStab(PCG):
+    """Solves H p = -g for the active worlds where H is unsymmetric, with the preconditioner of a symmetric part.
+
+    An iteration takes two products and two preconditionings. Translations of free groups are deflated as in `PCG`: they
+    meet no stiffness in this operator either.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        m, w = self.model, self.work
+        self.recursion = bicgstab_kernels(m.dtype, m.terms.traits.gated)
+        self.control = w.struct(bicgstab_struct(), m.worlds, sums=(BICGSTAB_ROWS, m.worlds), any_again=(1,))
+        field = (m.worlds, m.slots), m.types.vec3
+        self.shadow, self.y, self.t = (w.array(f"bicgstab {name}", *field) for name in ("shadow", "y", "t"))
+        self.best = [w.array(f"bicgstab best {name}", *field) for name in ("x", "r")]
+
+    def modules(self) -> set[wp.Module]:
+        return super().modules() | {self.recursion.module}
+
+    def _run(self) -> None:
+        w, k, launch, bi = self.work, self.recursion, self.launch, self.control
+        launch(k.begin, self.model.worlds, [w.newton, w.pcg, bi])
+        self._recur()
+        bi.any_again.zero_()
+        launch(k.finish, self.model.worlds, [w.newton, w.pcg, bi, 1])
+        with launch.rare():
+            wp.capture_if(bi.any_again, self._begin_again)
+
+    def _begin_again(self) -> None:
+        """Go on from the best of a solve that stalled."""
+        w, k, launch, bi = self.work, self.recursion, self.launch, self.control
+        self._precondition(w.r, w.z, bi.again)
+        w.pcg.any_active.zero_()
+        launch(k.begin_again, self.model.worlds, [w.newton, w.pcg, bi])
+        self._recur()
+        launch(k.finish, self.model.worlds, [w.newton, w.pcg, bi, 0])
+
+    def _recur(self) -> None:
+        """Iterate from r and z = B r, and take the best."""
+        w, k, launch = self.work, self.recursion, self.launch
+        launch(k.first_direction, self.dim, [w.pcg, w.z, w.r, w.direction, self.shadow, w.p, *self.best])
+        wp.capture_while(w.pcg.any_active, self._iterate)
+        launch(k.take_best, self.dim, [w.newton, w.pcg, self.control, *self.best, w.direction, w.r])
+
+    def _iterate(self) -> None:
+        w, k, launch, bi = self.work, self.recursion, self.launch, self.control
+        m, active, reduce = self.model, w.pcg.active, self.residual.reduce
+        self._precondition(w.p, self.y, active)
+        self.residual.product(self.y, w.Hp, active)
+        launch(self.residual.newton.dot_rows, self.dim, [self.shadow, w.Hp, active, w.rows])
+        reduce(w.rows, 1, active, bi.sums)
+        launch(k.first_length, m.worlds, [w.pcg, bi])
+        launch(k.first_step, self.dim, [w.pcg, bi, self.y, w.Hp, w.direction, w.r])
+        self._precondition(w.r, w.z, active)
+        launch(k.look, m.worlds, [w.pcg, bi])
+        self.residual.product(w.z, self.t, active)
+        launch(k.second_rows, self.dim, [w.pcg, w.diagonal, w.r, self.t, self.shadow, w.rows])
+        reduce(w.rows, BICGSTAB_ROWS, active, bi.sums)
+        launch(k.second_length, m.worlds, [w.pcg, bi])
+        launch(k.second_step, self.dim, [w.pcg, bi, w.z, self.t, w.Hp, w.direction, w.r, w.p, *self.best])
+        launch(k.close, m.worlds, [w.pcg, bi])
