@@ -1,6 +1,6 @@
 """The step itself: time levels, predictor, acceptance, energy ledger, report.
 
-A step of dt is walked in substeps of dt / 2^level. A refused substep raises the level by one; after an accepted one
+A step of dt, or of what is left to the end, is walked in substeps of dt / 2^level. A refused substep raises the level by one; after an accepted one
 the level falls again as soon as the position is even, so that time stays an exact binary fraction of dt.
 """
 
@@ -14,7 +14,7 @@ from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
 from ..solvers.control import FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
-from .control import STATUS, step_struct
+from .control import STATUS, step_span, step_struct
 from .ledger import ledger_kernels
 
 __all__ = ["step_kernels"]
@@ -40,7 +40,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
-    Step = step_struct()
+    Step, limits = step_struct(), step_span()
+    end_of, slack_of, span_of = limits.end, limits.slack, limits.span
     Newton = control_struct()
     PCG = pcg_struct()
     nonpotential, gated = traits.nonpotential, traits.gated
@@ -51,9 +52,12 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
-        """Open a step of every world that has not failed."""
+        """Open a step of every world that has not failed and is not at the end of the run."""
         world = wp.tid()
+        time = step.time[world]
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
+        if time >= end_of(step, world) - slack_of(step, world):
+            alive = 0
         step.running[world] = alive
         step.refused[world] = 0
         newton.total_iterations[world] = 0
@@ -69,7 +73,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         wp.atomic_max(step.any_running, 0, 1)
         step.level[world] = 0
         step.part[world] = 0
-        step.step_start[world] = step.time[world]
+        step.step_start[world] = time
+        if wp.abs(step.summed[world] - time) <= slack_of(step, world):
+            step.step_start[world] = step.summed[world]
         step.total_J[world] = f64(1.0e30)
 
     @wp.kernel(module=module)
@@ -92,9 +98,10 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         newton.failed[world] = 0
         newton.iterations[world] = 0
         parts = f64(wp.lshift(1, step.level[world]))
-        h = step.dt[world] / parts
+        span = span_of(step, world)
+        h = span / parts
         step.h[world] = h
-        step.new_time[world] = step.step_start[world] + step.dt[world] * (f64(step.part[world] + 1) / parts)
+        step.new_time[world] = step.step_start[world] + span * (f64(step.part[world] + 1) / parts)
         if wp.static(midpoint):
             step.stage_time[world] = step.new_time[world] - f64(0.5) * h
         previous = f64(0.0)
@@ -241,6 +248,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.time[world] = step.new_time[world]
             if level == 0:
                 step.running[world] = 0
+                step.summed[world] = step.new_time[world]
+                if wp.abs(end_of(step, world) - step.new_time[world]) <= slack_of(step, world):
+                    step.time[world] = end_of(step, world)
             else:
                 wp.atomic_max(step.any_running, 0, 1)
             return
@@ -291,7 +301,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             v_before[world, slot] = v_n[world, slot]
             if slot == 0:
                 step.previous_h[world] = step.h[world]
-                step.previous_end[world] = step.new_time[world]
+                step.previous_end[world] = step.time[world]
         if wp.static(accelerated):
             c = coefficients(step.h[world], f64(0.0), step.parameter)
             a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
@@ -301,7 +311,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             v_before[world, slot] = T(c.mass_factor) * (new - before)
             if slot == 0:
                 step.previous_h[world] = step.h[world]
-                step.previous_end[world] = step.new_time[world]
+                step.previous_end[world] = step.time[world]
         u_n[world, slot] = u[world, slot]
         if slot == 0:
             newton.potential[world] = newton.elem_sums[0, world]

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["ArraySpec", "State", "words_of"]
 
-MEMORY = ("preconditioner", "operator", "predictor")
-"""What names of arrays begin with that solvers remember; a state can do without."""
+MEMORY = ("preconditioner", "operator", "predictor", "summed")
+"""What names of arrays begin with that a state can do without: memory of solvers, roundings of the time."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ class Loops:
         self.tally: wp.array | None = None
         self.stepped: wp.array | None = None
         self._flags: wp.array | None = None
+        if ends:
+            work.step.ends = self.ends
         if quiet:
             self.tally = work.array("tally", (model.worlds, len(TALLY)), wp.float64)
             self.stepped = work.array("stepped", (model.worlds,), wp.int32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -86,6 +87,7 @@ class Stepper:
             state.register("ledger", wp.float64, (len(model.terms.ledger),))
             state.register("ledger_time", wp.float64)
         state.register("status", wp.int32)
+        state.register("summed_time", wp.float64)
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
         midpoint = integrator.midpoint
         self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint)
@@ -116,6 +118,7 @@ class Stepper:
             self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
         self.loops = Loops(model, self.work, self.launch, quiet=quiet, ends=ends)
+        self.stop_at(math.inf)
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
         self.backup = state.like() if solver.max_halvings > 0 or self.adaptive else None
@@ -132,7 +135,7 @@ class Stepper:
     def _bind(self) -> None:
         w, state = self.work, self.state
         w.step.time = state.time
-        w.step.status = state.status
+        w.step.status, w.step.summed = state.status, state.summed_time
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
         w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
@@ -289,6 +292,10 @@ class Stepper:
         """Step of all worlds, s, or of each [world]."""
         self._dt = dt
         write_times(self.work.step.dt, dt)
+
+    def stop_at(self, end: float, steps: int = 0) -> None:
+        """End of a run of so many steps, s, which the last one meets; inf: none."""
+        self.work.step.stop.assign(np.array([end, steps * math.ulp(end) if steps else 0.0]))
 
     def run(self) -> None:
         """Do one step of every running world."""
