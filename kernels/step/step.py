@@ -21,6 +21,8 @@ __all__ = ["step_kernels"]
 
 FULL = 1e-9
 """Part of the load that may lack where all of it counts as acting."""
+LARGEST_GROWTH = {"float64": 1e9, "float32": 1e4}
+"""Growth of a step up to which a multistep scheme takes the step before: its differences are rounding beyond."""
 STRETCH = 2.0
 """Largest growth of a step that accelerations are extrapolated for: after many halvings they are those of an event."""
 
@@ -48,6 +50,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     variant = traits.suffix("nonpotential", "gated")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
+    GROWTH = LARGEST_GROWTH[dtype]
     module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
 
     @wp.kernel(module=module)
@@ -107,7 +110,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         previous = f64(0.0)
         if wp.static(multistep):
             # a state that was set, reset or advanced by another scheme since has no past
-            if step.previous_end[world] == step.time[world]:
+            known = step.previous_end[world] == step.time[world]
+            if known and h <= f64(GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
         c = coefficients(h, previous, step.parameter)
         step.a0[world] = c.a0

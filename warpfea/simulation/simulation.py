@@ -79,6 +79,7 @@ class Simulation(Digests):
 
     Attributes:
         controls: what the caller writes between steps, see Controls.
+        compile_s, output_s: s that it took to make the simulation, kernels included, and that writers of runs took.
 
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
@@ -149,7 +150,7 @@ class Simulation(Digests):
             self.stepper = stepper(model, self.state, capture)
         model.parameters.begun = True
         self.controls = Controls(model, self.state)
-        self.compile_s = clock.perf_counter() - began
+        self.compile_s, self.output_s = clock.perf_counter() - began, 0.0
         self.error = adapt.error if adapt else None
         self._open_digest(quiet)
         self._start: State | None = None
