@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     began = clock.perf_counter()
     source = resolve(options, saved)
     t_end = options.t_end or source.scene.t_end
-    _check_picture(options, t_end)
+    _check_times(options, source, t_end)
     outputs = make_outputs(options, source, t_end)
     before = {file: _mark(file) for file in _files(options).values()}
     with quiet_warp():
@@ -163,8 +163,14 @@ def _check_look(options: argparse.Namespace) -> None:
         )
 
 
-def _check_picture(options: argparse.Namespace, t_end: float) -> None:
-    """UsageError for a picture of what is not reached."""
+def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> None:
+    """UsageError for an end at the start, and for a picture of what is not reached."""
+    fixed = not (options.static or options.resume or isinstance(source.dt, str))
+    if fixed and t_end <= SAME_TIME * float(source.dt):
+        raise UsageError(
+            f"--t-end {t_end:g}: no step would be done, for it is within {SAME_TIME:g} of a step from the start; give "
+            "a later --t-end"
+        )
     if options.png_time is not None and not 0.0 <= options.png_time <= t_end * (1.0 + 1e-9):
         raise UsageError(f"--png-time {options.png_time:g}: the run lasts from 0 to t = {t_end:g} s")
 
