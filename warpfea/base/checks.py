@@ -10,9 +10,13 @@ import numpy as np
 
 __all__ = ["is_count", "is_number", "number_hint"]
 
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "Pa": 1.0, "kPa": 1e3, "MPa": 1e6,
-         "GPa": 1e9, "N": 1.0, "kN": 1e3, "kg": 1.0, "kg/m^3": 1.0, "kg/m3": 1.0, "g/cm^3": 1e3, "g/cm3": 1e3,
-         "": 1.0}  # fmt: skip
+UNITS = {
+    **dict.fromkeys(("", "s", "m", "Pa", "N", "kg", "kg/m^3", "kg/m3"), 1.0),
+    **dict.fromkeys(("ms", "mm"), 1e-3),
+    **dict.fromkeys(("us", "um"), 1e-6),
+    **dict.fromkeys(("kPa", "kN", "g/cm^3", "g/cm3"), 1e3),
+    **{"cm": 1e-2, "MPa": 1e6, "GPa": 1e9},
+}
 """Units that users write behind numbers, in SI units."""
 
 
@@ -31,11 +35,11 @@ def is_count(value: Any) -> bool:
 
 
 def number_hint(value: Any) -> str:
-    """The text "; write 0.005: SI units, a number without the unit" for a text such as "5 ms", else nothing."""
-    found = re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([A-Za-z/^3]*)\s*", value) if isinstance(value, str) else None
-    if found is None or found[2] not in UNITS:
+    """The text "; write 0.005: a number in SI units, no text" for a text such as "5 ms", else nothing."""
+    found = re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\D.*)?", value) if isinstance(value, str) else None
+    if found is None or (found[2] or "").strip() not in UNITS:
         return ""
     try:
-        return f"; write {float(found[1]) * UNITS[found[2]]:.12g}: a number in SI units, no text"
+        return f"; write {float(found[1]) * UNITS[(found[2] or '').strip()]:.12g}: a number in SI units, no text"
     except ValueError:
         return ""
