@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from .base.brief import brief_repr
 from .base.errors import ModelError
 from .base.names import did_you_mean
 
@@ -93,7 +94,7 @@ class KelvinVoigt:
             raise ModelError(f"KelvinVoigt: form = {self.form!r} is none of 'incremental', 'rate', 'explicit'{hint}")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Material:
     """Base of the laws: a density, which statics without gravity does without, and optional damping.
 
@@ -107,6 +108,8 @@ class Material:
     _options: ClassVar[dict[str, Any]] = {}
     density: Any = field(default=None, kw_only=True)
     damping: KelvinVoigt | None = field(default=None, kw_only=True)
+
+    __repr__ = brief_repr
 
     def __new__(cls, *_: Any, **options: Any) -> Self:
         """ModelError where E or nu is given to a law that takes other constants: its from_E_nu is meant."""
@@ -165,7 +168,7 @@ class Material:
         raise NotImplementedError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SVK(Material):
     """St. Venant-Kirchhoff: Psi = lambda/2 tr(E)^2 + mu tr(E^2), Eqs. (25)-(28).
 
@@ -210,7 +213,7 @@ class SVK(Material):
         return lam, mu, 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MooneyRivlin(Material):
     """Mooney-Rivlin: Psi = mu10 (I1bar - 3) + mu01 (I2bar - 3) + k/2 (J - 1)^2, Eqs. (36)-(52).
 
@@ -262,7 +265,7 @@ class MooneyRivlin(Material):
         return self.mu10, self.k, self.mu01
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class NeoHookean(Material):
     """Neo-Hookean: Psi = mu/2 (I1bar - 3) + k/2 (J - 1)^2, which is Mooney-Rivlin with mu01 = 0.
 

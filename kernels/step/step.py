@@ -1,7 +1,8 @@
 """The step itself: time levels, predictor, acceptance, energy ledger, report.
 
-A step of dt, or of what is left to the end, is walked in substeps of dt / 2^level. A refused substep raises the level by one; after an accepted one
-the level falls again as soon as the position is even, so that time stays an exact binary fraction of dt.
+A step of dt, or of what is left to the end, is walked in substeps of dt / 2^level. A refused substep raises the level
+by one; after an accepted one the level falls again as soon as the position is even, so that time stays an exact binary
+fraction of dt.
 """
 
 import functools
