@@ -15,6 +15,7 @@ from ..base.console import compile_bar, quiet_warp
 from ..base.errors import ModelError
 from ..base.memory import enough_memory
 from ..base.names import listing
+from ..base.worlds import chosen_worlds
 from ..kernels.step.control import SAME_TIME, STATUS
 from ..model.assembly import require_density
 from ..model.handles import NodeSet
@@ -304,15 +305,22 @@ class Simulation(Digests):
     def freeze(self, worlds: Any) -> None:
         """Leave worlds (indices or mask) as they are from now on."""
         status = self.state.status.numpy()
-        status[worlds] = STATUS["frozen"]
+        try:
+            status[worlds] = STATUS["frozen"]
+        except IndexError:
+            B = self.model.worlds
+            raise ModelError(
+                f"freeze: worlds = {worlds!r} must be numbers from 0 to {B - 1}, or ({B},) of True and False"
+            ) from None
         self.state.status.assign(status)
 
     def reset(self, mask: Any = None, state: State | None = None) -> None:
         """Set worlds back to a state, by default to the model's initial one.
 
         Args:
-            mask: [world], by default all; or a Warp array of int32 or bool on the model's device: nothing is read back
-                then, joints and overlaps are not checked, and worlds end bit-equal to a run from that state.
+            mask: [world] of True and False, or the numbers of some worlds, by default all; or a Warp array of int32 or
+                bool [world] on the model's device: nothing is read back then, joints and overlaps are not checked, and
+                worlds end bit-equal to a run from that state.
             state: where they go. With a Warp array as the mask one that a simulation of this model has had, such as
                 `sim.state.like()` keeps.
 
@@ -323,10 +331,7 @@ class Simulation(Digests):
         if isinstance(mask, wp.array):
             self._reset_on_device(mask, state)
             return
-        B = self.model.worlds
-        mask = np.ones(B, bool) if mask is None else np.asarray(mask, dtype=bool)
-        if mask.shape != (B,):
-            raise ModelError(f"reset: mask has shape {mask.shape}, expected ({B},)")
+        mask = chosen_worlds("reset", mask, self.model.worlds)
         source = self.model.state() if state is None else state
         check_state(self.model, source)
         self._own_times |= bool(mask.any() and not mask.all())
