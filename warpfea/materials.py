@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from .base.brief import brief_repr
+from .base.checks import number_hint
 from .base.errors import ModelError
 from .base.names import did_you_mean
 
@@ -39,22 +40,28 @@ DENSITIES = ("density", "density_factor")
 def _positive(owner: str, **values: float) -> None:
     for name, value in values.items():
         if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
-            raise ModelError(f"{owner}: {name} = {value!r} must be a positive finite number")
+            raise ModelError(f"{owner}: {name} = {value!r} must be a positive finite number{number_hint(value)}")
 
 
 def _non_negative(owner: str, **values: float) -> None:
     for name, value in values.items():
         if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value >= 0.0):
-            raise ModelError(f"{owner}: {name} = {value!r} must be a finite number that is not negative")
+            raise ModelError(
+                f"{owner}: {name} = {value!r} must be a finite number that is not negative{number_hint(value)}"
+            )
 
 
 def _check_density(owner: str, density: Density) -> None:
     if density is None or callable(density):
         return
-    values = np.asarray(density, dtype=float)
+    try:
+        values = np.asarray(density, dtype=float)
+    except (TypeError, ValueError):
+        values = np.full(1, np.nan)
     if values.ndim > 1 or not np.all(np.isfinite(values)) or not np.all(values > 0.0):
         raise ModelError(
             f"{owner}: density = {density!r} must be positive (kg/m^3): a number, one per element, or f(X)"
+            f"{number_hint(density)}"
         )
 
 
@@ -65,7 +72,7 @@ def _check_damping(owner: str, damping: Any) -> None:
 
 def _check_nu(owner: str, nu: float) -> None:
     if not (isinstance(nu, (int, float, np.floating)) and -1.0 < nu < 0.5):
-        raise ModelError(f"{owner}: nu = {nu!r} must lie between -1 and 0.5, both excluded")
+        raise ModelError(f"{owner}: nu = {nu!r} must lie between -1 and 0.5, both excluded{number_hint(nu)}")
 
 
 @dataclass(frozen=True)
@@ -111,12 +118,24 @@ class Material:
 
     __repr__ = brief_repr
 
-    def __new__(cls, *_: Any, **options: Any) -> Self:
-        """ModelError where E or nu is given to a law that takes other constants: its from_E_nu is meant."""
+    def __new__(cls, *values: Any, **options: Any) -> Self:
+        """ModelError for what a law does not take; where E or nu is given its from_E_nu may be meant."""
         taken = inspect.signature(cls.__init__).parameters
         if hasattr(cls, "from_E_nu") and not {"E", "nu"} & set(taken) and {"E", "nu"} & set(options):
             name = cls.__name__
             raise ModelError(f"{name}: E and nu are not its constants; {name}.from_E_nu(E=, nu=) takes them")
+        kinds = [parameter.kind for parameter in taken.values()]
+        known = list(taken)[1:]
+        row = known[: kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD) - 1]
+        odd = [name for name in options if name not in known and inspect.Parameter.VAR_KEYWORD not in kinds]
+        if odd or (len(values) > len(row) and inspect.Parameter.VAR_POSITIONAL not in kinds):
+            what = (
+                f"{odd[0]!r} is unknown"
+                if odd
+                else f"{len(values)} values without names, such as density=, are too many"
+            )
+            hint = did_you_mean(odd[0], known) if odd else ""
+            raise ModelError(f"{cls.__name__}: {what}; it takes {', '.join(known)}{hint}")
         return super().__new__(cls)
 
     @property

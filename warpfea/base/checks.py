@@ -35,11 +35,14 @@ def is_count(value: Any) -> bool:
 
 
 def number_hint(value: Any) -> str:
-    """The text "; write 0.005: a number in SI units, no text" for a text such as "5 ms", else nothing."""
+    """The text "; write 0.005, a bare number in SI units" for a text such as "5 ms", else nothing."""
     found = re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\D.*)?", value) if isinstance(value, str) else None
-    if found is None or (found[2] or "").strip() not in UNITS:
+    factor = UNITS.get((found[2] or "").strip()) if found else None
+    if found is None or factor is None:
         return ""
     try:
-        return f"; write {float(found[1]) * UNITS[(found[2] or '').strip()]:.12g}: a number in SI units, no text"
+        number = float(found[1]) * factor
     except ValueError:
         return ""
+    short = f"{number:g}" if float(f"{number:g}") == number else f"{number:.12g}"
+    return f"; write {short}, a bare number in SI units"
