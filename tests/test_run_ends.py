@@ -1,4 +1,4 @@
-"""`run` meets its end: the last step is shortened, in every scheme and precision, and runs in parts have the same bits."""
+"""`run` meets its end: the last step is shortened, in every scheme; runs in parts have the bits of the whole."""
 
 from __future__ import annotations
 
