@@ -293,11 +293,11 @@ class Simulation(Digests):
             if total == 0 and t_end != now and self.steps == 0:
                 raise ModelError(f"t_end = {t_end:g} s is within {SAME_TIME:g} dt of the start at t = {now:g} s, so no "
                                  "step would be done; take a later t_end")  # fmt: skip
-        self.stepper.stop_at(t_end, total)
+        self.stepper.loops.stop_at(t_end, total)
         try:
             run_steps(self, total, t_end, outputs, on_step, progress)
         finally:
-            self.stepper.stop_at(math.inf)
+            self.stepper.loops.stop_at()
         if self.last is None:
             self.last = idle_report(self)
         return self.last

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -118,7 +117,6 @@ class Stepper:
             self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
         self.loops = Loops(model, self.work, self.launch, quiet=quiet, ends=ends)
-        self.stop_at(math.inf)
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
         self.backup = state.like() if solver.max_halvings > 0 or self.adaptive else None
@@ -292,10 +290,6 @@ class Stepper:
         """Step of all worlds, s, or of each [world]."""
         self._dt = dt
         write_times(self.work.step.dt, dt)
-
-    def stop_at(self, end: float, steps: int = 0) -> None:
-        """End of a run of so many steps, s, which the last one meets; inf: none."""
-        self.work.step.stop.assign(np.array([end, steps * math.ulp(end) if steps else 0.0]))
 
     def run(self) -> None:
         """Do one step of every running world."""
