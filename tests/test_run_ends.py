@@ -114,6 +114,14 @@ def test_each_world_meets_its_own_end(device):
     assert np.array_equal(u[1], alone.state.displacement.numpy()[0])
 
 
+@pytest.mark.parametrize("answer", [False, np.False_])
+def test_on_step_ends_the_run_by_false(answer):
+    """Fails on 8934ce7 with numpy's: `lambda s: s.time[0] < 0.01` never ended a run."""
+    sim = wf.Simulation(bar(), dt=DT)
+    sim.run(0.02, on_step=lambda s: answer if s.steps == 3 else None)
+    assert sim.steps == 3
+
+
 def test_worlds_that_are_there_wait_for_the_others():
     """Fails on 8934ce7: the world that was not reset went on to 0.014 s."""
     sim, alone = wf.Simulation(bar(worlds=3), dt=DT), wf.Simulation(bar(), dt=DT)

@@ -9,6 +9,8 @@ import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import numpy as np
+
 from ..kernels.step.control import STATUS
 
 __all__ = ["interruptible", "run_steps", "step_bar"]
@@ -55,7 +57,8 @@ def run_steps(
                 report = sim.step()
                 each(lambda out: out.write(sim), opened)
                 bar(report)
-                if on_step is not None and on_step(sim) is False:
+                answer = None if on_step is None else on_step(sim)
+                if isinstance(answer, (bool, np.bool_)) and not answer:
                     break
                 cut = interrupted() and done < total
                 if cut or (report.status != STATUS["running"]).all():
