@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def test_run_writes_every_output_and_says_so(folder, capfd):
 
 
 def test_summary_has_the_fixed_keys(folder, capfd):
-    code, _, _ = run(capfd, *SHORT, "--json", "a.json")
+    code, out, _ = run(capfd, *SHORT, "--json", "a.json", "--usd", "a.usdc")
     assert code == 0
     summary = json.loads((folder / "a.json").read_text())
     assert tuple(summary) == KEYS
@@ -50,7 +51,11 @@ def test_summary_has_the_fixed_keys(folder, capfd):
     assert (summary["device"], summary["dtype"], summary["dt"]) == ("cpu", "float64", 0.002)
     assert summary["t_end"] == pytest.approx(0.01)
     assert (summary["steps"], summary["status"]) == (5, "done")
-    assert 0 < summary["compile_s"] <= summary["wall_s"]
+    assert 0 < summary["compile_s"] <= summary["setup_s"]
+    parts = [summary[f"{name}_s"] for name in ("setup", "solve", "output")]
+    assert min(parts) > 0
+    assert sum(parts) == pytest.approx(summary["wall_s"])
+    assert re.search(r"time +[\d.]+ s: set-up [\d.]+ s \(kernels [\d.]+ s\), solve [\d.]+ s, output [\d.]+ s\n", out)
     assert summary["newton_iterations"] >= 5
     assert summary["pcg_iterations"] > 5
     assert 0 < summary["max_residual"] < 1e-7
@@ -132,7 +137,7 @@ def test_a_run_resumes_from_its_checkpoint_bit_for_bit(folder, capfd):
     assert run(capfd, *rest, "--resume", "c.npz", "--checkpoint", "c.npz", "--json", "rest.json")[0] == 0
     whole, rest = (json.loads((folder / f"{name}.json").read_text()) for name in ("whole", "rest"))
     for key in KEYS:
-        if key not in ("wall_s", "compile_s"):
+        if not key.endswith("_s"):  # times
             assert rest[key] == whole[key], key
 
 

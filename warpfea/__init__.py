@@ -3,35 +3,11 @@
 b = wf.ModelBuilder(); body = b.add_solid(...); model = b.finalize(); sim = wf.Simulation(model, dt=...); sim.run(...)
 """
 
-from __future__ import annotations
+import importlib as _importlib
 
-import importlib
-import importlib.util
-import pathlib
-import sys
-from typing import Any
+from .base.checkout import map_checkout as _map_checkout
 
-
-def _map_checkout() -> None:
-    """In a source checkout `kernels/` and `scenes/` lie beside this package: bind just these two names."""
-    root = pathlib.Path(__file__).resolve().parent.parent
-    if not (root / "pyproject.toml").is_file():
-        return
-    for name in ("kernels", "scenes"):
-        init = root / name / "__init__.py"
-        full = f"{__name__}.{name}"
-        if full in sys.modules or not init.is_file():
-            continue
-        spec = importlib.util.spec_from_file_location(full, init, submodule_search_locations=[str(init.parent)])
-        if spec is None or spec.loader is None:
-            continue
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[full] = module
-        spec.loader.exec_module(module)
-        globals()[name] = module
-
-
-_map_checkout()
+_map_checkout(__name__)
 
 from . import mesh  # noqa: E402
 from .base.errors import (  # noqa: E402
@@ -133,7 +109,15 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name == "study":  # by name: no scene, which imports this, is to depend on studies
-        return importlib.import_module(f"{__name__}.studies.accuracy").study
+def __getattr__(name: str) -> object:
+    """`study` when it is asked for: no scene, which imports this package, is to depend on the studies.
+
+    What type checkers see stands in `__init__.pyi`.
+    """
+    if name == "study":
+        return _importlib.import_module(f"{__name__}.studies.accuracy").study
     raise AttributeError(f"module 'warpfea' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

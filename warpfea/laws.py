@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .base.checks import number_hint
 from .base.errors import ModelError
 
 __all__ = ["Control", "TimeLaw", "time_law"]
@@ -100,9 +101,13 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
     if isinstance(value, wp.Function):
         return TimeLaw(np.zeros(0), np.zeros((0, 3)), value, scalar)
     if callable(value):
-        raise ModelError(f"{what}: a function of time must be a wp.func, got {value!r}")
+        name = getattr(value, "__name__", type(value).__name__).replace("<lambda>", "a lambda")
+        raise ModelError(
+            f"{what}: {name} is a Python function, and no device runs it: sample it, (times, [f(t) for t in times]) "
+            "with times = np.linspace(0, t_end, 201), or write a def with @wp.func above it"
+        )
     width = () if scalar else (3,)
-    if isinstance(value, tuple) and len(value) == 2 and np.ndim(value[0]) == 1:
+    if isinstance(value, (tuple, list)) and len(value) == 2 and np.ndim(value[0]) == 1:
         times = np.asarray(value[0], dtype=float)
         values = np.asarray(value[1], dtype=float)
         if values.shape != (len(times), *width):
@@ -118,10 +123,11 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
             values = np.asarray(value, dtype=float)[None]
         except (TypeError, ValueError) as error:
             kinds = "number, vector, (times, values), wp.func or Control"
-            raise ModelError(f"{what} = {value!r} is not a {kinds}") from error
+            raise ModelError(f"{what} = {value!r} is not a {kinds}{number_hint(value)}") from error
         times = np.zeros(1)
         if values.shape != (1, *width):
-            raise ModelError(f"{what} has shape {values.shape[1:]}, expected {width or 'a number'}")
+            hint = f"; write a vector such as (0, 0, {value!r})" if values.shape == (1,) else ""
+            raise ModelError(f"{what} has shape {values.shape[1:]}, expected {width or 'a number'}{hint}")
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise ModelError(f"{what}: {value!r} holds a value that is not finite")
     return TimeLaw(times, _widen(values, scalar), None, scalar)

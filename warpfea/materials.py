@@ -11,6 +11,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from .base.brief import brief_repr
+from .base.checks import number_hint
 from .base.errors import ModelError
 from .base.names import did_you_mean
 
@@ -38,22 +40,28 @@ DENSITIES = ("density", "density_factor")
 def _positive(owner: str, **values: float) -> None:
     for name, value in values.items():
         if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
-            raise ModelError(f"{owner}: {name} = {value!r} must be a positive finite number")
+            raise ModelError(f"{owner}: {name} = {value!r} must be a positive finite number{number_hint(value)}")
 
 
 def _non_negative(owner: str, **values: float) -> None:
     for name, value in values.items():
         if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value >= 0.0):
-            raise ModelError(f"{owner}: {name} = {value!r} must be a finite number that is not negative")
+            raise ModelError(
+                f"{owner}: {name} = {value!r} must be a finite number that is not negative{number_hint(value)}"
+            )
 
 
 def _check_density(owner: str, density: Density) -> None:
     if density is None or callable(density):
         return
-    values = np.asarray(density, dtype=float)
+    try:
+        values = np.asarray(density, dtype=float)
+    except (TypeError, ValueError):
+        values = np.full(1, np.nan)
     if values.ndim > 1 or not np.all(np.isfinite(values)) or not np.all(values > 0.0):
         raise ModelError(
             f"{owner}: density = {density!r} must be positive (kg/m^3): a number, one per element, or f(X)"
+            f"{number_hint(density)}"
         )
 
 
@@ -64,7 +72,7 @@ def _check_damping(owner: str, damping: Any) -> None:
 
 def _check_nu(owner: str, nu: float) -> None:
     if not (isinstance(nu, (int, float, np.floating)) and -1.0 < nu < 0.5):
-        raise ModelError(f"{owner}: nu = {nu!r} must lie between -1 and 0.5, both excluded")
+        raise ModelError(f"{owner}: nu = {nu!r} must lie between -1 and 0.5, both excluded{number_hint(nu)}")
 
 
 @dataclass(frozen=True)
@@ -93,7 +101,7 @@ class KelvinVoigt:
             raise ModelError(f"KelvinVoigt: form = {self.form!r} is none of 'incremental', 'rate', 'explicit'{hint}")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Material:
     """Base of the laws: a density, which statics without gravity does without, and optional damping.
 
@@ -108,12 +116,26 @@ class Material:
     density: Any = field(default=None, kw_only=True)
     damping: KelvinVoigt | None = field(default=None, kw_only=True)
 
-    def __new__(cls, *_: Any, **options: Any) -> Self:
-        """ModelError where E or nu is given to a law that takes other constants: its from_E_nu is meant."""
+    __repr__ = brief_repr
+
+    def __new__(cls, *values: Any, **options: Any) -> Self:
+        """ModelError for what a law does not take; where E or nu is given its from_E_nu may be meant."""
         taken = inspect.signature(cls.__init__).parameters
         if hasattr(cls, "from_E_nu") and not {"E", "nu"} & set(taken) and {"E", "nu"} & set(options):
             name = cls.__name__
             raise ModelError(f"{name}: E and nu are not its constants; {name}.from_E_nu(E=, nu=) takes them")
+        kinds = [parameter.kind for parameter in taken.values()]
+        known = list(taken)[1:]
+        row = known[: kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD) - 1]
+        odd = [name for name in options if name not in known and inspect.Parameter.VAR_KEYWORD not in kinds]
+        if odd or (len(values) > len(row) and inspect.Parameter.VAR_POSITIONAL not in kinds):
+            what = (
+                f"{odd[0]!r} is unknown"
+                if odd
+                else f"{len(values)} values without names, such as density=, are too many"
+            )
+            hint = did_you_mean(odd[0], known) if odd else ""
+            raise ModelError(f"{cls.__name__}: {what}; it takes {', '.join(known)}{hint}")
         return super().__new__(cls)
 
     @property
@@ -165,7 +187,7 @@ class Material:
         raise NotImplementedError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SVK(Material):
     """St. Venant-Kirchhoff: Psi = lambda/2 tr(E)^2 + mu tr(E^2), Eqs. (25)-(28).
 
@@ -210,7 +232,7 @@ class SVK(Material):
         return lam, mu, 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MooneyRivlin(Material):
     """Mooney-Rivlin: Psi = mu10 (I1bar - 3) + mu01 (I2bar - 3) + k/2 (J - 1)^2, Eqs. (36)-(52).
 
@@ -262,7 +284,7 @@ class MooneyRivlin(Material):
         return self.mu10, self.k, self.mu01
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class NeoHookean(Material):
     """Neo-Hookean: Psi = mu/2 (I1bar - 3) + k/2 (J - 1)^2, which is Mooney-Rivlin with mu01 = 0.
 

@@ -19,7 +19,7 @@ import warp as wp
 from ..common.types import kernel_module, precision
 from ..solvers.control import FAIL_ERROR, control_struct
 from ..solvers.pcg import pcg_struct
-from .control import step_struct
+from .control import step_span, step_struct
 
 __all__ = ["COUNTS", "KEPT", "MAX_LEVEL", "adaptive_kernels", "adaptive_struct"]
 
@@ -84,6 +84,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
+    span_of = step_span().span
     Step, Newton, PCG, Adaptive = step_struct(), control_struct(), pcg_struct(), adaptive_struct()
     estimate, order, multistep = scheme.estimate, scheme.order, scheme.multistep
     module = kernel_module(f"adaptive_{dtype}_{scheme.variant}")
@@ -93,7 +94,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         """Raise the level until substeps are no longer than the wish."""
         level = step.level[world]
         part = step.part[world]
-        h = step.dt[world] / f64(wp.lshift(1, level))
+        h = span_of(step, world) / f64(wp.lshift(1, level))
         while level < MAX_LEVEL and h > f64(1.000001) * wish:
             h = f64(0.5) * h
             level = level + 1

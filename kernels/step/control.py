@@ -1,10 +1,11 @@
 """What the step loop knows of each world, and what it reports."""
 
 import functools
+import types as _types
 
 import warp as wp
 
-__all__ = ["REPORT", "STATUS", "Coefficients", "step_struct"]
+__all__ = ["REPORT", "SAME_TIME", "STATUS", "Coefficients", "step_span", "step_struct"]
 
 STATUS = {"running": 0, "failed": 1, "frozen": 2}
 
@@ -25,6 +26,9 @@ REPORT = (
     "floor",
 )
 """Columns of the report of a step, [world, column] in float64; probes follow."""
+
+SAME_TIME = 1e-6
+"""Part of a step within which two times are one."""
 
 
 @wp.struct
@@ -62,6 +66,9 @@ def step_struct():
         accepted: wp.array(dtype=wp.int32)
         first_refusal: wp.array(dtype=wp.int32)
         time: wp.array(dtype=wp.float64)  # s, state
+        summed: wp.array(dtype=wp.float64)  # s, state: sum of the steps, where `time` was set to an end beside it
+        stop: wp.array(dtype=wp.float64)  # [2] s: end of the run, inf without; rounding of its times
+        ends: wp.array(dtype=wp.float64)  # s, end of each world, where they have one
         new_time: wp.array(dtype=wp.float64)  # end of the attempt
         stage_time: wp.array(dtype=wp.float64)  # its middle, of schemes that take forces there
         step_start: wp.array(dtype=wp.float64)
@@ -88,3 +95,33 @@ def step_struct():
         ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
 
     return StepControl
+
+
+@functools.cache
+def step_span() -> _types.SimpleNamespace:
+    """Device functions of the end of a run or world, which the last step meets."""
+    f64 = wp.float64
+    Step = step_struct()
+
+    @wp.func
+    def end(step: Step, world: int) -> f64:
+        """End of the run or of the world, s."""
+        first = step.stop[0]
+        if step.ends:
+            first = wp.min(first, step.ends[world])
+        return first
+
+    @wp.func
+    def slack(step: Step, world: int) -> f64:
+        """Difference of times that counts as none, s."""
+        return wp.max(f64(SAME_TIME) * step.dt[world], step.stop[1])
+
+    @wp.func
+    def span(step: Step, world: int) -> f64:
+        """Length of the step, s: dt, or what is left to the end."""
+        left = end(step, world) - step.step_start[world]
+        if left < step.dt[world] - slack(step, world):
+            return left
+        return step.dt[world]
+
+    return _types.SimpleNamespace(end=end, slack=slack, span=span)

@@ -7,7 +7,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from .control import REPORT, STATUS
+from .control import REPORT, SAME_TIME, STATUS
 
 __all__ = ["MOTION", "TALLY", "VALUES", "loop_kernels", "observation_kernels"]
 
@@ -33,9 +33,9 @@ def loop_kernels() -> _types.SimpleNamespace:
     def end_episodes(
         time: wp.array(dtype=f64), t_end: wp.array(dtype=f64), dt: wp.array(dtype=f64), status: wp.array(dtype=wp.int32)
     ):
-        """Freeze the worlds that are within half a step of their end."""
+        """Freeze the worlds that are at their end."""
         world = wp.tid()
-        if status[world] == wp.static(running) and time[world] >= t_end[world] - f64(0.5) * dt[world]:
+        if status[world] == wp.static(running) and time[world] >= t_end[world] - f64(SAME_TIME) * dt[world]:
             status[world] = wp.static(STATUS["frozen"])
 
     @wp.kernel(module=module)

@@ -159,6 +159,6 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         predictor.kept[world, 0] = f64(best)
         predictor.kept[world, 1] = f64(wp.min(count + 1, 2))
         predictor.kept[world, 2] = step.h[world]
-        predictor.kept[world, 3] = step.new_time[world]
+        predictor.kept[world, 3] = step.time[world]
 
     return _types.SimpleNamespace(begin=begin, extrapolate=extrapolate, compare=compare, shift=shift, learn=learn)

@@ -1,7 +1,8 @@
 """The step itself: time levels, predictor, acceptance, energy ledger, report.
 
-A step of dt is walked in substeps of dt / 2^level. A refused substep raises the level by one; after an accepted one
-the level falls again as soon as the position is even, so that time stays an exact binary fraction of dt.
+A step of dt, or of what is left to the end, is walked in substeps of dt / 2^level. A refused substep raises the level
+by one; after an accepted one the level falls again as soon as the position is even, so that time stays an exact binary
+fraction of dt.
 """
 
 import functools
@@ -14,13 +15,15 @@ from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
 from ..solvers.control import FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
-from .control import STATUS, step_struct
+from .control import STATUS, step_span, step_struct
 from .ledger import ledger_kernels
 
 __all__ = ["step_kernels"]
 
 FULL = 1e-9
 """Part of the load that may lack where all of it counts as acting."""
+LARGEST_GROWTH = {"float64": 1e9, "float32": 1e4}
+"""Growth of a step up to which a multistep scheme takes the step before: its differences are rounding beyond."""
 STRETCH = 2.0
 """Largest growth of a step that accelerations are extrapolated for: after many halvings they are those of an event."""
 
@@ -40,20 +43,25 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
-    Step = step_struct()
+    Step, limits = step_struct(), step_span()
+    end_of, slack_of, span_of = limits.end, limits.slack, limits.span
     Newton = control_struct()
     PCG = pcg_struct()
     nonpotential, gated = traits.nonpotential, traits.gated
     variant = traits.suffix("nonpotential", "gated")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
+    GROWTH = LARGEST_GROWTH[dtype]
     module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
-        """Open a step of every world that has not failed."""
+        """Open a step of every world that has not failed and is not at the end of the run."""
         world = wp.tid()
+        time = step.time[world]
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
+        if time >= end_of(step, world) - slack_of(step, world):
+            alive = 0
         step.running[world] = alive
         step.refused[world] = 0
         newton.total_iterations[world] = 0
@@ -69,7 +77,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         wp.atomic_max(step.any_running, 0, 1)
         step.level[world] = 0
         step.part[world] = 0
-        step.step_start[world] = step.time[world]
+        step.step_start[world] = time
+        if wp.abs(step.summed[world] - time) <= slack_of(step, world):
+            step.step_start[world] = step.summed[world]
         step.total_J[world] = f64(1.0e30)
 
     @wp.kernel(module=module)
@@ -92,15 +102,17 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         newton.failed[world] = 0
         newton.iterations[world] = 0
         parts = f64(wp.lshift(1, step.level[world]))
-        h = step.dt[world] / parts
+        span = span_of(step, world)
+        h = span / parts
         step.h[world] = h
-        step.new_time[world] = step.step_start[world] + step.dt[world] * (f64(step.part[world] + 1) / parts)
+        step.new_time[world] = step.step_start[world] + span * (f64(step.part[world] + 1) / parts)
         if wp.static(midpoint):
             step.stage_time[world] = step.new_time[world] - f64(0.5) * h
         previous = f64(0.0)
         if wp.static(multistep):
             # a state that was set, reset or advanced by another scheme since has no past
-            if step.previous_end[world] == step.time[world]:
+            known = step.previous_end[world] == step.time[world]
+            if known and h <= f64(GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
         c = coefficients(h, previous, step.parameter)
         step.a0[world] = c.a0
@@ -241,6 +253,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.time[world] = step.new_time[world]
             if level == 0:
                 step.running[world] = 0
+                step.summed[world] = step.new_time[world]
+                if wp.abs(end_of(step, world) - step.new_time[world]) <= slack_of(step, world):
+                    step.time[world] = end_of(step, world)
             else:
                 wp.atomic_max(step.any_running, 0, 1)
             return
@@ -293,7 +308,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             v_before[world, slot] = v_n[world, slot]
             if slot == 0:
                 step.previous_h[world] = step.h[world]
-                step.previous_end[world] = step.new_time[world]
+                step.previous_end[world] = step.time[world]
         if wp.static(accelerated):
             c = coefficients(step.h[world], f64(0.0), step.parameter)
             a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
@@ -303,7 +318,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             v_before[world, slot] = T(c.mass_factor) * (new - before)
             if slot == 0:
                 step.previous_h[world] = step.h[world]
-                step.previous_end[world] = step.new_time[world]
+                step.previous_end[world] = step.time[world]
         u_n[world, slot] = u[world, slot]
         if slot == 0:
             newton.potential[world] = newton.elem_sums[0, world]

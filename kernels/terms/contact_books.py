@@ -275,7 +275,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         his.angle[world, k] = at.angle[world, k]
         his.grown[world, k] = con.grow[world, k]
         if k == 0:
-            his.posed[world] = clock.new_time[world]
+            his.posed[world] = clock.time[world]
             at.elapsed[world] = at.elapsed[world] + clock.h[world]
             potential[world] = potential[world] + term_sums[1, world]
 

@@ -184,7 +184,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
         world = wp.tid()
         if accepted[world] == 0:
             return
-        his.posed[world] = clock.new_time[world]
+        his.posed[world] = clock.time[world]
         at.elapsed[world] = at.elapsed[world] + clock.h[world]
         potential[world] = potential[world] + term_sums[1, world]
 

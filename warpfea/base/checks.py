@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
 
-__all__ = ["is_count", "is_number"]
+__all__ = ["is_count", "is_number", "number_hint"]
+
+UNITS = {
+    **dict.fromkeys(("", "s", "m", "Pa", "N", "kg", "kg/m^3", "kg/m3"), 1.0),
+    **dict.fromkeys(("ms", "mm"), 1e-3),
+    **dict.fromkeys(("us", "um"), 1e-6),
+    **dict.fromkeys(("kPa", "kN", "g/cm^3", "g/cm3"), 1e3),
+    **{"cm": 1e-2, "MPa": 1e6, "GPa": 1e9},
+}
+"""Units that users write behind numbers, in SI units."""
 
 
 def is_number(value: Any) -> bool:
@@ -22,3 +32,17 @@ def is_number(value: Any) -> bool:
 def is_count(value: Any) -> bool:
     """A whole number."""
     return is_number(value) and value == int(value)
+
+
+def number_hint(value: Any) -> str:
+    """The text "; write 0.005, a bare number in SI units" for a text such as "5 ms", else nothing."""
+    found = re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\D.*)?", value) if isinstance(value, str) else None
+    factor = UNITS.get((found[2] or "").strip()) if found else None
+    if found is None or factor is None:
+        return ""
+    try:
+        number = float(found[1]) * factor
+    except ValueError:
+        return ""
+    short = f"{number:g}" if float(f"{number:g}") == number else f"{number:.12g}"
+    return f"; write {short}, a bare number in SI units"

@@ -10,7 +10,7 @@ from typing import Any
 from .console import size
 from .errors import CapacityError
 
-__all__ = ["enough_memory"]
+__all__ = ["REMEDY", "enough_memory"]
 
 _REFUSED = re.compile(r"Failed to allocate (?:(\d+) bytes|memory)|out of memory", re.IGNORECASE)
 
@@ -21,18 +21,18 @@ def enough_memory(what: str, device: Any) -> Iterator[None]:
     try:
         yield
     except MemoryError as error:
-        raise CapacityError(f"{what}: the host has no memory left ({error}){_REMEDY}") from error
+        raise CapacityError(f"{what}: the host has no memory left ({error}){REMEDY}") from error
     except RuntimeError as error:
         found = _REFUSED.search(str(error))
         if found is None:
             raise
         count = int(found[1]) if found[1] else 0
         asked = f"another {count} bytes ({size(count)})" if count else "what it needs"
-        text = f"{what}: device {device} has no room for {asked}{_room(device)}{_REMEDY}"
+        text = f"{what}: device {device} has no room for {asked}{_room(device)}{REMEDY}"
         raise CapacityError(text, bytes=count) from error
 
 
-_REMEDY = "; take fewer worlds, a coarser mesh, dtype='float32' or a device with more memory"
+REMEDY = "; take fewer worlds, a coarser mesh, dtype='float32' or a device with more memory"
 
 
 def _room(device: Any) -> str:

@@ -13,16 +13,32 @@ SHORT, SHORT_CUTOFF = 5, 0.75
 """Length up to which a name is short, and its cutoff: a letter in common says less of it."""
 
 
+SYNONYMS = {
+    "rho": "density",
+    **dict.fromkeys(("young", "youngs_modulus", "modulus"), "E"),
+    **dict.fromkeys(("poisson", "poissons_ratio"), "nu"),
+    **dict.fromkeys(("hinge", "pin"), "revolute"),
+    **dict.fromkeys(("ball", "socket"), "spherical"),
+    **dict.fromkeys(("prismatic", "slider"), "translational"),
+    **dict.fromkeys(("mises", "stress"), "von_mises"),
+    **dict.fromkeys(("newmark", "hht"), "generalized_alpha"),
+    **dict.fromkeys(("euler", "implicit_euler"), "backward_euler"),
+}
+"""Other words for names that are used here."""
+
+
 def did_you_mean(name: object, known: Iterable[object]) -> str:
     """The text "; did you mean 'x'?" with the known name closest to `name`, or nothing where none is close.
 
     Upper and lower case, and hyphens for underscores, count as the same; hyphens in front don't count. A short name is
-    also close to one with its letters in another order.
+    also close to one with its letters in another order; other words for a name of `SYNONYMS` mean it.
     """
     wanted = _plain(str(name))
     plain: dict[str, str] = {}
     for text in map(str, known):
         plain.setdefault(_plain(text), text)
+    if SYNONYMS.get(wanted) in plain.values():
+        return f"; did you mean {SYNONYMS[wanted]!r}?"
     found = difflib.get_close_matches(wanted, plain, n=1, cutoff=SHORT_CUTOFF if len(wanted) <= SHORT else CUTOFF)
     found = found or [text for text in plain if sorted(text) == sorted(wanted)]
     return f"; did you mean {plain[found[0]]!r}?" if found else ""

@@ -24,17 +24,35 @@ def on_host(values: Any) -> np.ndarray:
 
 
 def chosen_worlds(what: str, mask: Any, worlds: int) -> np.ndarray:
-    """(worlds,) which worlds a mask means, by default all. ModelError for another shape or other values."""
+    """(worlds,) which worlds a mask, or some of their numbers, mean, by default all.
+
+    Raises:
+        ModelError: neither, or whole numbers that may be either.
+    """
     if mask is None:
         return np.ones(worlds, dtype=bool)
     try:
         out = on_host(mask)
-        good = out.shape == (worlds,) and out.dtype.kind in "biu" and bool(np.isin(out, (0, 1)).all())
+        known = out.dtype.kind in "biu" or out.size == 0
     except (TypeError, ValueError):
-        good = False
-    if not good:
-        raise ModelError(f"{what}: mask = {mask!r} must be ({worlds},) of True and False, one per world")
-    return out.astype(bool)
+        known = False
+    flags = known and out.shape == (worlds,) and bool(np.isin(out, (0, 1)).all())
+    if flags and out.dtype.kind == "b":
+        return out.astype(bool)
+    numbers = known and out.dtype.kind != "b" and out.ndim < 2 and bool(np.isin(out, range(worlds)).all())
+    numbers = numbers and len(set(out.ravel().tolist())) == out.size
+    chosen = np.isin(np.arange(worlds), out) if numbers else np.zeros(worlds, dtype=bool)
+    if flags and not numbers:  # whole numbers, one of them twice
+        return out.astype(bool)
+    if numbers and (out.size < worlds or worlds > 3):  # of up to three worlds all numbers may be flags or statuses
+        return chosen
+    if flags:
+        one, other = out.astype(bool).tolist(), chosen.tolist()
+        raise ModelError(f"{what}: mask = {mask!r} may be flags of the worlds or their numbers; write {one} or {other}")
+    raise ModelError(
+        f"{what}: mask = {mask!r} must be ({worlds},) of True and False, one per world, or the numbers of some of the "
+        f"worlds 0 to {worlds - 1}"
+    )
 
 
 def per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ...] = ()) -> np.ndarray:

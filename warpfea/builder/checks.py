@@ -57,7 +57,8 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
     body = thing if isinstance(thing, Body) else getattr(thing, "body", None)
     wanted = " or ".join(HANDLES[kind] for kind in kinds)
     if not isinstance(body, Body):
-        raise ModelError(f"{what}: expected a handle of a body, {wanted}, got {thing!r}")
+        hint = f"; write body.nodes({thing!r}) or body.surface({thing!r})" if isinstance(thing, str) else ""
+        raise ModelError(f"{what}: expected a handle of a body, {wanted}, got {thing!r}{hint}")
     if not isinstance(thing, kinds):
         raise ModelError(f"{what}: expected {wanted} of body {body.name!r}, got {HANDLES[type(thing)]}")
     if body not in bodies:
@@ -74,7 +75,7 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
 
 def gravity_of(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
     """A constant gravity (3,), m/s^2, and its law over time, of which the constant is zero; None: constant."""
-    samples = isinstance(value, tuple) and len(value) == 2 and np.ndim(value[0]) == 1
+    samples = isinstance(value, (tuple, list)) and len(value) == 2 and np.ndim(value[0]) == 1
     if samples or isinstance(value, (wp.Function, Control)) or callable(value):
         return np.zeros(3), time_law(value, "gravity")
     return vector(value, "gravity"), None
@@ -134,7 +135,8 @@ def vector(value: Any, what: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise ModelError(f"{what} = {value!r} is not three numbers") from error
     if out.shape != (3,) or not np.all(np.isfinite(out)):
-        raise ModelError(f"{what} = {value!r} is not three finite numbers")
+        hint = f"; write a vector such as (0, 0, {value!r})" if out.shape == () else ""
+        raise ModelError(f"{what} = {value!r} is not three finite numbers{hint}")
     return out
 
 
@@ -208,7 +210,10 @@ def assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[s
         _check_density(name, "", material, mesh)
         return [("", material)], np.zeros(len(mesh.cells), dtype=np.int64)
     if not isinstance(material, dict) or not all(isinstance(m, Material) for m in material.values()):
-        raise ModelError(f"body {name!r}: material must be a law or a dict of group name to law, got {material!r}")
+        hint = "; write wf.SVK(E=2.1e11, nu=0.3, density=7850) or wf.NeoHookean.from_E_nu(...) with numbers of its own"
+        raise ModelError(
+            f"body {name!r}: material must be a law or a dict of group name to law, got {material!r}{hint}"
+        )
     index = np.full(len(mesh.cells), -1, dtype=np.int64)
     for k, (group, law) in enumerate(material.items()):
         if group not in mesh.element_sets:

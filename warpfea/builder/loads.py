@@ -76,7 +76,10 @@ def follower_pressure(body: Body, surface: SurfaceSet, pressure: Any) -> Pressur
 def check_field(field: Any) -> None:
     """Raise ModelError unless a body force is a wp.func of place and time."""
     if not isinstance(field, wp.Function):
-        raise ModelError(f"add_body_force: the field must be a wp.func, got {field!r}")
+        raise ModelError(
+            f"add_body_force: the field must be a wp.func, got {field!r}; write def f(x: wp.vec3d, t: wp.float64) -> "
+            "wp.vec3d with @wp.func above it"
+        )
     if len(field.input_types) != 2:
         raise ModelError(
             f"add_body_force: {field.key} takes {len(field.input_types)} arguments; it must be "

@@ -29,6 +29,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec
 
+from ..base.checks import number_hint
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..base.usercode import user_code
@@ -135,7 +136,10 @@ class Scene(Generic[P]):
             try:
                 out[name] = self.parameters[name].parse(text.strip())
             except ValueError as error:
-                raise ModelError(f"--set {setting}: {error} for parameter {name!r} of scene {self.name!r}") from None
+                hint = number_hint(text.strip())
+                raise ModelError(
+                    f"--set {setting}: {error} for parameter {name!r} of scene {self.name!r}{hint}"
+                ) from None
         return out
 
     def resolve(self, given: dict[str, Any]) -> dict[str, Any]:

@@ -32,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = _show_warning
+            _check_device(getattr(arguments, "device", None))
             return int(arguments.command(arguments))
     except KeyboardInterrupt as stop:
         if debug:
@@ -47,6 +48,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         code, text = _describe(error)
         print(f"warpfea: error: {text}", file=sys.stderr)
         return code
+
+
+def _check_device(name: str | None) -> None:
+    """ModelError for a device that is not there, before any work."""
+    if name is not None:
+        from ..base.devices import find_device
+
+        find_device(name)
 
 
 def _describe(error: Exception) -> tuple[int, str]:

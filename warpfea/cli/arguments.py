@@ -8,6 +8,7 @@ import pathlib
 import re
 from typing import Any, NoReturn
 
+from ..base.checks import number_hint
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
 
@@ -68,7 +69,7 @@ def positive(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = math.nan
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive finite number{number_hint(text)}") from None
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive finite number")
     return value

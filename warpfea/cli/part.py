@@ -13,6 +13,7 @@ from typing import Any
 
 from .. import materials
 from .. import mesh as meshes
+from ..base.checks import number_hint
 from ..base.errors import Error, UsageError
 from ..base.names import did_you_mean
 from ..builder.builder import ModelBuilder
@@ -127,7 +128,10 @@ def parse_material(text: str) -> tuple[str, materials.Material]:
     group, _, name = head.rpartition("=")
     if not colon or name not in LAWS:
         hint = did_you_mean(name, LAWS)
-        raise UsageError(f"{where}: expected [GROUP=]LAW:NAME=VALUE,... with LAW one of {', '.join(LAWS)}{hint}")
+        raise UsageError(
+            f"{where}: expected [GROUP=]LAW:NAME=VALUE,... with LAW one of {', '.join(LAWS)}, such as "
+            f"svk:E=2.1e11,nu=0.3,density=7850{hint}"
+        )
     values: dict[str, Any] = {}
     for item in tail.split(","):
         match = re.fullmatch(r"\s*(\w+)\s*=\s*(\S+)\s*", item)
@@ -145,13 +149,18 @@ def parse_material(text: str) -> tuple[str, materials.Material]:
         raise UsageError(f"{where}: {error}") from None
 
 
+def _hint(text: str) -> str:
+    """What to write for a text that is no number."""
+    return "; commas stand between the values" if ";" in text else number_hint(text)
+
+
 def _number(where: str, key: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise UsageError(f"{where}: {key} = {text!r} is not a finite number")
+        raise UsageError(f"{where}: {key} = {text!r} is not a finite number{_hint(text)}")
     return value
 
 

@@ -13,6 +13,7 @@ from ..base.console import quiet_warp, write_json
 from ..base.errors import ConstraintError, ConvergenceError, OutputError, UsageError
 from ..base.names import did_you_mean
 from ..base.writer import Output, check_folder, check_target
+from ..kernels.step.control import SAME_TIME
 from ..model.model import Model
 from ..simulation.checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
 from ..simulation.checkpoint import Checkpoint, load_checkpoint, read_meta
@@ -59,8 +60,9 @@ def run(options: argparse.Namespace) -> int:
         if options.resume:
             load_checkpoint(sim, options.resume)
             now = float(sim.time.max())
-            if now >= t_end - (0.5 * sim.dt if sim.error is None else 0.0):
+            if now >= t_end - (SAME_TIME * sim.dt if sim.error is None else 0.0):
                 raise UsageError(f"{options.resume}: is at t = {now:g} s already, the end is {t_end:g} s; give --t-end")
+        setup_s = clock.perf_counter() - began
         status = "failed"
         try:
             if options.static:
@@ -80,21 +82,17 @@ def run(options: argparse.Namespace) -> int:
             raise
         finally:
             with interruptible():  # all is done but the report: Ctrl-C does not take it away
-                summary = summarize(source, sim, status=status, wall_s=clock.perf_counter() - began)
-                _report(options, sim, summary, before, t_end if status == "done" else None)
+                wall_s = clock.perf_counter() - began
+                _report(options, sim, summarize(source, sim, status=status, wall_s=wall_s, setup_s=setup_s), before)
     return DONE
 
 
 def _report(
-    options: argparse.Namespace,
-    sim: Simulation,
-    summary: dict[str, Any],
-    before: dict[pathlib.Path, Any],
-    t_end: float | None,
+    options: argparse.Namespace, sim: Simulation, summary: dict[str, Any], before: dict[pathlib.Path, Any]
 ) -> None:
     """Write the summary, and print it. An output that fails here does not hide what ended the run.
 
-    `before` are the marks of the outputs before the run, `t_end` as of `human`.
+    `before` are the marks of the outputs before the run.
     """
     if options.json:
         try:
@@ -103,7 +101,7 @@ def _report(
             if summary["status"] == "done":
                 raise
     if not options.quiet and options.json != "-":
-        print(human(summary, sim, _written(options, before), t_end))
+        print(human(summary, sim, _written(options, before)))
         sys.stdout.flush()
 
 
@@ -169,12 +167,12 @@ def _check_look(options: argparse.Namespace) -> None:
 
 
 def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> None:
-    """UsageError for an end before the first step, and for a picture of what is not reached."""
+    """UsageError for an end at the start, and for a picture of what is not reached."""
     fixed = not (options.static or options.resume or isinstance(source.dt, str))
-    if fixed and t_end <= 0.5 * float(source.dt):
+    if fixed and t_end <= SAME_TIME * float(source.dt):
         raise UsageError(
-            f"--t-end {t_end:g}: no step would be done, for it is at most half a step of dt = {source.dt:g} s; "
-            "give a smaller --dt or a later --t-end"
+            f"--t-end {t_end:g}: no step would be done, for it is within {SAME_TIME:g} of a step from the start; give "
+            "a later --t-end"
         )
     if options.png_time is not None and not 0.0 <= options.png_time <= t_end * (1.0 + 1e-9):
         raise UsageError(f"--png-time {options.png_time:g}: the run lasts from 0 to t = {t_end:g} s")

@@ -10,6 +10,7 @@ import numpy as np
 from ..base.console import number, plain, table
 from ..base.provenance import versions
 from ..kernels.elements.materials import ANY_J
+from ..kernels.step.control import SAME_TIME
 from ..model.model import Model
 from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
@@ -33,6 +34,9 @@ KEYS = (
     "status",
     "wall_s",
     "compile_s",
+    "setup_s",
+    "solve_s",
+    "output_s",
     "newton_iterations",
     "pcg_iterations",
     "max_residual",
@@ -58,20 +62,25 @@ NO_J = 1e30
 """What a step reports for the smallest J where no element has one."""
 
 
-def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) -> dict[str, Any]:
+def summarize(
+    source: Source, sim: Simulation, *, status: str, wall_s: float, setup_s: float | None = None
+) -> dict[str, Any]:
     """The summary of a run of one world, SI units.
 
     `analysis` is "dynamic" or "static"; `t_end` the time that was reached, of statics `load` the part of the load, 0 to
-    1, with `steps` load steps; `substeps` are the accepted ones of dt="auto", whose `steps` are intervals, else
-    null; `mass` is null where a density is missing, `bounding_box` that of the reference;
-    `wall_s` are the seconds from building to the closing of files, `compile_s` those of them in which the simulation
-    was made; `min_J` is the smallest det F of any step, null where there is none; `rough_steps` are
-    those accepted short of the tolerance (Jacobi), `floored_steps` those whose residual rounding stopped above it,
-    and `max_floor` the largest error that was estimated there (`StepReport.floor`), 0 without such steps; energies and
-    probes are the last values, of statics the strain energy alone; `violation` is the largest of the constraints in any
-    step, m; `contacts` has by name the largest normal_force, N, and penetration, m, of any step, and the last force, N,
-    area, m^2, and stick; `stable` is whether the equilibrium of statics is, null where that is not known.
+    1, with `steps` load steps; `substeps` are the accepted ones of dt="auto", whose `steps` are intervals, else null;
+    `mass` is null where a density is missing, `bounding_box` that of the reference; `wall_s` are the seconds from
+    building to the closing of files: `setup_s` until the first step, of which `compile_s` to make the simulation with
+    its kernels, `output_s` to write files, `solve_s` the rest; `min_J` is the smallest det F of any step, null where
+    there is none; `rough_steps` are those accepted short of the tolerance (Jacobi), `floored_steps` those whose
+    residual rounding stopped above it, and `max_floor` the largest error that was estimated there (`StepReport.floor`),
+    0 without such steps; energies and probes are the last values, of statics the strain energy alone; `violation` is
+    the largest of the constraints in any step, m; `contacts` has by name the largest normal_force, N, and penetration,
+    m, of any step, and the last force, N, area, m^2, and stick; `stable` is whether the equilibrium of statics is, null
+    where that is not known.
     """
+    setup_s = min(sim.compile_s if setup_s is None else setup_s, wall_s)
+    output_s = min(sim.output_s, wall_s - setup_s)
     probes = {}
     for probe in sim.model.probes:
         record = sim.probe(probe.name)
@@ -97,7 +106,10 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
         "substeps": int(sim.totals["substeps"].sum()) if "substeps" in sim.totals else None,
         "status": status,
         "wall_s": wall_s,
-        "compile_s": sim.compile_s,
+        "compile_s": min(sim.compile_s, setup_s),
+        "setup_s": setup_s,
+        "solve_s": wall_s - setup_s - output_s,
+        "output_s": output_s,
         "newton_iterations": int(sim.totals["newton"].sum()),
         "pcg_iterations": int(sim.totals["pcg"].sum()),
         "max_residual": sim.max_residual,
@@ -119,8 +131,8 @@ def summarize(source: Source, sim: Simulation, *, status: str, wall_s: float) ->
     return {name: plain(value) for name, value in content.items()}
 
 
-def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end: float | None = None) -> str:
-    """The summary as a table; `t_end` is the time that was asked for, s, of a run that is done."""
+def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str:
+    """The summary as a table."""
     s, info = summary, sim.model.info()
     steps = max(s["steps"], 1)
     done = f"{s['status']}, static, at {number(100.0 * (s['load'] or 0.0))} % of the load, {s['steps']} load steps"
@@ -132,15 +144,12 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
         ["size", f"{box_text(s['bounding_box'])}, {mass_text(s['mass'])}"],
         ["device", f"{s['device']}, {s['dtype']}, {sim.integrator.label}"],
         ["status", done],
-        ["time", f"{s['wall_s']:.1f} s, of which {s['compile_s']:.1f} s for kernels and set-up"],
+        ["time", _times(s)],
         ["iterations", _iterations(s, sim)],
     ]
     if s["floored_steps"]:
         end = f"{s['floored_steps']} of {s['steps']} steps end where rounding stops the residual"
         rows.append(["", f"{end}; largest estimated error {_text(s['max_floor'], 2)}"])
-    if t_end is not None and s["t_end"] is not None and abs(s["t_end"] - t_end) > 1e-9 * abs(t_end):
-        end = f"ended at t = {number(s['t_end'], 6)} s, the whole steps nearest to t_end = {number(t_end, 6)} s"
-        rows.insert(5, ["", end])
     if s["min_J"] is not None and s["min_J"] <= 0.0:
         rows.append(["WARNING", _inverted(s["min_J"], sim.model)])
     if s["stable"] is not None:
@@ -171,10 +180,18 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
     return table(rows)
 
 
+def _times(s: dict[str, Any]) -> str:
+    """What the run took."""
+    setup, kernels, solve, output = (f"{s[f'{name}_s']:.1f} s" for name in ("setup", "compile", "solve", "output"))
+    return f"{s['wall_s']:.1f} s: set-up {setup} (kernels {kernels}), solve {solve}, output {output}"
+
+
 def _steps(s: dict[str, Any], sim: Simulation) -> str:
     """How many steps of which size."""
     if sim.error is None:
-        return f"{s['steps']} steps of {number(s['dt'])} s"
+        end = s["steps"] * s["dt"] - s["t_end"]
+        shorter = s["status"] == "done" and SAME_TIME * s["dt"] < end < s["dt"]
+        return f"{s['steps']} steps of {number(s['dt'])} s{', the last shorter' * shorter}"
     refused = int(sim.totals["rejected"].sum())
     return f"{int(sim.totals['substeps'].sum())} adaptive steps, {refused} refused, for an error of {number(sim.error)}"
 

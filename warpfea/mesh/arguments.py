@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.checks import is_number
 from ..base.errors import MeshError
 from ..base.names import did_you_mean
 from .cells import ELEMENT_CELLS, Floats
@@ -23,7 +24,8 @@ def _numbers(what: str, values: Any, count: int) -> Floats:
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.shape != (count,):
-        raise MeshError(f"{what}: expected {count} number{'s' if count > 1 else ''}, got {values!r}")
+        hint = f"; write {(values,) * count!r}" if np.ndim(values) == 0 and is_number(values) else ""
+        raise MeshError(f"{what}: expected {count} number{'s' if count > 1 else ''}, got {values!r}{hint}")
     return array
 
 

@@ -144,6 +144,15 @@ def _check_mid_nodes(mesh: Mesh, curved: Ints) -> None:
     wrong = np.take_along_axis(distance2, nearest[:, :, None], axis=2)[:, :, 0] < np.einsum("mkk->mk", distance2)
     if not wrong.any():
         return
+    out_of_order = curved[wrong.any(axis=1)]
+    corners = mesh.points[mesh.cells[out_of_order, :4]]
+    left = out_of_order[np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0.0] if kind.name == "tetra10" else curved[:0]
+    if left.size:
+        raise MeshError(
+            f"{mesh.label}: element {left[0]} is inverted: its corners {mesh.cells[left[0], :4].tolist()} are numbered "
+            f"left-handed, and its mid-side nodes are not those of its edges ({left.size} such element{_s(left)}); "
+            f"{_swap_back(mesh, int(left[0]))}"
+        )
     i, k = np.argwhere(wrong)[0]
     own, other = kind.edges[k], kind.edges[nearest[i, k]]
     swapped = (nearest[wrong.any(axis=1)] == (0, 1, 2, 3, 5, 4)).all()
@@ -155,6 +164,19 @@ def _check_mid_nodes(mesh: Mesh, curved: Ints) -> None:
         f"{np.sqrt(distance2[i, k, nearest[i, k]]):.6g} m against {np.sqrt(distance2[i, k, k]):.6g} m "
         f"({int(wrong.any(axis=1).sum())} such elements{hint})"
     )
+
+
+def _swap_back(mesh: Mesh, element: int) -> str:
+    """What to do about a quadratic tetrahedron that is inverted: the two corners that were swapped, if that is all."""
+    edges = mesh.kind.edges
+    x = mesh.points[mesh.cells[element]]
+    for a, b in edges:
+        order = np.arange(4)
+        order[[a, b]] = b, a
+        middle = 0.5 * (x[order[edges[:, 0]]] + x[order[edges[:, 1]]])
+        if (np.linalg.norm(x[4:, None] - middle, axis=2).argmin(axis=1) == np.arange(6)).all():
+            return f"corners {a} and {b} were swapped without them: cells[e, [{a}, {b}]] = cells[e, [{b}, {a}]]"
+    return f"{_LEFT_HANDED[mesh.cell_type]}"
 
 
 def check_volumes(mesh: Mesh) -> None:

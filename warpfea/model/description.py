@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.brief import brief_repr
 from ..base.errors import ModelError
 from ..laws import TimeLaw
 from .bodies import Body
@@ -41,6 +42,8 @@ class Rotation:
     anchor: Any
     axis: Any
     angle: Any
+
+    __repr__ = brief_repr
 
 
 @dataclass(eq=False)

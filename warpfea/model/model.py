@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from ..base.devices import find_device
 from ..base.errors import ModelError
 from ..base.memory import enough_memory
 from ..kernels.common.types import precision
@@ -22,7 +23,7 @@ from .parameters import MaterialParameters
 from .state import State
 from .topology import free_groups, label_components, make_topology
 
-__all__ = ["Block", "Model", "find_device"]
+__all__ = ["Block", "Model"]
 
 
 SHOWN = 3
@@ -429,12 +430,3 @@ class Model:
         h.update(self._built_of)
         self.terms.hash(h)
         return h.hexdigest()
-
-
-def find_device(device: Any) -> Any:
-    """A Warp device by name, None for the preferred one. ModelError lists those there are."""
-    try:
-        return wp.get_device(device) if device is not None else wp.get_preferred_device()
-    except Exception as error:
-        names = ", ".join(str(d) for d in wp.get_devices())
-        raise ModelError(f"device {device!r} is not there; Warp finds {names}") from error

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.brief import lines
 from ..base.errors import CheckpointError, ModelError
 from ..base.memory import enough_memory
 from ..kernels.common.state import state_kernels
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["ArraySpec", "State", "words_of"]
 
-MEMORY = ("preconditioner", "operator", "predictor")
-"""What names of arrays begin with that solvers remember; a state can do without."""
+MEMORY = ("preconditioner", "operator", "predictor", "summed")
+"""What names of arrays begin with that a state can do without: memory of solvers, roundings of the time."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,10 @@ class State:
         self._words: dict[str, wp.array] = {}
         self.sealed = False
         self.asked: list[str] = []  # names in the order of `register`
+
+    def __repr__(self) -> str:
+        worlds = f"{self.worlds} world{'s' * (self.worlds != 1)}"
+        return lines(f"State({worlds} on {self.device}: {', '.join(self.specs)})")
 
     def __getattr__(self, name: str) -> wp.array:
         arrays = self.__dict__.get("_arrays", {})

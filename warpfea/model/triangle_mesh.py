@@ -91,6 +91,12 @@ class TriMesh(Shape):
                 "round, [:, ::-1]"
             )
 
+    def __repr__(self) -> str:
+        used = self.points[self.triangles.ravel()]
+        box = " x ".join(f"{side:.4g}" for side in used.max(axis=0) - used.min(axis=0))
+        kind = f"closed, {self.volume:.4g} m^3" if self.closed else "a sheet"
+        return f"TriMesh({len(self.points)} points, {len(self.triangles)} triangles, {box} m, {kind})"
+
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
         """The middle of its box, and the axes of the world."""
         used = self.points[self.triangles.ravel()]

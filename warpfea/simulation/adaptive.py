@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.checks import is_number
+from ..base.checks import is_number, number_hint
 from ..base.errors import ModelError
 from ..kernels.step.adaptive import COUNTS, KEPT, adaptive_kernels, adaptive_struct
 from ..solvers import NewtonPCG
@@ -58,7 +58,7 @@ def adapt_of(
                 raise ModelError(f"{name} = {value!r} is for dt = 'auto', and dt is {dt!r}")
         return None
     if dt != "auto":
-        raise ModelError(f"dt = {dt!r} must be a positive finite time (s), or 'auto'")
+        raise ModelError(f"dt = {dt!r} must be a positive finite time (s), or 'auto'{number_hint(dt)}")
     if not (is_number(error) and 0.0 < error < 1.0):
         raise ModelError(
             f"dt = 'auto' needs error, over the model's size, between 0 and 1, such as 1e-4; got {error!r}"

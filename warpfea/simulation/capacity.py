@@ -16,6 +16,7 @@ import warp as wp
 
 from ..base.console import size
 from ..base.errors import CapacityError
+from ..base.memory import REMEDY
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -64,8 +65,7 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
     per_world = need // model.worlds
     raise CapacityError(
         f"a simulation of {model.worlds} worlds takes {size(need)}, {per_world} bytes per world, and {model.device} "
-        f"has {size(free)} free: at most {fit} worlds fit; take fewer, a coarser mesh, dtype='float32' or a device "
-        "with more memory",
+        f"has {size(free)} free: at most {fit} worlds fit{REMEDY}",
         bytes=need, per_world=per_world, worlds=fit,
     )  # fmt: skip
 

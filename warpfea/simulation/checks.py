@@ -7,18 +7,25 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..base.checks import is_number, number_hint
 from ..base.errors import ModelError
 from ..model.model import Model
 from ..model.state import State
 
 __all__ = ["check_choice", "check_constraint_tol", "check_mask", "check_model", "check_state", "check_steps",
-           "check_times", "write_times"]  # fmt: skip
+           "check_time", "check_times", "write_times"]  # fmt: skip
 
 
 def check_model(model: Any) -> None:
     """Raise ModelError for what is not a Model, such as a builder."""
     if not isinstance(model, Model):
         raise ModelError(f"expected a Model, got {type(model).__name__}; builder.finalize() makes one")
+
+
+def check_time(name: str, value: Any) -> None:
+    """Raise ModelError for what is not a time, s."""
+    if not is_number(value):
+        raise ModelError(f"{name} = {value!r} must be a finite time (s){number_hint(value)}")
 
 
 def check_times(name: str, value: Any, model: Model, *, positive: bool = False) -> None:
@@ -33,7 +40,7 @@ def check_times(name: str, value: Any, model: Model, *, positive: bool = False) 
         return
     one = isinstance(value, (int, float, np.floating)) and not isinstance(value, bool)
     if not one and not isinstance(value, (np.ndarray, list, tuple)):
-        raise ModelError(f"{name} = {value!r} must be a {what}, or one of each world")
+        raise ModelError(f"{name} = {value!r} must be a {what}, or one of each world{number_hint(value)}")
     try:
         values = np.asarray(value, dtype=float)
     except (TypeError, ValueError):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.brief import FEW, brief, lines
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
 from ..laws import Control
@@ -49,7 +50,7 @@ class Controls(Mapping[str, "ControlValue"]):
         return len(self._values)
 
     def __repr__(self) -> str:
-        return f"Controls({', '.join(map(repr, self._values.values()))})"
+        return lines(f"Controls({', '.join(map(repr, self._values.values()))})")
 
 
 class ControlValue:
@@ -138,7 +139,8 @@ class ControlValue:
         return self.array.__dlpack_device__()
 
     def __repr__(self) -> str:
-        return f"ControlValue({self.control.name!r}, {self.numpy().tolist()})"
+        values = self.numpy()
+        return f"ControlValue({self.control.name!r}, {values.tolist() if len(values) <= FEW else brief(values)})"
 
     @property
     def _what(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +32,9 @@ class Loops:
         self.tally: wp.array | None = None
         self.stepped: wp.array | None = None
         self._flags: wp.array | None = None
+        self.stop_at()
+        if ends:
+            work.step.ends = self.ends
         if quiet:
             self.tally = work.array("tally", (model.worlds, len(TALLY)), wp.float64)
             self.stepped = work.array("stepped", (model.worlds,), wp.int32)
@@ -39,6 +43,11 @@ class Loops:
     def modules(self) -> set[wp.Module]:
         """Modules that it launches."""
         return set() if self.tally is None and self.ends is None else {loop_kernels().module}
+
+    def stop_at(self, end: float = math.inf, steps: int = 0) -> None:
+        """A run of so many steps begins, whose last one is to meet its end, s; inf: it is over."""
+        # the steps add up to the end but for their roundings
+        self.work.step.stop.assign(np.array([end, steps * math.ulp(end) if steps else 0.0]))
 
     def end(self) -> None:
         """A step begins, or has been reported: worlds that are at their end take no further part."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..base.brief import lines
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
 from ..kernels.step.loops import MOTION, VALUES, observation_kernels
@@ -200,4 +201,4 @@ class Observations:
         return self.array.__dlpack_device__()
 
     def __repr__(self) -> str:
-        return f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._width})"
+        return lines(f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._width})")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.brief import brief_repr
 from ..base.errors import ModelError
 
 __all__ = ["ContactRecord", "JointRecord", "PendingReport", "ProbeRecord", "StepReport", "describe", "idle_report",
@@ -57,6 +58,8 @@ class StepReport:
     largest_h: np.ndarray | None = None
     stable: np.ndarray | None = None
 
+    __repr__ = brief_repr
+
 
 class PendingReport(StepReport):
     """A report that is read from the device when one of its arrays is asked for.
@@ -94,6 +97,8 @@ class JointRecord:
     moment: np.ndarray
     violation: np.ndarray
 
+    __repr__ = brief_repr
+
 
 @dataclass(frozen=True, eq=False)
 class ContactRecord:
@@ -126,6 +131,8 @@ class ContactRecord:
     friction: np.ndarray
     collider_work: np.ndarray
 
+    __repr__ = brief_repr
+
 
 @dataclass(frozen=True, eq=False)
 class ProbeRecord:
@@ -136,6 +143,8 @@ class ProbeRecord:
     position: np.ndarray
     displacement: np.ndarray
     velocity: np.ndarray
+
+    __repr__ = brief_repr
 
 
 def idle_report(sim: Any) -> StepReport:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
+import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
+
+import numpy as np
 
 from ..kernels.step.control import STATUS
 
@@ -28,13 +31,23 @@ def run_steps(
     """
     opened: list[Any] = []
     cut = False
+
+    def each(do: Callable[[Any], Any], outs: Sequence[Any]) -> None:
+        began = clock.perf_counter()
+        try:
+            for out in outs:
+                do(out)
+        finally:
+            sim.output_s += clock.perf_counter() - began
+
+    def open_one(out: Any) -> None:
+        opened.append(out)
+        out.open(sim)
+
     with interruptible() as interrupted, step_bar(total, t_end, progress, static=sim.load is not None) as bar:
         try:
-            for out in outputs:
-                opened.append(out)
-                out.open(sim)
-            for out in opened:
-                out.write(sim)
+            each(open_one, outputs)
+            each(lambda out: out.write(sim), opened)
         except BaseException:  # nothing has been done yet: leave no half-empty files
             for out in opened:
                 out.abort()
@@ -42,10 +55,10 @@ def run_steps(
         try:
             for done in range(1, total + 1):
                 report = sim.step()
-                for out in opened:
-                    out.write(sim)
+                each(lambda out: out.write(sim), opened)
                 bar(report)
-                if on_step is not None and on_step(sim) is False:
+                answer = None if on_step is None else on_step(sim)
+                if isinstance(answer, (bool, np.bool_)) and not answer:
                     break
                 cut = interrupted() and done < total
                 if cut or (report.status != STATUS["running"]).all():
@@ -53,7 +66,7 @@ def run_steps(
         except BaseException:
             close_all(opened, sim)
             raise
-        close_all(opened, sim, quiet=False)
+        each(lambda out: close_all(out, sim, quiet=False), [opened])
         if cut:
             raise KeyboardInterrupt
 

@@ -15,7 +15,8 @@ from ..base.console import compile_bar, quiet_warp
 from ..base.errors import ModelError
 from ..base.memory import enough_memory
 from ..base.names import listing
-from ..kernels.step.control import STATUS
+from ..base.worlds import chosen_worlds
+from ..kernels.step.control import SAME_TIME, STATUS
 from ..model.assembly import require_density
 from ..model.handles import NodeSet
 from ..model.state import State
@@ -30,6 +31,7 @@ from .checks import (
     check_model,
     check_state,
     check_steps,
+    check_time,
     check_times,
     write_times,
 )
@@ -55,8 +57,8 @@ class Simulation(Digests):
         state: where it starts; by default model.state(). It is advanced in place.
         dt: step, s, of all worlds or of each (worlds,), which may be set later; or "auto": each world takes the steps
             that keep its error to `error`, and all meet at common instants, to which `step` goes.
-        t_end: s, of all worlds or of each (worlds,), which may be set later: on the device worlds are frozen within
-            half a step of it, until they are reset. None: no end.
+        t_end: s, of all worlds or of each (worlds,), which may be set later: the last step of a world is shortened to
+            meet it, and on the device the world is then frozen, until it is reset. None: no end.
         error: of dt="auto": largest error of a position at the end, over the model's size (`model.size`).
         interval: of dt="auto": s between common instants at most; they are multiples of it, times of outputs, kinks of
             time laws and the ends of runs. None: a 64th of the first run, 1/60 s of steps without one.
@@ -78,6 +80,7 @@ class Simulation(Digests):
 
     Attributes:
         controls: what the caller writes between steps, see Controls.
+        compile_s, output_s: s that it took to make the simulation, kernels included, and that writers of runs took.
 
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
@@ -148,7 +151,7 @@ class Simulation(Digests):
             self.stepper = stepper(model, self.state, capture)
         model.parameters.begun = True
         self.controls = Controls(model, self.state)
-        self.compile_s = clock.perf_counter() - began
+        self.compile_s, self.output_s = clock.perf_counter() - began, 0.0
         self.error = adapt.error if adapt else None
         self._open_digest(quiet)
         self._start: State | None = None
@@ -262,19 +265,18 @@ class Simulation(Digests):
         """Step until t_end (s), writing outputs. Ctrl-C ends after the step in hand, with valid files.
 
         Args:
-            t_end: end time, s; the number of steps is rounded to the nearest, so the end may differ by half a step.
-                With dt="auto" it is met.
+            t_end: end time, s, which is met: the last step is shortened, and what is below 1e-6 dt is no step of its
+                own. A world that is there earlier than others waits.
             outputs: writers (USDWriter, VTUWriter, Checkpoint, ...).
             on_step: called after each step; ends the run when it returns False.
             progress: show a bar on stderr; by default when stderr is a terminal.
 
         Raises:
-            ModelError: t_end lies in the past, or is so close to the start that no step would be done.
+            ModelError: t_end lies in the past.
             ConvergenceError, ConstraintError, OutputError: the outputs hold what came before.
             KeyboardInterrupt: after Ctrl-C, once outputs are closed; not when no step was left to do.
         """
-        if not math.isfinite(t_end):
-            raise ModelError(f"t_end = {t_end!r} must be finite")
+        check_time("t_end", t_end)
         if not isinstance(outputs, (list, tuple)) or not all(hasattr(out, "write") for out in outputs):
             raise ModelError(f"run: outputs must be a list of writers such as USDWriter(path), got {outputs!r}")
         if np.ndim(self.dt) or len(set([] if self.t_end is None else self.t_end)) > 1:
@@ -282,14 +284,20 @@ class Simulation(Digests):
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
         adaptive = self.stepper.adaptive
-        total = adaptive.steps_to(now, t_end, outputs) if adaptive else round((t_end - now) / self.dt)
-        if total < 0:
+        if t_end < now - (0.0 if adaptive else SAME_TIME * self.dt):
             raise ModelError(f"t_end = {t_end:g} s lies in the past: the simulation is at t = {now:.6g} s")
-        # who has stepped may be as close to t_end as whole steps come; a start is not
-        if total == 0 and t_end != now and (self.steps == 0 or now == 0.0):
-            away = f"t_end = {t_end:g} s is at most half a step from the start at t = {now:g} s"
-            raise ModelError(f"{away}, so no step would be done; take dt < {self.dt:g} s or a later t_end")
-        run_steps(self, total, t_end, outputs, on_step, progress)
+        if adaptive:
+            total = adaptive.steps_to(now, t_end, outputs)
+        else:
+            total = max(math.ceil((t_end - now) / self.dt - SAME_TIME), 0)
+            if total == 0 and t_end != now and self.steps == 0:
+                raise ModelError(f"t_end = {t_end:g} s is within {SAME_TIME:g} dt of the start at t = {now:g} s, so no "
+                                 "step would be done; take a later t_end")  # fmt: skip
+        self.stepper.loops.stop_at(t_end, total)
+        try:
+            run_steps(self, total, t_end, outputs, on_step, progress)
+        finally:
+            self.stepper.loops.stop_at()
         if self.last is None:
             self.last = idle_report(self)
         return self.last
@@ -297,15 +305,22 @@ class Simulation(Digests):
     def freeze(self, worlds: Any) -> None:
         """Leave worlds (indices or mask) as they are from now on."""
         status = self.state.status.numpy()
-        status[worlds] = STATUS["frozen"]
+        try:
+            status[worlds] = STATUS["frozen"]
+        except IndexError:
+            B = self.model.worlds
+            raise ModelError(
+                f"freeze: worlds = {worlds!r} must be numbers from 0 to {B - 1}, or ({B},) of True and False"
+            ) from None
         self.state.status.assign(status)
 
     def reset(self, mask: Any = None, state: State | None = None) -> None:
         """Set worlds back to a state, by default to the model's initial one.
 
         Args:
-            mask: [world], by default all; or a Warp array of int32 or bool on the model's device: nothing is read back
-                then, joints and overlaps are not checked, and worlds end bit-equal to a run from that state.
+            mask: [world] of True and False, or the numbers of some worlds, by default all; or a Warp array of int32 or
+                bool [world] on the model's device: nothing is read back then, joints and overlaps are not checked, and
+                worlds end bit-equal to a run from that state.
             state: where they go. With a Warp array as the mask one that a simulation of this model has had, such as
                 `sim.state.like()` keeps.
 
@@ -316,10 +331,7 @@ class Simulation(Digests):
         if isinstance(mask, wp.array):
             self._reset_on_device(mask, state)
             return
-        B = self.model.worlds
-        mask = np.ones(B, bool) if mask is None else np.asarray(mask, dtype=bool)
-        if mask.shape != (B,):
-            raise ModelError(f"reset: mask has shape {mask.shape}, expected ({B},)")
+        mask = chosen_worlds("reset", mask, self.model.worlds)
         source = self.model.state() if state is None else state
         check_state(self.model, source)
         self._own_times |= bool(mask.any() and not mask.all())

@@ -86,6 +86,7 @@ class Stepper:
             state.register("ledger", wp.float64, (len(model.terms.ledger),))
             state.register("ledger_time", wp.float64)
         state.register("status", wp.int32)
+        state.register("summed_time", wp.float64)
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
         midpoint = integrator.midpoint
         loss = integrator.dissipation
@@ -134,7 +135,7 @@ class Stepper:
     def _bind(self) -> None:
         w, state = self.work, self.state
         w.step.time = state.time
-        w.step.status = state.status
+        w.step.status, w.step.summed = state.status, state.summed_time
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
         w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings

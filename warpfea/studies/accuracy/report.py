@@ -12,6 +12,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from ...base.brief import brief_repr
 from ...base.console import number, plain, size, table, write_json
 from ...base.errors import OutputError
 from ...base.provenance import machine, origin, versions
@@ -82,6 +83,8 @@ class Row:
     pareto: bool = False
     split: dict[str, float | None] | None = None
     ledger: dict[str, float] | None = None
+
+    __repr__ = brief_repr
 
     @property
     def reaches(self) -> float:

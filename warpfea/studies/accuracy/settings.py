@@ -254,6 +254,6 @@ def check_steps(dt: float, t_end: float) -> None:
     if count < 0.5 or abs(count - round(count)) > 1e-6 * max(1.0, count):
         near = ", ".join(f"{t_end / n:.12g}" for n in (math.floor(count), math.ceil(count)) if n > 0)
         raise ModelError(
-            f"study: dt = {dt:g} s does not divide the end time {t_end:g} s ({count:.6g} steps), and runs would end at "
-            f"different times; take {near} s or another end time"
+            f"study: dt = {dt:g} s does not divide the end time {t_end:g} s ({count:.6g} steps): the last one would be "
+            f"shorter, and no error of this step; take {near} s or another end time"
         )

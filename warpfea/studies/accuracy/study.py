@@ -11,12 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import warp as wp
-
 from ...base.checks import is_number
 from ...base.console import quiet_warp
+from ...base.devices import find_device
 from ...base.errors import ModelError
 from ...base.names import did_you_mean, listing
+from ...builder.builder import ModelBuilder
 from ...builder.reference import Reference, read_reference, reference_of
 from ...builder.scene import Scene, locate
 from ...builder.scene import scene as as_scene
@@ -41,7 +41,7 @@ RUN = "run"
 
 
 def study(
-    scene: Scene[Any] | Callable[..., Any] | str,
+    scene: Scene[Any] | Callable[..., ModelBuilder] | str,
     *,
     over: Mapping[str, Sequence[Any]] | None = None,
     methods: Sequence[str] | None = None,
@@ -133,7 +133,7 @@ def study(
         solver=solver,
         tol=tol if tol is not None else found.tol,
         dtype=dtype,
-        device=_device(device),
+        device=str(find_device(device)),
         t_end=float(t_end or found.t_end),
         values=found.resolve(swept | values),
     )
@@ -192,14 +192,6 @@ def _check_names(what: str, given: Mapping[str, Any], known: Any) -> None:
             raise ModelError(
                 f"study: {what} {name!r} is unknown; there are {listing(known)}{did_you_mean(name, known)}"
             )
-
-
-def _device(name: str | None) -> str:
-    try:
-        with quiet_warp():
-            return str(wp.get_device(name) if name else wp.get_preferred_device())
-    except (ValueError, RuntimeError) as error:
-        raise ModelError(f"study: device {name!r}: {error}") from None
 
 
 def _check_probes(scene: Scene[Any], setting: Setting, chosen: Sequence[str] | None) -> None:

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ...model.model import Model, find_device
+from ...base.devices import find_device
+from ...model.model import Model
 from ...simulation.simulation import Simulation
 from ...solvers.residual import Residual
 from ..profile.profiling import copy_bandwidth

@@ -15,9 +15,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import warp as wp
-
 from ...base.console import number, plain, quiet_warp, table, write_json
+from ...base.devices import find_device
 from ...base.errors import Error, UsageError
 from ...base.names import did_you_mean
 from ...base.provenance import origin
@@ -244,10 +243,7 @@ def stress(options: argparse.Namespace) -> bool:
     if options.json and options.json != STDOUT:
         check_target(options.json, (".json",))
     with quiet_warp():
-        try:
-            device = str(wp.get_device(options.device) if options.device else wp.get_preferred_device())
-        except (ValueError, RuntimeError) as error:
-            raise UsageError(f"--device {options.device}: {error}") from None
+        device = str(find_device(options.device))
         settings = {"case": options.case, "quick": options.quick, "dtype": options.dtype, "meshes": meshes is not None}
         content = _started(options, settings, device)
         run_rows(rows, device, meshes, content, options)

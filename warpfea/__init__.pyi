@@ -1,0 +1,48 @@
+"""What type checkers see of warpfea: the names of `__init__.py`, and `study`, which is loaded when it is asked for."""
+# ruff: noqa: I001
+
+from . import mesh as mesh
+from .base.errors import (
+    CapacityError as CapacityError,
+    CheckpointError as CheckpointError,
+    ConstraintError as ConstraintError,
+    ConvergenceError as ConvergenceError,
+    Error as Error,
+    MeshError as MeshError,
+    MeshWarning as MeshWarning,
+    ModelError as ModelError,
+    OutputError as OutputError,
+    PenetrationError as PenetrationError,
+)
+from .base.version import __version__ as __version__
+from .builder.beams import spline as spline
+from .builder.builder import ModelBuilder as ModelBuilder
+from .builder.joints import GROUND as GROUND
+from .builder.reference import Reference as Reference
+from .builder.scene import scene as scene
+from .elements.sections import Rectangle as Rectangle
+from .laws import Control as Control
+from .materials import SVK as SVK, KelvinVoigt as KelvinVoigt, MooneyRivlin as MooneyRivlin, NeoHookean as NeoHookean
+from .model.bodies import Body as Body
+from .model.description import Rotation as Rotation
+from .model.handles import (
+    ElementSet as ElementSet,
+    MaterialPoint as MaterialPoint,
+    NodeSet as NodeSet,
+    SurfaceSet as SurfaceSet,
+)
+from .model.joints import Joint as Joint
+from .model.model import Model as Model
+from .model.shapes import Box as Box, Capsule as Capsule, Cylinder as Cylinder, HalfSpace as HalfSpace, Sphere as Sphere
+from .model.state import State as State
+from .model.triangle_mesh import TriMesh as TriMesh
+from .outputs.render import GIFWriter as GIFWriter, PNGWriter as PNGWriter
+from .outputs.usd import USDWriter as USDWriter
+from .outputs.vtk import VTUWriter as VTUWriter
+from .simulation.checkpoint import Checkpoint as Checkpoint
+from .simulation.integrators import GeneralizedAlpha as GeneralizedAlpha
+from .simulation.observations import Observations as Observations
+from .simulation.simulation import Simulation as Simulation, StepReport as StepReport
+from .simulation.statics import solve_static as solve_static
+from .solvers import Jacobi as Jacobi, NewtonPCG as NewtonPCG
+from .studies.accuracy import study as study

@@ -1,0 +1,61 @@
+"""Short reprs of objects that hold arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from typing import Any
+
+import numpy as np
+
+__all__ = ["FEW", "brief", "brief_repr", "lines"]
+
+WIDTH, LINES = 118, 5
+"""Of a repr."""
+FEW = 4
+"""Items of an array up to which they are shown."""
+TEXT = 60
+"""Characters of a value."""
+
+
+def brief(value: Any) -> str:
+    """A value in a few words: of an array of more than 4 items the shape and the range."""
+    if isinstance(value, np.ndarray):
+        return _array(value)
+    if isinstance(value, (tuple, list)) and any(isinstance(item, np.ndarray) for item in value):
+        return f"({', '.join(map(brief, value))})"
+    if callable(value) and not isinstance(value, type) and hasattr(value, "__name__"):
+        return f"{value.__name__}()"
+    return textwrap.shorten(repr(value), TEXT, placeholder=" ...")
+
+
+def _array(a: np.ndarray) -> str:
+    if a.size == 1:
+        return _number(a.ravel()[0])
+    if a.size <= FEW and a.ndim == 1:
+        return f"[{', '.join(map(_number, a))}]"
+    if a.dtype == bool:
+        return f"{int(a.sum())} of {a.size} true"
+    shape = "x".join(map(str, a.shape))
+    known = a[np.isfinite(a)] if a.dtype.kind in "fiu" else a[:0]
+    if not known.size:
+        return f"array {shape}"
+    low, high = _number(known.min()), _number(known.max())
+    return f"array {shape}, {f'all {low}' if low == high else f'{low} to {high}'}"
+
+
+def _number(x: Any) -> str:
+    return f"{x:.4g}" if isinstance(x, (float, np.floating)) else str(x)
+
+
+def lines(text: str) -> str:
+    """A text in at most five lines."""
+    out = textwrap.wrap(text, WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    return "\n".join(out if len(out) <= LINES else [*out[: LINES - 1], "    ..."])
+
+
+def brief_repr(self: Any) -> str:
+    """The repr of a dataclass; fields that are None are left out."""
+    values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.repr}
+    shown = ", ".join(f"{name}={brief(value)}" for name, value in values.items() if value is not None)
+    return lines(f"{type(self).__name__}({shown})")

@@ -1,0 +1,26 @@
+"""What a source checkout is: `kernels/` and `scenes/` lie beside the package there."""
+
+import importlib.util
+import pathlib
+import sys
+
+__all__ = ["map_checkout"]
+
+
+def map_checkout(package: str) -> None:
+    """Bind the two folders of a checkout as sub-packages; nothing is to be done where the package is installed."""
+    root = pathlib.Path(__file__).resolve().parents[2]
+    if not (root / "pyproject.toml").is_file():
+        return
+    for name in ("kernels", "scenes"):
+        init = root / name / "__init__.py"
+        full = f"{package}.{name}"
+        if full in sys.modules or not init.is_file():
+            continue
+        spec = importlib.util.spec_from_file_location(full, init, submodule_search_locations=[str(init.parent)])
+        if spec is None or spec.loader is None:
+            continue
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[full] = module
+        spec.loader.exec_module(module)
+        setattr(sys.modules[package], name, module)

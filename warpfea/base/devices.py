@@ -1,0 +1,29 @@
+"""Devices by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from .console import quiet_warp
+from .errors import ModelError
+
+__all__ = ["find_device"]
+
+
+def find_device(device: Any = None) -> wp.Device:
+    """The Warp device of a name, None for the preferred one. ModelError lists those there are."""
+    with quiet_warp():
+        if device is None:
+            return wp.get_preferred_device()
+        # asked for a GPU where there is none, Warp's library prints errors of its own
+        bare = str(device).startswith("cuda") and not wp.is_cuda_available()
+        try:
+            if not bare:
+                return wp.get_device(device)
+        except Exception:
+            pass
+        names = ", ".join(str(known) for known in wp.get_devices())
+    hint = ", and no CUDA GPU with a driver; take 'cpu', or leave the device out" if bare else ""
+    raise ModelError(f"device {device!r} is not there; Warp finds {names}{hint}")
