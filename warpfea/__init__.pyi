@@ -1,4 +1,4 @@
-"""What type checkers see of warpfea: the names of `__init__.py`, and `study`, which is loaded when it is asked for."""
+"""Interface for type checkers: the names of `__init__.py`, and `study`, which is loaded when it is asked for."""
 # ruff: noqa: I001
 
 from . import mesh as mesh
@@ -13,6 +13,8 @@ from .base.errors import (
     ModelError as ModelError,
     OutputError as OutputError,
     PenetrationError as PenetrationError,
+    StabilityError as StabilityError,
+    StabilityWarning as StabilityWarning,
 )
 from .base.version import __version__ as __version__
 from .builder.beams import spline as spline
@@ -40,7 +42,7 @@ from .outputs.render import GIFWriter as GIFWriter, PNGWriter as PNGWriter
 from .outputs.usd import USDWriter as USDWriter
 from .outputs.vtk import VTUWriter as VTUWriter
 from .simulation.checkpoint import Checkpoint as Checkpoint
-from .simulation.integrators import GeneralizedAlpha as GeneralizedAlpha
+from .simulation.integrators import EnergyMomentum as EnergyMomentum, GeneralizedAlpha as GeneralizedAlpha
 from .simulation.observations import Observations as Observations
 from .simulation.simulation import Simulation as Simulation, StepReport as StepReport
 from .simulation.statics import solve_static as solve_static
