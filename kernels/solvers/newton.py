@@ -178,9 +178,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def judge_floor(ctl: Control, component_of_part: wp.array(dtype=wp.int32)):
-        """The error that a residual stands for, over the size of the solution, of the worst body.
+        """The error that a residual stands for, over the size of the solution, of the worst part.
 
-        With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); each body
+        With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); each part
         by itself, or a soft one would hide behind a stiff one that a joint ties it to.
         """
         world = wp.tid()

@@ -197,6 +197,7 @@ class NewtonLoop:
         ctl.eps = EPS[model.dtype]
         ctl.equilibrium = int(not inertia)
         ctl.length = float(model.size)
+        ctl.component_of_group = model.residual_groups.component
         ctl.max_iterations = options.max_newton
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
@@ -342,10 +343,11 @@ class NewtonLoop:
         """What hard steps need: the error that a residual stands for, the length of steps that Armijo's rule would cut,
         the searches that follow, and whether an accepted iterate is inside out."""
         m, w, k = self.model, self.work, self.kernels
-        args = [w.newton, m.part_slot_start, m.part_slot, m.part_element_start, m.part_element]
+        parts = m.residual_parts
+        args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
-        self.launch(k.floor_partial, (m.worlds, m.part_count, FLOOR_LANES), args)
-        self.launch(k.judge_floor, m.worlds, [w.newton, m.component_of_part])
+        self.launch(k.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
+        self.launch(k.judge_floor, m.worlds, [w.newton, parts.component])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self.residual.elements.measure_turn(self.at, w.direction, w.newton.active)
