@@ -42,6 +42,8 @@ SWIFT = 1.0e4
 """Roundings of its speed below which, in double precision, an error of a body's velocities is none."""
 REACTION = 1.0e-6
 """Share of twice the strain energy in the squared scale of a residual group."""
+ROUNDED = 8.0
+"""Roundings of the positions up to which, in double precision, the residual of a group among others is none."""
 TRIES = 3
 """Solves that may find the error of a stalled iterate too large before the step is given up."""
 
@@ -113,6 +115,20 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         return wp.vec3d(ctl.group_sums[0, world, group], wp.max(f2, stress), ctl.group_sums[4, world, group])
 
     @wp.func
+    def rounded(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
+        """Whether in double precision a group's residual is that of rounded positions, and within the tolerance of all
+        groups of its component: solving on would not make it smaller."""
+        if ctl.groups == ctl.components or ctl.eps > f64(COARSE) or norm > f64(ROUNDED) * rounding:
+            return False
+        internal, loads, inertia = f64(0.0), f64(0.0), f64(0.0)
+        for other in range(ctl.groups):
+            if ctl.component_of_group[other] == ctl.component_of_group[group]:
+                internal += ctl.group_sums[1, world, other]
+                loads += ctl.group_sums[2, world, other]
+                inertia += ctl.group_sums[3, world, other]
+        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, inertia)))
+
+    @wp.func
     def measure(ctl: Control, world: int):
         """Norms and acceptance of the residual just evaluated, for each residual group apart where there are several.
 
@@ -140,6 +156,9 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 accept = wp.max(accept, norm * (ctl.force_tol / force))
             if ctl.predicted[world] != 0:
                 accept = f64(PREDICTED) * accept  # what is left would add up over steps that none solves for
+            rounding = f64(2.0) * ctl.eps * wp.sqrt(sums[2])
+            if norm > accept and rounded(ctl, world, group, norm, rounding):
+                accept = norm
             loud = norm > accept
             if wp.static(gated):
                 allowed = closure(ctl, world, ctl.constraint_tol)
@@ -152,7 +171,6 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.quiet[world, ctl.component_of_group[group]] = 0
                 solve += g2
                 solve_accept = wp.min(solve_accept, accept)
-                rounding = f64(2.0) * ctl.eps * wp.sqrt(sums[2])
                 if wp.static(gated):
                     if ctl.classical != 0:  # the residual holds rho c, and so kappa times the rounding of places
                         rounding = rounding / (ctl.slack * ctl.slack)

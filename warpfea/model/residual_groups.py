@@ -10,17 +10,33 @@ import warp as wp
 
 __all__ = ["SlotGroups", "slot_groups"]
 
-LIKE = 10.0
-"""Shear moduli that differ by less than this factor, one from the next, are of like stiffness."""
+LIKE = 30.0
+"""Stiffnesses that differ by less than this factor, one from the next, are alike."""
 
 
-def stiffness_classes(mu: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """(n,) number, from 0 for the softest, of the class of like shear moduli `mu` (n,), Pa, within each `label`."""
-    out = np.zeros(len(mu), dtype=np.int64)
+def stiffness_classes(stiffness: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(n,) number, from 0 for the softest, of the class of like `stiffness` (n,) within each `label`."""
+    out = np.zeros(len(stiffness), dtype=np.int64)
     for one in np.unique(label):
-        values, which = np.unique(mu[label == one], return_inverse=True)
+        values, which = np.unique(stiffness[label == one], return_inverse=True)
         out[label == one] = np.append(0, np.cumsum(values[1:] > LIKE * values[:-1]))[which.ravel()]
     return out
+
+
+def slenderness(model: Any) -> np.ndarray:
+    """(parts,) squared ratio of the least to the largest radius of gyration of each part, which bending softens by.
+
+    With x = sum_i s_i E_i the second moments of a part are E^T M E.
+    """
+    E, M = model.reference, model.mass_host
+    count = int(model.part.max()) + 1
+    rows = np.column_stack([np.ones(model.slots) * model.is_position_host, E])
+    moments = np.zeros((count, 4, 4))
+    np.add.at(moments, model.part, rows[:, :, None] * (M @ rows)[:, None, :])
+    mass, centre = moments[:, 0, 0], moments[:, 0, 1:] / moments[:, :1, 0]
+    second = moments[:, 1:, 1:] / mass[:, None, None] - centre[:, :, None] * centre[:, None, :]
+    least, _, largest = np.linalg.eigvalsh(second).T
+    return np.maximum(least / largest, 1e-12)
 
 
 def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -30,9 +46,9 @@ def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
     softest of its slots. Moduli are those that the model was built with.
     """
     parts = [host for block in model.blocks for host in block.parts]
-    component = np.concatenate([model.component[host.conn[:, 0] + host.body.slot_offset] for host in parts])
+    first = np.concatenate([host.conn[:, 0] + host.body.slot_offset for host in parts])
     mu = np.concatenate([np.full(len(host.conn), host.body.materials[host.material][1].lame[1]) for host in parts])
-    of_element = stiffness_classes(mu, component)
+    of_element = stiffness_classes(mu * slenderness(model)[model.part[first]], model.component[first])
     of_slot = np.zeros(model.slots, dtype=np.int64)
     connectivity = [block.connectivity for block in model.blocks]
     ends = np.cumsum([len(conn) for conn in connectivity])[:-1]
