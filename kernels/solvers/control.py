@@ -122,6 +122,7 @@ def control_struct():
         new_walls: wp.array(dtype=wp.int32)  # what they hold now may set in suddenly again
         # where rounding stops the residual
         strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left; 2: it has been done
+        any_strict: wp.array(dtype=wp.int32)  # a world's next solve does
         rounds: wp.array(dtype=wp.int32)  # linear solves of this attempt
         strict_count: wp.array(dtype=wp.int32)
         eta: wp.array(dtype=wp.float64)  # that error, over the size of the solution; of the last such solve

@@ -213,6 +213,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def ask(ctl: Control, world: int):
         """Let the next solve tell how large an error the residual stands for; see `judge_floor`."""
         ctl.strict[world] = 1
+        wp.atomic_max(ctl.any_strict, 0, 1)
         ctl.mixed[world] = 0
 
     @wp.func

@@ -31,6 +31,8 @@ ROUNDS = 3
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1  # of the first solve of a step that begins far from its end: what it is solved to is lost
+SCATTER = 2.0
+"""Factor on the displacement that the mean of a few residuals tells: it scatters by half of what rounding leaves."""
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
 
@@ -208,6 +210,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 eta = f64(1.0e30)
                 if ctl.negative[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
                     eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
+                    if ctl.eps > f64(COARSE):  # a direction may be so soft that energy does not see it
+                        eta = wp.max(eta, f64(SCATTER) * dq * step / wp.max(largest, f64(1.0e-300)))
                     if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * largest:
                         eta = dq * step / wp.max(largest, f64(1.0e-300))
                     if eta > ctl.floor_bound and step <= f64(SWIFT) * ctl.eps * speed and ctl.eps < f64(COARSE):

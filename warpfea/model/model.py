@@ -242,7 +242,6 @@ class Model:
             "driven nodes": any(s.law or s.node_laws for s in self.description.supports),
             "free groups": self.group_count > 0,
             "separate components": self.component_count > 1,
-            "groups of like stiffness": self.residual_groups.count > self.component_count,
             "probes": bool(self.probes),
         }
 

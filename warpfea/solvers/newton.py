@@ -15,6 +15,7 @@ from ..base.launch import labelled
 from ..kernels.elements.materials import ANY_J
 from ..kernels.solvers.control import FLOOR_LANES
 from ..kernels.solvers.newton import newton_kernels
+from ..kernels.solvers.vectors import SHAKES
 from .direct import Direct
 from .pcg import PCG
 from .preconditioner import NAMES, choose, make
@@ -211,6 +212,10 @@ class NewtonLoop:
         if at.accelerated and model.dtype == "float64":  # in float32 places are rounded by more
             ctl.constraint_pace = max(constraint_tol / model.size, ctl.tol) * FALL
             ctl.constraint_least = CLOSED * model.size
+        # in double precision the errors that rounding leaves are far below those that steps are refused for
+        self.shaking = model.dtype == "float32"
+        if self.shaking:
+            self.shaken = work.array("shaken", (model.worlds,), wp.int32)
         self.candidates: Sequence[Callable[[], None]] = ()
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
@@ -304,6 +309,9 @@ class NewtonLoop:
         w, k, launch = self.work, self.kernels, self.launch
         active = w.newton.active
         self.residual.linearise(active)
+        if self.shaking:
+            with launch.rare():
+                wp.capture_if(w.newton.any_strict, self._shake)
         self.pcg.solve(active)
         self.residual.hold_nonpotential(active)
         self.residual.tangent_curvature(active)
@@ -322,6 +330,25 @@ class NewtonLoop:
         self.preconditioner.follow(active)
         self._each("follow", active)
         self._any(active, self.iterating)
+
+    @labelled("control")
+    def _shake(self) -> None:
+        """Put the mean of residuals at shaken positions in place of the residual, for the solve that tells its error.
+
+        Rounding leaves a residual that is a function of the iterate's bits. Newton's method finds where that vanishes,
+        so of the error that it stands for nothing is left to see there, and least along directions that are soft.
+        """
+        w, k, launch, flags = self.work, self.kernels, self.launch, self.shaken
+        for sample in range(SHAKES + 1):
+            if sample:
+                self.residual.place(flags)
+            launch(k.shake, self.dim, [w.newton, sample, w.u_stage, w.p, w.z, flags])
+            if sample:
+                self.residual.balance(flags)
+                launch(k.add_gradient, self.dim, [flags, w.gradient, w.z])
+        self.residual.product(w.p, w.Hp, flags)
+        launch(k.shaken_gradient, self.dim, [flags, w.z, w.Hp, w.gradient])
+        w.newton.any_strict.zero_()
 
     @labelled("control")
     def _refresh(self) -> None:
@@ -348,6 +375,9 @@ class NewtonLoop:
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
         self.launch(k.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
         self.launch(k.judge_floor, m.worlds, [w.newton, parts.component])
+        if self.shaking:
+            self.residual.evaluate(self.shaken)
+            self.shaken.zero_()
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self.residual.elements.measure_turn(self.at, w.direction, w.newton.active)

@@ -174,7 +174,7 @@ class Workspace:
             "elem_sums": (2, worlds),
             "slope_sum": (1, worlds),
             "tangent_sum": (1, worlds),
-            **dict.fromkeys(("any_active", "any_running", "any_hard"), (1,)),
+            **dict.fromkeys(("any_active", "any_running", "any_hard", "any_strict"), (1,)),
         } | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array) and name not in skip:
