@@ -21,6 +21,7 @@ from .control import (
 from .judging import COARSE, SWIFT, TRIES, judging_functions
 from .outer import outer_kernels
 from .pcg import pcg_struct
+from .perturbation import SCATTER
 from .searching import NOISE, TURN, search_kernels
 from .vectors import vector_kernels
 
@@ -31,8 +32,6 @@ ROUNDS = 3
 RIGID = 64.0
 """Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
 FAR_FORCING = 0.1  # of the first solve of a step that begins far from its end: what it is solved to is lost
-SCATTER = 2.0
-"""Factor on the displacement that the mean of a few residuals tells: it scatters by half of what rounding leaves."""
 HOPELESS = 3.0
 """A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
 

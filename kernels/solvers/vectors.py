@@ -8,10 +8,7 @@ import warp as wp
 from ..common.types import precision
 from .control import FLOOR_LANES, GROUP_ROWS, LANES, control_struct
 
-__all__ = ["SHAKES", "vector_kernels"]
-
-SHAKES = 4
-"""Evaluations at shaken positions whose mean residual tells an error: rounding is another in each."""
+__all__ = ["vector_kernels"]
 
 
 @functools.cache
@@ -147,57 +144,6 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         sums[5, world, part, lane] = speed
 
     @wp.kernel(module=module)
-    def shake(
-        ctl: Control,
-        sample: int,
-        u: wp.array2d(dtype=vec3),
-        moved: wp.array2d(dtype=vec3),
-        total: wp.array2d(dtype=vec3),
-        flags: wp.array(dtype=wp.int32),
-    ):
-        """u moves by three roundings at most, for each `sample` from 1 to SHAKES; `moved`: the sum of that over dq/dv.
-
-        Sample 0 flags the worlds whose next solve tells an error, and clears both sums there.
-        """
-        world, slot = wp.tid()
-        if slot == 0 and sample == 0:
-            flags[world] = wp.where(ctl.strict[world] == 1, 1, 0)
-        if ctl.strict[world] != 1:
-            return
-        if sample == 0:
-            total[world, slot] = vec3()
-            moved[world, slot] = vec3()
-            return
-        x = u[world, slot]
-        y = vec3()
-        state = wp.rand_init(sample, slot)
-        for k in range(3):
-            y[k] = x[k] + T(f64(wp.randi(state, -3, 4)) * ctl.eps) * x[k]
-        u[world, slot] = y
-        moved[world, slot] = moved[world, slot] + (y - x) / T(ctl.dq_dv[world])
-
-    @wp.kernel(module=module)
-    def add_gradient(
-        flags: wp.array(dtype=wp.int32), gradient: wp.array2d(dtype=vec3), total: wp.array2d(dtype=vec3)
-    ):
-        """total += gradient."""
-        world, slot = wp.tid()
-        if flags[world] != 0:
-            total[world, slot] = total[world, slot] + gradient[world, slot]
-
-    @wp.kernel(module=module)
-    def shaken_gradient(
-        flags: wp.array(dtype=wp.int32),
-        total: wp.array2d(dtype=vec3),
-        product: wp.array2d(dtype=vec3),
-        gradient: wp.array2d(dtype=vec3),
-    ):
-        """gradient = sum over the samples of g(u + d) - H d, over their number."""
-        world, slot = wp.tid()
-        if flags[world] != 0:
-            gradient[world, slot] = T(wp.static(1.0 / SHAKES)) * (total[world, slot] - product[world, slot])
-
-    @wp.kernel(module=module)
     def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):
         """target = source in the active worlds."""
         world, slot = wp.tid()
@@ -231,9 +177,6 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         copy_active=copy_active,
         set_base=set_base,
         floor_partial=floor_partial,
-        shake=shake,
-        add_gradient=add_gradient,
-        shaken_gradient=shaken_gradient,
         dot_rows=dot_rows,
         any_set=any_set,
     )

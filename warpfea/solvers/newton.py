@@ -15,7 +15,7 @@ from ..base.launch import labelled
 from ..kernels.elements.materials import ANY_J
 from ..kernels.solvers.control import FLOOR_LANES
 from ..kernels.solvers.newton import newton_kernels
-from ..kernels.solvers.vectors import SHAKES
+from ..kernels.solvers.perturbation import SAMPLES, perturbation_kernels
 from .direct import Direct
 from .pcg import PCG
 from .preconditioner import NAMES, choose, make
@@ -212,10 +212,12 @@ class NewtonLoop:
         if at.accelerated and model.dtype == "float64":  # in float32 places are rounded by more
             ctl.constraint_pace = max(constraint_tol / model.size, ctl.tol) * FALL
             ctl.constraint_least = CLOSED * model.size
-        # in double precision the errors that rounding leaves are far below those that steps are refused for
-        self.shaking = model.dtype == "float32"
-        if self.shaking:
-            self.shaken = work.array("shaken", (model.worlds,), wp.int32)
+        # in double precision roundings are far from the errors that steps are refused for; forces at a mid-point are
+        # not those of the positions
+        self.perturbation = None
+        if model.dtype == "float32" and not at.midpoint:
+            self.perturbation = perturbation_kernels(model.dtype)
+            self.perturbed = work.array("perturbed", (model.worlds,), wp.int32)
         self.candidates: Sequence[Callable[[], None]] = ()
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
@@ -238,6 +240,7 @@ class NewtonLoop:
     def modules(self) -> set[wp.Module]:
         """Modules that the loop launches, except those of the reductions and of the terms."""
         out = {self.kernels.module, self.pcg.kernels.module}
+        out |= {self.perturbation.module} if self.perturbation else set()
         return out | self.preconditioner.modules() | self.residual.modules()
 
     def run(self) -> None:
@@ -309,9 +312,9 @@ class NewtonLoop:
         w, k, launch = self.work, self.kernels, self.launch
         active = w.newton.active
         self.residual.linearise(active)
-        if self.shaking:
+        if self.perturbation:
             with launch.rare():
-                wp.capture_if(w.newton.any_strict, self._shake)
+                wp.capture_if(w.newton.any_strict, self._perturb)
         self.pcg.solve(active)
         self.residual.hold_nonpotential(active)
         self.residual.tangent_curvature(active)
@@ -332,22 +335,22 @@ class NewtonLoop:
         self._any(active, self.iterating)
 
     @labelled("control")
-    def _shake(self) -> None:
-        """Put the mean of residuals at shaken positions in place of the residual, for the solve that tells its error.
+    def _perturb(self) -> None:
+        """Put the mean of residuals at perturbed positions in place of that which the next solve tells the error of.
 
-        Rounding leaves a residual that is a function of the iterate's bits. Newton's method finds where that vanishes,
-        so of the error that it stands for nothing is left to see there, and least along directions that are soft.
+        The residual that rounding leaves is a function of the bits of the iterate. Newton's method finds where it
+        vanishes, so that the error is not seen there, least of all along soft directions.
         """
-        w, k, launch, flags = self.work, self.kernels, self.launch, self.shaken
-        for sample in range(SHAKES + 1):
-            if sample:
-                self.residual.place(flags)
-            launch(k.shake, self.dim, [w.newton, sample, w.u_stage, w.p, w.z, flags])
-            if sample:
-                self.residual.balance(flags)
-                launch(k.add_gradient, self.dim, [flags, w.gradient, w.z])
+        w, k, launch, flags = self.work, self.perturbation, self.launch, self.perturbed
+        launch(k.begin_samples, self.dim, [w.newton, flags, w.p, w.z])
+        for sample in range(SAMPLES):
+            self.residual.place(flags)
+            launch(k.perturb, self.dim, [w.newton, flags, sample, w.u, w.p])
+            self.residual.balance(flags)
+            launch(k.add_sample, self.dim, [flags, w.gradient, w.z])
         self.residual.product(w.p, w.Hp, flags)
-        launch(k.shaken_gradient, self.dim, [flags, w.z, w.Hp, w.gradient])
+        args = [self.model.topology, w.step.mass_factor, flags, w.p, w.Hp, w.z, w.gradient]
+        launch(k.mean_gradient, self.dim, args)
         w.newton.any_strict.zero_()
 
     @labelled("control")
@@ -375,9 +378,9 @@ class NewtonLoop:
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
         self.launch(k.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
         self.launch(k.judge_floor, m.worlds, [w.newton, parts.component])
-        if self.shaking:
-            self.residual.evaluate(self.shaken)
-            self.shaken.zero_()
+        if self.perturbation:
+            self.residual.evaluate(self.perturbed)
+            self.perturbed.zero_()
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self.residual.elements.measure_turn(self.at, w.direction, w.newton.active)
