@@ -43,9 +43,9 @@ class NewtonPCG:
     Args:
         tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
             for each connected part of the model apart, and in it for what is of unlike stiffness. A thousandth of the
-            reactions counts with f_int, so that a held, stressed body without loads has a scale. None: 1e-8 in float64, 1e-4 in float32. Where rounding stops the
-            residual above it, the error that is left is estimated and told (`StepReport.floor`); above 1e-4 in
-            float64, 2e-3 in float32, the step is refused.
+            reactions counts with f_int, so that a held, stressed body without loads has a scale. None: 1e-8 in float64,
+            1e-4 in float32. Where rounding stops the residual above it, the error that is left is estimated and told
+            (`StepReport.floor`); above 1e-4 in float64, 2e-3 in float32, the step is refused.
         force_tol: a step is also accepted when |g|, the plain norm over the free components, is at most this, N
             (gradient slots count in N m); 0: never.
         forcing: relative residual of the linear solves; None: Eisenstat and Walker's, no further than needed.
