@@ -15,7 +15,8 @@ from .control import control_struct
 
 __all__ = ["SAMPLES", "SCATTER", "perturbation_kernels"]
 
-SAMPLES = 4
+SAMPLES, SHARE = 4, 0.25
+"""Evaluations, and the weight of each."""
 SCATTER = 2.0
 """Factor on a displacement that the mean of so many residuals tells: it scatters by half of what rounding leaves."""
 MOST = 3
@@ -86,7 +87,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             a += mass_at(topo, world, k) * moved[world, topo.mass_column[k]]
         stiff = product[world, slot] - T(mass_factor[world]) * a
-        gradient[world, slot] = T(wp.static(1.0 / SAMPLES)) * (total[world, slot] - stiff)
+        gradient[world, slot] = T(SHARE) * (total[world, slot] - stiff)
 
     return _types.SimpleNamespace(
         module=module, begin_samples=begin_samples, perturb=perturb, add_sample=add_sample, mean_gradient=mean_gradient

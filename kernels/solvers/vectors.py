@@ -20,7 +20,7 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
     Control = control_struct()
 
     @wp.kernel(module=module)
-    def group_partial(
+    def norm_partial(
         start: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
         element_start: wp.array(dtype=wp.int32),
@@ -46,7 +46,7 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
         partial[GROUP_ROWS - 1, world, group, lane] = strain
 
     @wp.kernel(module=module)
-    def group_sum(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
+    def norm_sum(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
         """Sum of the lanes, in order."""
         row, world, group = wp.tid()
         if active[world] == 0:
@@ -170,8 +170,8 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
             wp.atomic_max(out, 0, 1)
 
     return _types.SimpleNamespace(
-        group_partial=group_partial,
-        group_sum=group_sum,
+        norm_partial=norm_partial,
+        norm_sum=norm_sum,
         update_position=update_position,
         trial_velocity=trial_velocity,
         copy_active=copy_active,

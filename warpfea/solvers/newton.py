@@ -342,6 +342,7 @@ class NewtonLoop:
         vanishes, so that the error is not seen there, least of all along soft directions.
         """
         w, k, launch, flags = self.work, self.perturbation, self.launch, self.perturbed
+        assert k is not None
         launch(k.begin_samples, self.dim, [w.newton, flags, w.p, w.z])
         for sample in range(SAMPLES):
             self.residual.place(flags)

@@ -257,9 +257,9 @@ class Residual:
         if groups.count > 1:
             args = [groups.slot_start, groups.slot, groups.element_start, groups.element]
             args += [w.rows, w.energy_rows, active, w.residual_group_partial]
-            launch(self.newton.group_partial, (m.worlds, groups.count, LANES), args)
+            launch(self.newton.norm_partial, (m.worlds, groups.count, LANES), args)
             sums = (GROUP_ROWS, m.worlds, groups.count)
-            launch(self.newton.group_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
+            launch(self.newton.norm_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
     @labelled("loads")
     def hold_nonpotential(self, active: wp.array) -> None:

@@ -125,8 +125,8 @@ def tried(case: dict[str, Any], device: Any) -> dict[str, Any]:
     except wf.ConvergenceError as error:
         known = "float32 can't hold this case" in str(error)
         return row | {"outcome": "refused" if known else str(error)[:200]}
-    error = float(np.abs(u - exact).max() / np.abs(exact).max())
-    return row | told | {"stable": row["stable"], "outcome": "accepted", "error": error}
+    off = float(np.abs(u - exact).max() / np.abs(exact).max())
+    return row | told | {"stable": row["stable"], "outcome": "accepted", "error": off}
 
 
 def rows(device: Any, count: int) -> Iterator[dict[str, Any]]:
