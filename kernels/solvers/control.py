@@ -5,7 +5,6 @@ import functools
 import warp as wp
 
 __all__ = [
-    "COMPONENT_ROWS",
     "FAIL_CONSTRAINT",
     "FAIL_CURVATURE",
     "FAIL_ERROR",
@@ -20,6 +19,7 @@ __all__ = [
     "FAIL_WORK",
     "FLOOR_LANES",
     "FLOOR_ROWS",
+    "GROUP_ROWS",
     "LANES",
     "TERM_ROWS",
     "control_struct",
@@ -38,7 +38,7 @@ FAIL_INVERTED = 10
 FAIL_WORK = 11
 FAIL_ERROR = 12
 
-COMPONENT_ROWS = 5  # squared norms of g, f_int, loads, inertia, rounding
+GROUP_ROWS = 6  # squared norms of g, f_int, loads, inertia, rounding; strain energy
 FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|
 LANES, FLOOR_LANES = 32, 16
 TERM_ROWS = 3
@@ -63,12 +63,14 @@ def control_struct():
         phi_magnitude: wp.array(dtype=wp.float64)
         slope: wp.array(dtype=wp.float64)  # g.p at the iterate
         norm: wp.array(dtype=wp.float64)  # |g| in the D^-1 norm
-        relative: wp.array(dtype=wp.float64)  # |g| over the largest force, of the worst component
-        excess: wp.array(dtype=wp.float64)  # largest norm over accepted norm of the components
+        relative: wp.array(dtype=wp.float64)  # |g| over the largest force, of the worst group
+        excess: wp.array(dtype=wp.float64)  # the same over what is accepted, violations of constraints as well
         floor_excess: wp.array(dtype=wp.float64)  # the same over what rounding of positions alone may cause
-        solve_norm: wp.array(dtype=wp.float64)  # |g| of the components that are not converged
+        solve_norm: wp.array(dtype=wp.float64)  # |g| of the groups that are not converged
         solve_accept: wp.array(dtype=wp.float64)  # smallest accepted norm among them
-        component_sums: wp.array3d(dtype=wp.float64)  # [COMPONENT_ROWS, world, component], with several components
+        group_sums: wp.array3d(dtype=wp.float64)  # [GROUP_ROWS, world, residual group], with several groups
+        component_of_group: wp.array(dtype=wp.int32)  # [residual group]
+        worst: wp.array(dtype=wp.float64)  # largest norm over accepted norm of the groups, constraints not counted
         quiet: wp.array2d(dtype=wp.int32)  # [world, component] converged
         reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
         forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
@@ -120,13 +122,14 @@ def control_struct():
         new_walls: wp.array(dtype=wp.int32)  # what they hold now may set in suddenly again
         # where rounding stops the residual
         strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left; 2: it has been done
+        any_strict: wp.array(dtype=wp.int32)  # a world's next solve does
         rounds: wp.array(dtype=wp.int32)  # linear solves of this attempt
         strict_count: wp.array(dtype=wp.int32)
         eta: wp.array(dtype=wp.float64)  # that error, over the size of the solution; of the last such solve
         last_eta: wp.array(dtype=wp.float64)
         floor: wp.array(dtype=wp.float64)  # the eta that was accepted in this attempt, 0: none
         floor_bound: wp.float64  # largest that is
-        floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, part, lane]
+        floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, residual part, lane]
         negative: wp.array(dtype=wp.int32)  # the last solve met a direction without positive curvature
         # the first iterate
         bent: wp.array(dtype=wp.int32)  # a solve of this attempt did
@@ -141,6 +144,7 @@ def control_struct():
         rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
         max_iterations: wp.int32
         components: wp.int32
+        groups: wp.int32  # components, and materials of like stiffness in each
         nonpotential: wp.int32
         equilibrium: wp.int32  # statics
         length: wp.float64  # of the model, m

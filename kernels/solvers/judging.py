@@ -42,6 +42,10 @@ COARSE = 1.0e-10
 """Rounding above which the precision is single."""
 SWIFT = 1.0e4
 """Roundings of its speed below which, in double precision, an error of a body's velocities is none."""
+REACTION = 1.0e-6
+"""Share of twice the strain energy in the squared scale of a residual group."""
+ROUNDED = 8.0
+"""Roundings of the positions up to which, in double precision, the residual of a group among others is none."""
 TRIES = 3
 """Solves that may find the error of a stalled iterate too large before the step is given up."""
 
@@ -99,61 +103,89 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         return largest
 
     @wp.func
-    def measure(ctl: Control, world: int):
-        """Norms and acceptance of the residual just evaluated, for each component apart where there are several.
+    def squared_sums(ctl: Control, world: int, group: int):
+        """Squared norms of g, of the largest forces, and of the rounding of the positions, of a residual group.
 
-        Components that do not touch must not hide behind each other's forces, and a converged one is left alone.
+        Of its stress forces a small part counts, as of reactions: a group between others may bear no load of its own.
+        """
+        if ctl.groups == 1:
+            f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
+            return wp.vec3d(ctl.slot_sums[0, world], f2, ctl.slot_sums[8, world])
+        f2 = wp.max(
+            ctl.group_sums[1, world, group], wp.max(ctl.group_sums[2, world, group], ctl.group_sums[3, world, group])
+        )
+        stress = f64(2.0) * f64(REACTION) * wp.abs(ctl.group_sums[5, world, group]) / ctl.dq_dv[world]
+        return wp.vec3d(ctl.group_sums[0, world, group], wp.max(f2, stress), ctl.group_sums[4, world, group])
+
+    @wp.func
+    def rounded(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
+        """Whether in double precision a group's residual is that of rounded positions, and within the tolerance of all
+        groups of its component: solving on would not make it smaller."""
+        if ctl.groups == ctl.components or ctl.eps > f64(COARSE) or norm > f64(ROUNDED) * rounding:
+            return False
+        internal, loads, inertia = f64(0.0), f64(0.0), f64(0.0)
+        for other in range(ctl.groups):
+            if ctl.component_of_group[other] == ctl.component_of_group[group]:
+                internal += ctl.group_sums[1, world, other]
+                loads += ctl.group_sums[2, world, other]
+                inertia += ctl.group_sums[3, world, other]
+        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, inertia)))
+
+    @wp.func
+    def measure(ctl: Control, world: int):
+        """Norms and acceptance of the residual just evaluated, for each residual group apart where there are several.
+
+        Components, and materials of unlike stiffness in each, must not hide behind each other's forces, and a component
+        of the model all of whose groups have converged is left alone.
         """
         force = wp.sqrt(ctl.slot_sums[9, world])
         ctl.force[world] = force
         largest = f64(0.0)
+        worst = f64(0.0)
         excess = f64(0.0)
         floor_excess = f64(0.0)
         solve = f64(0.0)
         solve_accept = f64(1.0e300)
         for c in range(ctl.components):
-            g2 = ctl.slot_sums[0, world]
-            f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
-            spread = ctl.slot_sums[8, world]
-            if ctl.components > 1:
-                g2 = ctl.component_sums[0, world, c]
-                f2 = wp.max(
-                    ctl.component_sums[1, world, c],
-                    wp.max(ctl.component_sums[2, world, c], ctl.component_sums[3, world, c]),
-                )
-                spread = ctl.component_sums[4, world, c]
+            ctl.quiet[world, c] = 1
+        for group in range(ctl.groups):
+            sums = squared_sums(ctl, world, group)
+            g2 = sums[0]
             norm = wp.sqrt(g2)
-            scale = wp.sqrt(f2)
+            scale = wp.sqrt(sums[1])
             accept = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
             if force > f64(0.0):
                 # the force's tolerance in this norm, as they compare at this iterate
                 accept = wp.max(accept, norm * (ctl.force_tol / force))
             if ctl.predicted[world] != 0:
                 accept = f64(PREDICTED) * accept  # what is left would add up over steps that none solves for
+            rounding = f64(2.0) * ctl.eps * wp.sqrt(sums[2])
+            if norm > accept and rounded(ctl, world, group, norm, rounding):
+                accept = norm
             loud = norm > accept
             if wp.static(gated):
                 allowed = closure(ctl, world, ctl.constraint_tol)
-                if ctl.violation[world, c] > allowed:
+                violation = ctl.violation[world, ctl.component_of_group[group]]
+                if violation > allowed:
                     loud = True
-                    excess = wp.max(excess, ctl.violation[world, c] / allowed)
+                    excess = wp.max(excess, violation / allowed)
                     floor_excess = f64(1.0e300)
-            ctl.quiet[world, c] = wp.where(loud, 0, 1)
             if loud:
+                ctl.quiet[world, ctl.component_of_group[group]] = 0
                 solve += g2
                 solve_accept = wp.min(solve_accept, accept)
-                rounding = f64(2.0) * ctl.eps * wp.sqrt(spread)
                 if wp.static(gated):
                     if ctl.classical != 0:  # the residual holds rho c, and so kappa times the rounding of places
                         rounding = rounding / (ctl.slack * ctl.slack)
                 floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
-            ratio = norm / wp.max(scale, f64(1.0e-300))
-            largest = wp.max(largest, ratio)
-            excess = wp.max(excess, norm / wp.max(accept, f64(1.0e-300)))
+            largest = wp.max(largest, norm / wp.max(scale, f64(1.0e-300)))
+            worst = wp.max(worst, norm / wp.max(accept, f64(1.0e-300)))
         if wp.static(gated):
             ctl.open[world] = largest_violation(ctl, world) / closure(ctl, world, ctl.constraint_tol)
         ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
         ctl.relative[world] = largest
-        ctl.excess[world] = excess
+        ctl.worst[world] = worst
+        ctl.excess[world] = wp.max(excess, worst)
         ctl.floor_excess[world] = floor_excess
         ctl.solve_norm[world] = wp.sqrt(solve)
         ctl.solve_accept[world] = solve_accept
@@ -184,6 +216,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def ask(ctl: Control, world: int):
         """Let the next solve tell how large an error the residual stands for; see `judge_floor`."""
         ctl.strict[world] = 1
+        wp.atomic_max(ctl.any_strict, 0, 1)
         ctl.mixed[world] = 0
 
     @wp.func

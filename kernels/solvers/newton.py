@@ -21,6 +21,7 @@ from .control import (
 from .judging import COARSE, SWIFT, TRIES, judging_functions
 from .outer import outer_kernels
 from .pcg import pcg_struct
+from .perturbation import SCATTER
 from .searching import NOISE, TURN, search_kernels
 from .vectors import vector_kernels
 
@@ -178,9 +179,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def judge_floor(ctl: Control, component_of_part: wp.array(dtype=wp.int32)):
-        """The error that a residual stands for, over the size of the solution, of the worst body.
+        """The error that a residual stands for, over the size of the solution, of the worst part.
 
-        With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); each body
+        With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); each part
         by itself, or a soft one would hide behind a stiff one that a joint ties it to.
         """
         world = wp.tid()
@@ -208,6 +209,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 eta = f64(1.0e30)
                 if ctl.negative[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
                     eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
+                    if ctl.eps > f64(COARSE):  # a direction may be so soft that energy does not see it
+                        eta = wp.max(eta, f64(SCATTER) * dq * step / wp.max(largest, f64(1.0e-300)))
                     if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * largest:
                         eta = dq * step / wp.max(largest, f64(1.0e-300))
                     if eta > ctl.floor_bound and step <= f64(SWIFT) * ctl.eps * speed and ctl.eps < f64(COARSE):

@@ -84,6 +84,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         `stands`: the trial is the iterate itself or the best one. `leap`: it may have raised Phi.
         """
         old_norm = ctl.norm[world]
+        old_worst = ctl.worst[world]
         old_phi = ctl.phi[world]
         ctl.searching[world] = 0
         measure(ctl, world)
@@ -112,6 +113,8 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
                     ctl.mixed[world] = wp.where(lost(ctl, world), 0, 1)
         ctl.total_iterations[world] = ctl.total_iterations[world] + 1
         ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
+        if ctl.groups > ctl.components:  # the forces of one may dwarf those that are solved for
+            ratio = ctl.worst[world] / wp.max(old_worst, f64(1.0e-300))
         ctl.reduction[world] = ratio
         eta = f64(0.9) * ratio * ratio
         guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]

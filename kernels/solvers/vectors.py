@@ -1,4 +1,4 @@
-"""Kernels of Newton's method on vectors [world, slot]: iterates, dot products, sums over components."""
+"""Kernels of Newton's method on vectors [world, slot]: iterates, dot products, sums over residual groups."""
 
 import functools
 import types as _types
@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from .control import COMPONENT_ROWS, FLOOR_LANES, LANES, control_struct
+from .control import FLOOR_LANES, GROUP_ROWS, LANES, control_struct
 
 __all__ = ["vector_kernels"]
 
@@ -20,34 +20,41 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
     Control = control_struct()
 
     @wp.kernel(module=module)
-    def component_partial(
+    def norm_partial(
         start: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
+        element_start: wp.array(dtype=wp.int32),
+        element: wp.array(dtype=wp.int32),
         rows: wp.array3d(dtype=f64),
+        energy: wp.array3d(dtype=f64),
         active: wp.array(dtype=wp.int32),
         partial: wp.array4d(dtype=f64),
     ):
-        """Strided partial sums of the residual's norms over the slots of a component."""
-        world, component, lane = wp.tid()
+        """Strided partial sums of GROUP_ROWS over the slots and elements of a residual group."""
+        world, group, lane = wp.tid()
         if active[world] == 0:
             return
-        for row in range(COMPONENT_ROWS):
+        for row in range(GROUP_ROWS - 1):
             source = wp.where(row == 4, 8, row)
             total = f64(0.0)
-            for k in range(start[component] + lane, start[component + 1], LANES):
+            for k in range(start[group] + lane, start[group + 1], LANES):
                 total += rows[source, world, slot[k]]
-            partial[row, world, component, lane] = total
+            partial[row, world, group, lane] = total
+        strain = f64(0.0)
+        for k in range(element_start[group] + lane, element_start[group + 1], LANES):
+            strain += energy[0, world, element[k]]
+        partial[GROUP_ROWS - 1, world, group, lane] = strain
 
     @wp.kernel(module=module)
-    def component_sum(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
+    def norm_sum(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
         """Sum of the lanes, in order."""
-        row, world, component = wp.tid()
+        row, world, group = wp.tid()
         if active[world] == 0:
             return
         total = f64(0.0)
         for lane in range(LANES):
-            total += partial[row, world, component, lane]
-        out[row, world, component] = total
+            total += partial[row, world, group, lane]
+        out[row, world, group] = total
 
     @wp.kernel(module=module)
     def update_position(
@@ -163,8 +170,8 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
             wp.atomic_max(out, 0, 1)
 
     return _types.SimpleNamespace(
-        component_partial=component_partial,
-        component_sum=component_sum,
+        norm_partial=norm_partial,
+        norm_sum=norm_sum,
         update_position=update_position,
         trial_velocity=trial_velocity,
         copy_active=copy_active,

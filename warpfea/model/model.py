@@ -20,6 +20,7 @@ from .bodies import Body
 from .description import Description
 from .masses import Masses
 from .parameters import MaterialParameters
+from .residual_groups import slot_groups
 from .state import State
 from .topology import free_groups, label_components, make_topology
 
@@ -213,25 +214,10 @@ class Model:
         return term and term.tables
 
     def _upload_components(self) -> None:
-        """Slots by component, and slots and elements by part: bodies that joints tie are parts of one component.
-
-        With one component or part the lists are empty and stand for all in order.
-        """
-
-        def lists(of: np.ndarray, count: int) -> tuple[wp.array, wp.array]:
-            edges = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=count))])
-            order = np.argsort(of, kind="stable") if count > 1 else np.zeros(0)
-            return self.array("components", edges, wp.int32), self.array("components", order, wp.int32)
-
-        self.part_count = int(self.part.max()) + 1
-        of_element = np.concatenate([self.part[b.connectivity[:, 0]] for b in self.blocks])
-        self.part_slot_start, self.part_slot = lists(self.part, self.part_count)
-        self.part_element_start, self.part_element = lists(of_element, self.part_count)
-        of_part = np.zeros(self.part_count)
-        of_part[self.part] = self.component
-        self.component_of_part = self.array("components", of_part, wp.int32)
+        """What residuals are judged by: components, and in each materials of like stiffness; errors by part as well."""
+        self.residual_groups = slot_groups(self, self.component)
+        self.residual_parts = slot_groups(self, self.part)
         if self.component_count > 1:
-            self.component_start, self.component_slot = lists(self.component, self.component_count)
             self.component_of_slot = self.array("components", self.component, wp.int32)
 
     def graph(self) -> sp.csr_matrix:

@@ -21,8 +21,9 @@ class StepReport:
     Attributes:
         converged: the step was accepted, and its residual is within the solver's tolerance, or rounding stops it above
             and `floor` is the error that this leaves. With wf.Jacobi a world may go on without: False with status 0.
-        floor: estimated error of the step's increment where rounding stopped the residual, relative to the solution and
-            in the norm of energy; the true one is at most three times it. 0 where the tolerance was reached.
+        floor: estimated error of the step's increment where rounding stopped the residual, relative to the solution, in
+            the norm of energy and in float32 of displacements too; the true one is at most three times it. 0 where the
+            tolerance was reached.
         newton, pcg: iterations, refused attempts included; Jacobi's count as newton.
         residual: |g| over the largest force, of the last attempt.
         halvings: refused attempts.

@@ -15,6 +15,7 @@ from ..base.launch import labelled
 from ..kernels.elements.materials import ANY_J
 from ..kernels.solvers.control import FLOOR_LANES
 from ..kernels.solvers.newton import newton_kernels
+from ..kernels.solvers.perturbation import SAMPLES, perturbation_kernels
 from .bicgstab import BiCGStab
 from .direct import Direct
 from .pcg import PCG
@@ -46,10 +47,10 @@ class NewtonPCG:
 
     Args:
         tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
-            for each connected part of the model apart. A thousandth of the reactions counts with f_int, so that a held,
-            stressed body without loads has a scale. None: 1e-8 in float64, 1e-4 in float32. Where rounding stops the
-            residual above it, the error that is left is estimated and told (`StepReport.floor`); above 1e-4 in
-            float64, 2e-3 in float32, the step is refused.
+            for each connected part of the model apart, and in it for what is of unlike stiffness. A thousandth of the
+            reactions counts with f_int, so that a held, stressed body without loads has a scale. None: 1e-8 in float64,
+            1e-4 in float32. Where rounding stops the residual above it, the error that is left is estimated and told
+            (`StepReport.floor`); above 1e-4 in float64, 2e-3 in float32, the step is refused.
         force_tol: a step is also accepted when |g|, the plain norm over the free components, is at most this, N
             (gradient slots count in N m); 0: never.
         forcing: relative residual of the linear solves; None: Eisenstat and Walker's, no further than needed.
@@ -214,6 +215,7 @@ class NewtonLoop:
         ctl.eps = EPS[model.dtype]
         ctl.equilibrium = int(not inertia)
         ctl.length = float(model.size)
+        ctl.component_of_group = model.residual_groups.component
         ctl.max_iterations = options.max_newton
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
@@ -227,6 +229,12 @@ class NewtonLoop:
         if at.accelerated and model.dtype == "float64":  # in float32 places are rounded by more
             ctl.constraint_pace = max(constraint_tol / model.size, ctl.tol) * FALL
             ctl.constraint_least = CLOSED * model.size
+        # in double precision roundings are far from the errors that steps are refused for; forces at a mid-point are
+        # not those of the positions
+        self.perturbation = None
+        if model.dtype == "float32" and not at.midpoint:
+            self.perturbation = perturbation_kernels(model.dtype)
+            self.perturbed = work.array("perturbed", (model.worlds,), wp.int32)
         self.candidates: Sequence[Callable[[], None]] = ()
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
@@ -249,6 +257,7 @@ class NewtonLoop:
     def modules(self) -> set[wp.Module]:
         """Modules that the loop launches, except those of the reductions and of the terms."""
         out = {self.kernels.module} | self.pcg.modules()
+        out |= {self.perturbation.module} if self.perturbation else set()
         return out | self.preconditioner.modules() | self.residual.modules()
 
     def run(self) -> None:
@@ -320,6 +329,9 @@ class NewtonLoop:
         w, k, launch = self.work, self.kernels, self.launch
         active = w.newton.active
         self.residual.linearise(active)
+        if self.perturbation:
+            with launch.rare():
+                wp.capture_if(w.newton.any_strict, self._perturb)
         self.pcg.solve(active)
         self.residual.hold_nonpotential(active)
         self.residual.tangent_curvature(active)
@@ -338,6 +350,26 @@ class NewtonLoop:
         self.preconditioner.follow(active)
         self._each("follow", active)
         self._any(active, self.iterating)
+
+    @labelled("control")
+    def _perturb(self) -> None:
+        """Put the mean of residuals at perturbed positions in place of that which the next solve tells the error of.
+
+        The residual that rounding leaves is a function of the bits of the iterate. Newton's method finds where it
+        vanishes, so that the error is not seen there, least of all along soft directions.
+        """
+        w, k, launch, flags = self.work, self.perturbation, self.launch, self.perturbed
+        assert k is not None
+        launch(k.begin_samples, self.dim, [w.newton, flags, w.p, w.z])
+        for sample in range(SAMPLES):
+            self.residual.place(flags)
+            launch(k.perturb, self.dim, [w.newton, flags, sample, w.u, w.p])
+            self.residual.balance(flags)
+            launch(k.add_sample, self.dim, [flags, w.gradient, w.z])
+        self.residual.product(w.p, w.Hp, flags)
+        args = [self.model.topology, w.step.mass_factor, flags, w.p, w.Hp, w.z, w.gradient]
+        launch(k.mean_gradient, self.dim, args)
+        w.newton.any_strict.zero_()
 
     @labelled("control")
     def _refresh(self) -> None:
@@ -359,10 +391,14 @@ class NewtonLoop:
         """What hard steps need: the error that a residual stands for, the length of steps that Armijo's rule would cut,
         the searches that follow, and whether an accepted iterate is inside out."""
         m, w, k = self.model, self.work, self.kernels
-        args = [w.newton, m.part_slot_start, m.part_slot, m.part_element_start, m.part_element]
+        parts = m.residual_parts
+        args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
-        self.launch(k.floor_partial, (m.worlds, m.part_count, FLOOR_LANES), args)
-        self.launch(k.judge_floor, m.worlds, [w.newton, m.component_of_part])
+        self.launch(k.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
+        self.launch(k.judge_floor, m.worlds, [w.newton, parts.component])
+        if self.perturbation:
+            self.residual.evaluate(self.perturbed)
+            self.perturbed.zero_()
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self.residual.elements.measure_turn(self.at, w.direction, w.newton.active)

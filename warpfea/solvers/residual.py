@@ -11,7 +11,7 @@ from ..base.launch import labelled
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK, SHORT, reduce_kernels
 from ..kernels.common.structs import additions_struct
-from ..kernels.solvers.control import COMPONENT_ROWS, LANES, TERM_ROWS
+from ..kernels.solvers.control import GROUP_ROWS, LANES, TERM_ROWS
 from ..kernels.solvers.newton import newton_kernels
 from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.step.stage import stage_kernels
@@ -256,11 +256,13 @@ class Residual:
         launch(self.gather.residual, self.dim, args)
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
-        if m.component_count > 1:
-            args = [m.component_start, m.component_slot, w.rows, active, w.component_partial]
-            launch(self.newton.component_partial, (m.worlds, m.component_count, LANES), args)
-            sums = (COMPONENT_ROWS, m.worlds, m.component_count)
-            launch(self.newton.component_sum, sums, [w.component_partial, active, w.newton.component_sums])
+        groups = m.residual_groups
+        if groups.count > 1:
+            args = [groups.slot_start, groups.slot, groups.element_start, groups.element]
+            args += [w.rows, w.energy_rows, active, w.residual_group_partial]
+            launch(self.newton.norm_partial, (m.worlds, groups.count, LANES), args)
+            sums = (GROUP_ROWS, m.worlds, groups.count)
+            launch(self.newton.norm_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
     @labelled("loads")
     def hold_nonpotential(self, active: wp.array) -> None:

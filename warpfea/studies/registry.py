@@ -196,6 +196,16 @@ _ENTRIES = (
         results=("jacobi_cpu.json",),
     ),
     Entry(
+        name="floor",
+        module="reports.floor",
+        summary="the error of float32 that reports tell, beside the true one",
+        about="Random strips loaded in their plane, of five kinds of elements, in statics and motion: what "
+        "StepReport.floor tells, and the error against float64.",
+        options=("device", "quick"),
+        example="--out tests/results/floor_cpu.json",
+        results=("floor_cpu.json",),
+    ),
+    Entry(
         name="identify",
         module="reports.identify",
         summary="stiffness and damping from a recorded, noisy motion, over many worlds",

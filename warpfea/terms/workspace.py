@@ -13,7 +13,7 @@ from ..base.memory import enough_memory
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
-from ..kernels.solvers.control import COMPONENT_ROWS, FLOOR_LANES, FLOOR_ROWS, LANES, TERM_ROWS, control_struct
+from ..kernels.solvers.control import FLOOR_LANES, FLOOR_ROWS, GROUP_ROWS, LANES, TERM_ROWS, control_struct
 from ..kernels.solvers.pcg import LANES as GROUP_LANES
 from ..kernels.solvers.pcg import pcg_struct
 from ..kernels.step.control import step_struct
@@ -104,9 +104,12 @@ class Workspace:
         self.report = self.array("report", (B, terms.report_width), wp.float64)
         self.any_flag = self.array("any_flag", (5,), wp.int32)
         C = model.component_count
-        sums = (COMPONENT_ROWS, B, C) if C > 1 else (1, 1, 1)
-        self.component_partial = self.array("component_partial", (*sums, LANES) if C > 1 else (1, 1, 1, 1), wp.float64)
-        skip: tuple[str, ...] = ("violation", "negative")  # of others
+        groups = model.residual_groups.count
+        sums = (GROUP_ROWS, B, groups) if groups > 1 else (1, 1, 1)
+        self.residual_group_partial = self.array(
+            "residual_group_partial", (*sums, LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
+        )
+        skip: tuple[str, ...] = ("violation", "negative", "component_of_group")  # of others
         skip += () if traits.gated else ("outer", "open")
         skip += () if traits.stored else ("term_sums", "stepped")
         skip += () if traits.limited else ("limit",)
@@ -125,10 +128,10 @@ class Workspace:
         )
         self.newton = self.struct(
             control_struct(), B, skip=skip,
-            history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), component_sums=sums, quiet=(B, C),
-            term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.part_count, FLOOR_LANES),
+            history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums, quiet=(B, C),
+            term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.residual_parts.count, FLOOR_LANES),
         )  # fmt: skip
-        self.newton.components = C
+        self.newton.components, self.newton.groups = C, groups
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative = self.pcg.negative
@@ -179,7 +182,7 @@ class Workspace:
             "elem_sums": (2, worlds),
             "slope_sum": (1, worlds),
             "tangent_sum": (1, worlds),
-            **dict.fromkeys(("any_active", "any_running", "any_hard"), (1,)),
+            **dict.fromkeys(("any_active", "any_running", "any_hard", "any_strict"), (1,)),
         } | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array) and name not in skip:

@@ -1,0 +1,94 @@
+"""Residuals at positions perturbed by roundings, whose mean tells the error that rounding leaves.
+
+Stochastic arithmetic in the manner of CESTAC (Vignes 1993, Mathematics and Computers in Simulation 35, 233-261): in
+each sample rounding is another, as the bits of the positions are.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.structs import mass_function, topology_struct
+from ..common.types import kernel_module, precision
+from .control import control_struct
+
+__all__ = ["SAMPLES", "SCATTER", "perturbation_kernels"]
+
+SAMPLES, SHARE = 4, 0.25
+"""Evaluations, and the weight of each."""
+SCATTER = 2.0
+"""Factor on a displacement that the mean of so many residuals tells: it scatters by half of what rounding leaves."""
+MOST = 3
+"""Roundings of a component by which it is moved at most."""
+
+
+@functools.cache
+def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the vectors."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    f64 = wp.float64
+    Control = control_struct()
+    Topology, mass_at = topology_struct(dtype), mass_function(dtype)
+    module = kernel_module(f"perturbation_{dtype}")
+
+    @wp.kernel(module=module)
+    def begin_samples(
+        ctl: Control, flags: wp.array(dtype=wp.int32), moved: wp.array2d(dtype=vec3), total: wp.array2d(dtype=vec3)
+    ):
+        """Flag the worlds whose next solve tells an error; clear both sums there."""
+        world, slot = wp.tid()
+        if slot == 0:
+            flags[world] = wp.where(ctl.strict[world] == 1, 1, 0)
+        if ctl.strict[world] == 1:
+            moved[world, slot] = vec3()
+            total[world, slot] = vec3()
+
+    @wp.kernel(module=module)
+    def perturb(
+        ctl: Control, flags: wp.array(dtype=wp.int32), sample: int, u: wp.array2d(dtype=vec3),
+        moved: wp.array2d(dtype=vec3),
+    ):  # fmt: skip
+        """u += d, up to MOST roundings, others for each slot and sample; moved += d / (dq/dv)."""
+        world, slot = wp.tid()
+        if flags[world] == 0:
+            return
+        x = u[world, slot]
+        y = vec3()
+        state = wp.rand_init(sample, slot)
+        for k in range(3):
+            y[k] = x[k] + T(f64(wp.randi(state, -MOST, MOST + 1)) * ctl.eps) * x[k]
+        u[world, slot] = y
+        moved[world, slot] = moved[world, slot] + (y - x) / T(ctl.dq_dv[world])
+
+    @wp.kernel(module=module)
+    def add_sample(flags: wp.array(dtype=wp.int32), gradient: wp.array2d(dtype=vec3), total: wp.array2d(dtype=vec3)):
+        """total += gradient."""
+        world, slot = wp.tid()
+        if flags[world] != 0:
+            total[world, slot] = total[world, slot] + gradient[world, slot]
+
+    @wp.kernel(module=module)
+    def mean_gradient(
+        topo: Topology,
+        mass_factor: wp.array(dtype=f64),
+        flags: wp.array(dtype=wp.int32),
+        moved: wp.array2d(dtype=vec3),
+        product: wp.array2d(dtype=vec3),
+        total: wp.array2d(dtype=vec3),
+        gradient: wp.array2d(dtype=vec3),
+    ):
+        """Mean over the samples of g(u + d) - (dq/dv) K p, with p = d / (dq/dv) and `product` = H p of their sum."""
+        world, slot = wp.tid()
+        if flags[world] == 0:
+            return
+        a = vec3()
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            a += mass_at(topo, world, k) * moved[world, topo.mass_column[k]]
+        stiff = product[world, slot] - T(mass_factor[world]) * a
+        gradient[world, slot] = T(SHARE) * (total[world, slot] - stiff)
+
+    return _types.SimpleNamespace(
+        module=module, begin_samples=begin_samples, perturb=perturb, add_sample=add_sample, mean_gradient=mean_gradient
+    )

@@ -1,0 +1,93 @@
+"""Groups of slots whose residuals are judged apart: what is joined, by materials of like stiffness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+__all__ = ["SlotGroups", "slot_groups"]
+
+LIKE = 30.0
+"""Stiffnesses that differ by less than this factor, one from the next, are alike."""
+
+
+def stiffness_classes(stiffness: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(n,) number, from 0 for the softest, of the class of like `stiffness` (n,) within each `label`."""
+    out = np.zeros(len(stiffness), dtype=np.int64)
+    for one in np.unique(label):
+        values, which = np.unique(stiffness[label == one], return_inverse=True)
+        out[label == one] = np.append(0, np.cumsum(values[1:] > LIKE * values[:-1]))[which.ravel()]
+    return out
+
+
+def slenderness(model: Any) -> np.ndarray:
+    """(parts,) squared ratio of the least to the largest radius of gyration of each part, which bending softens by.
+
+    With x = sum_i s_i E_i the second moments of a part are E^T M E.
+    """
+    E, M = model.reference, model.mass_host
+    count = int(model.part.max()) + 1
+    rows = np.column_stack([np.ones(model.slots) * model.is_position_host, E])
+    moments = np.zeros((count, 4, 4))
+    np.add.at(moments, model.part, rows[:, :, None] * (M @ rows)[:, None, :])
+    mass, centre = moments[:, 0, 0], moments[:, 0, 1:] / moments[:, :1, 0]
+    second = moments[:, 1:, 1:] / mass[:, None, None] - centre[:, :, None] * centre[:, None, :]
+    least, _, largest = np.linalg.eigvalsh(second).T
+    return np.maximum(least / largest, 1e-12)
+
+
+def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Class of stiffness in its component, of each slot and of each element in the order of the model's blocks.
+
+    A slot between materials is one of the stiffest there, which its forces come from; an element belongs with the
+    softest of its slots. Moduli are those that the model was built with.
+    """
+    parts = [host for block in model.blocks for host in block.parts]
+    first = np.concatenate([host.conn[:, 0] + host.body.slot_offset for host in parts])
+    mu = np.concatenate([np.full(len(host.conn), host.body.materials[host.material][1].lame[1]) for host in parts])
+    of_element = stiffness_classes(mu * slenderness(model)[model.part[first]], model.component[first])
+    of_slot = np.zeros(model.slots, dtype=np.int64)
+    connectivity = [block.connectivity for block in model.blocks]
+    ends = np.cumsum([len(conn) for conn in connectivity])[:-1]
+    for conn, classes in zip(connectivity, np.split(of_element, ends)):
+        np.maximum.at(of_slot, conn, classes[:, None])
+    return of_slot, np.concatenate([of_slot[conn].min(axis=1) for conn in connectivity])
+
+
+@dataclass(frozen=True)
+class SlotGroups:
+    """Slots and elements by group, on the device; with one group the lists are empty and stand for all in order.
+
+    Attributes:
+        slot_start, element_start: [group + 1] into slot and element.
+        component: [group] connected component of the model.
+    """
+
+    count: int
+    slot_start: wp.array
+    slot: wp.array
+    element_start: wp.array
+    element: wp.array
+    component: wp.array
+
+
+def slot_groups(model: Any, label: np.ndarray) -> SlotGroups:
+    """Groups of one `label` (slots,), each of whose elements has one, and of one class of stiffness."""
+    of_slot, of_element = like_stiffness(model)
+    first = np.concatenate([block.connectivity[:, 0] for block in model.blocks])
+    keys, of = np.unique(label * (of_slot.max() + 1) + of_slot, return_inverse=True)
+    of_element = np.searchsorted(keys, label[first] * (of_slot.max() + 1) + of_element)
+
+    def listed(of: np.ndarray) -> tuple[wp.array, wp.array]:
+        edges = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=len(keys)))])
+        order = np.argsort(of, kind="stable") if len(keys) > 1 else np.zeros(0)
+        return model.array("components", edges, wp.int32), model.array("components", order, wp.int32)
+
+    component = np.zeros(len(keys))
+    component[of.ravel()] = model.component
+    return SlotGroups(
+        len(keys), *listed(of.ravel()), *listed(of_element), model.array("components", component, wp.int32)
+    )
