@@ -43,6 +43,7 @@ from .base.errors import (  # noqa: E402
     MeshError,
     MeshWarning,
     ModelError,
+    ModelWarning,
     OutputError,
     PenetrationError,
 )
@@ -100,6 +101,7 @@ __all__ = [
     "Model",
     "ModelBuilder",
     "ModelError",
+    "ModelWarning",
     "MooneyRivlin",
     "NeoHookean",
     "NewtonPCG",

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-__all__ = ["REPORT", "STATUS", "Coefficients", "step_struct"]
+__all__ = ["GROWTH", "REPORT", "STATUS", "Coefficients", "step_struct"]
 
 STATUS = {"running": 0, "failed": 1, "frozen": 2}
 
@@ -23,8 +23,14 @@ REPORT = (
     "residual_force",
     "rough",
     "floor",
+    "energy_growth",
 )
 """Columns of the report of a step, [world, column] in float64; probes follow."""
+
+GROWTH = ("share", "largest", "turnover", "added", "since", "steps")
+"""Columns of the watch over the energy that the integrator adds: its share of the energy, the largest energy that was
+stored, J, the sum of |work| and of what viscosity took, J, what was added, J, when the share first exceeded
+`growth_told`, s, and substeps."""
 
 
 @wp.struct
@@ -85,5 +91,10 @@ def step_struct():
         stabilise: wp.float64  # N/m per kg, of statics: springs from the last equilibrium, none at full load
         total_J: wp.array(dtype=wp.float64)
         ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
+        growth: wp.array2d(dtype=wp.float64)  # [world, GROWTH], in the state; where it is watched
+        watched: wp.int32  # the energy that the integrator adds is
+        growth_told: wp.float64  # part of the energy from which on the time is kept
+        growth_limit: wp.float64  # beyond which no further step is taken
+        least_energy: wp.float64  # J, below which energies are rounding
 
     return StepControl

@@ -67,10 +67,11 @@ def check_mask(mask: wp.array, model: Model) -> None:
         )
 
 
-def check_choice(name: str, value: Any, first: str, second: str) -> None:
-    """Raise ModelError for what is neither of two words."""
-    if value not in (first, second):
-        raise ModelError(f"{name} = {value!r} is neither {first!r} nor {second!r}")
+def check_choice(name: str, value: Any, *known: str) -> None:
+    """Raise ModelError for what is none of the known words."""
+    if value not in known:
+        *others, last = map(repr, known)
+        raise ModelError(f"{name} = {value!r} is neither {', '.join(others)} nor {last}")
 
 
 def check_constraint_tol(value: Any) -> None:

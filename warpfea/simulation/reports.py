@@ -31,6 +31,8 @@ class StepReport:
         time: s.
         residual_force: |g| over the free components, N, of the last attempt.
         violation: largest of the constraints, m.
+        energy_growth: net energy that the integrator has added since the start, over the largest kinetic + strain +
+            contact energy plus the sum of |work|; 0 where it is not watched.
         outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
         substeps, rejected: of dt="auto": accepted substeps, and those refused for their estimated error, which count
             among the halvings; least_h, largest_h: their sizes, s. None with a fixed dt.
@@ -49,6 +51,7 @@ class StepReport:
     outer: np.ndarray
     residual_force: np.ndarray
     floor: np.ndarray
+    energy_growth: np.ndarray
     substeps: np.ndarray | None = None
     rejected: np.ndarray | None = None
     least_h: np.ndarray | None = None
@@ -139,7 +142,7 @@ def idle_report(sim: Any) -> StepReport:
     """The report of a simulation that has done no step since it was made or resumed."""
     count = sim.model.worlds
     zero, none = np.zeros(count, int), np.zeros(count)
-    return StepReport(sim.status == 0, zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero, none, none)
+    return StepReport(sim.status == 0, zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero, none, none, none)
 
 
 def step_text(dt: Any) -> str:

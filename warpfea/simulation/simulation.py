@@ -35,6 +35,7 @@ from .checks import (
 )
 from .controls import Controls
 from .digests import Digests
+from .energy_growth import CHOICES, EnergyGrowth
 from .failures import check_closed
 from .observations import Observations
 from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, describe, idle_report
@@ -75,9 +76,13 @@ class Simulation(Digests):
             several only once all have failed.
         inversion: a step that turns an element inside out, J <= 0 at a quadrature point where J was positive, is
             refused ("refuse"), or passes where the law allows it ("report": StepReport.min_J tells).
+        energy_growth: energy that the integrator has added in a world, net, over the largest kinetic + strain + contact
+            energy plus the sum of |work|: above 1 % a warning, above 10 % steps are refused ("refuse"), or go on
+            ("warn"); "ignore" and ledger=False: not watched.
 
     Attributes:
         controls: what the caller writes between steps, see Controls.
+        energy_growth: how the energy that the integrator adds is watched, as a text.
 
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
@@ -103,6 +108,7 @@ class Simulation(Digests):
         capture: bool = True,
         on_failure: str | None = None,
         inversion: str = "refuse",
+        energy_growth: str = "refuse",
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
         scheme, options = integrators.get(integrator), solvers.get(solver)
@@ -110,6 +116,8 @@ class Simulation(Digests):
         if not scheme.static:
             require_density(model.bodies, "motion")
         check_choice("inversion", inversion, "refuse", "report")
+        check_choice("energy_growth", energy_growth, *CHOICES)
+        self.energy_growth = EnergyGrowth(energy_growth, ledger=ledger, static=scheme.static)
         if on_failure is not None:
             check_choice("on_failure", on_failure, "raise", "freeze")
         given = {"error": error, "interval": interval, "horizon": horizon}
@@ -132,7 +140,7 @@ class Simulation(Digests):
             return Stepper(
                 model, state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
-                adapt=adapt, quiet=quiet, ends=t_end is not None, on_compile=on_compile or bar,
+                adapt=adapt, quiet=quiet, ends=t_end is not None, growth=self.energy_growth, on_compile=on_compile or bar,
             )  # fmt: skip
 
         self.model = model

@@ -12,7 +12,7 @@ from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
 from ..base.memory import enough_memory
 from ..kernels.step.adaptive import MAX_LEVEL
-from ..kernels.step.control import REPORT
+from ..kernels.step.control import GROWTH, REPORT
 from ..kernels.step.ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
 from ..model.state import State
@@ -23,6 +23,7 @@ from ..terms.workspace import Workspace
 from .adaptive import Adapt, Adaptive
 from .checks import write_times
 from .compiling import OnCompile, load_modules
+from .energy_growth import EnergyGrowth
 from .integrators import Integrator
 from .loops import Loops
 from .opening import Opening
@@ -57,6 +58,7 @@ class Stepper:
         adapt: Adapt | None = None,
         quiet: bool = False,
         ends: bool = False,
+        growth: EnergyGrowth | None = None,
         on_compile: OnCompile | None = None,
     ) -> None:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
@@ -85,6 +87,8 @@ class Stepper:
         if ledger:
             state.register("ledger", wp.float64, (len(model.terms.ledger),))
             state.register("ledger_time", wp.float64)
+        if growth and growth.watched:
+            state.register("energy_growth", wp.float64, (len(GROWTH),))
         state.register("status", wp.int32)
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
         midpoint = integrator.midpoint
@@ -115,6 +119,8 @@ class Stepper:
             tries = solver.max_halvings
             self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
+        if growth and growth.watched:
+            growth.bind(self.work.step, model, state.energy_growth)
         self.loops = Loops(model, self.work, self.launch, quiet=quiet, ends=ends)
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
