@@ -11,6 +11,7 @@ from ..base.console import number, plain, table
 from ..base.provenance import versions
 from ..kernels.elements.materials import ANY_J
 from ..model.model import Model
+from ..simulation.energy_growth import integrator_share
 from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
 from .source import Source
@@ -53,6 +54,15 @@ MANY = 12
 """Joints and contacts that are listed one by one."""
 WORST = 4
 """Joints and contacts listed of more."""
+SHARE = 0.05
+"""Of the energy turned over that the integrator may take without a word."""
+LESS = {
+    "backward_euler": "--integrator bdf2 takes far less of slow motion, energy_momentum nothing; a smaller --dt helps too",
+    "bdf2": "--integrator energy_momentum takes nothing, a smaller --dt less",
+    "generalized_alpha": "--integrator bdf2 or energy_momentum, or a smaller --dt",
+    "energy_momentum": "contact takes it at the end of steps; a smaller --dt takes less",
+}
+"""What to write where it takes more."""
 NO_J = 1e30
 """What a step reports for the smallest J where no element has one."""
 
@@ -153,6 +163,7 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
     if s["load"] is None:
         lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
         rows.append(["", f"lost by the integrator {lost} J, unbalanced {left} J"])
+        rows += _suggestion(sim)
         if s["contacts"]:
             stored = _text((e["contact"] or 0.0) + (e["contact_pairs"] or 0.0))
             lost = f"lost to restitution {_text(e['contact_loss'])}, to friction {_text(e['friction'])} J"
@@ -165,6 +176,14 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str], t_end:
     rows += _contact_rows(s["contacts"])
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return table(rows)
+
+
+def _suggestion(sim: Simulation) -> list[list[str]]:
+    """What to write where the integrator takes or gives much of the energy that is turned over."""
+    share, name = integrator_share(sim), sim.integrator.name
+    if not share > SHARE:
+        return []
+    return [["", f"that is {share:.0%} of the energy turned over: {LESS[name]}"]]
 
 
 def _steps(s: dict[str, Any], sim: Simulation) -> str:

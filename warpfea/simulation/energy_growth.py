@@ -13,6 +13,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from ..base.errors import ModelWarning
 from ..kernels.step.control import GROWTH
@@ -21,8 +22,9 @@ from ..model.contact_points import effective_modulus
 
 if TYPE_CHECKING:
     from ..model.model import Model
+    from ..model.state import State
 
-__all__ = ["CHOICES", "REFUSED", "TOLD", "EnergyGrowth", "growth_error"]
+__all__ = ["CHOICES", "REFUSED", "TOLD", "EnergyGrowth", "growth_error", "integrator_share"]
 
 CHOICES = ("refuse", "warn", "ignore")
 TOLD, REFUSED = 0.01, 0.1
@@ -57,8 +59,11 @@ class EnergyGrowth:
         refused = f", refused above {REFUSED:.0%}" if self.choice == "refuse" else ""
         return f"watched: warned of above {TOLD:.0%}{refused}"
 
-    def bind(self, step: Any, model: Model, rows: Any) -> None:
-        """Let the kernels of a step watch; `rows` are the state's [world, GROWTH]."""
+    def bind(self, step: Any, model: Model, state: State) -> None:
+        """Let the kernels of a step watch; a state that another simulation has had begins again."""
+        if not self.watched:
+            return
+        rows = state.register("energy_growth", wp.float64, (len(GROWTH),))
         rows.zero_()
         step.growth, step.watched = rows, 1
         step.growth_told = TOLD
@@ -92,6 +97,16 @@ def remedy(sim: Any) -> str:
     """What to write in place of the integrator."""
     others = [f"{other!r}" for other in CALMER.get(sim.integrator.name, ())]
     return f"take integrator={', '.join(others)} or a smaller dt" if others else "take a smaller dt"
+
+
+def integrator_share(sim: Any) -> float:
+    """What the ledger's `integrator` took, or gave, of the largest energy and the sum of |work|, in the worst world; NaN
+    where that is not watched."""
+    if not sim.energy_growth.watched:
+        return float("nan")
+    rows = sim.state.energy_growth.numpy()
+    scale = rows[:, GROWTH.index("largest")] + rows[:, GROWTH.index("turnover")]
+    return float(np.max(np.abs(sim.energies()["integrator"]) / np.maximum(scale, 1e-300)))
 
 
 def growth_error(sim: Any, world: int) -> str:

@@ -37,6 +37,7 @@ from .controls import Controls
 from .digests import Digests
 from .energy_growth import CHOICES, EnergyGrowth
 from .failures import check_closed
+from .law_warnings import warn_of_ends, warn_of_jumps
 from .observations import Observations
 from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, describe, idle_report
 from .run_loop import run_steps
@@ -166,6 +167,8 @@ class Simulation(Digests):
         if t_end is not None:
             self.t_end = t_end
         check_closed(self)
+        warn_of_jumps(self)
+        self.ended_laws: set[int] = set()
         self._load: np.ndarray | None = None
 
     def __repr__(self) -> str:
@@ -297,6 +300,8 @@ class Simulation(Digests):
         if total == 0 and t_end != now and (self.steps == 0 or now == 0.0):
             away = f"t_end = {t_end:g} s is at most half a step from the start at t = {now:g} s"
             raise ModelError(f"{away}, so no step would be done; take dt < {self.dt:g} s or a later t_end")
+        if not self.integrator.static:
+            warn_of_ends(self, t_end)
         run_steps(self, total, t_end, outputs, on_step, progress)
         if self.last is None:
             self.last = idle_report(self)

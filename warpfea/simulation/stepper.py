@@ -12,7 +12,7 @@ from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
 from ..base.memory import enough_memory
 from ..kernels.step.adaptive import MAX_LEVEL
-from ..kernels.step.control import GROWTH, REPORT
+from ..kernels.step.control import REPORT
 from ..kernels.step.ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
 from ..model.state import State
@@ -87,8 +87,6 @@ class Stepper:
         if ledger:
             state.register("ledger", wp.float64, (len(model.terms.ledger),))
             state.register("ledger_time", wp.float64)
-        if growth and growth.watched:
-            state.register("energy_growth", wp.float64, (len(GROWTH),))
         state.register("status", wp.int32)
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
         midpoint = integrator.midpoint
@@ -119,8 +117,8 @@ class Stepper:
             tries = solver.max_halvings
             self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
-        if growth and growth.watched:
-            growth.bind(self.work.step, model, state.energy_growth)
+        if growth:
+            growth.bind(self.work.step, model, state)
         self.loops = Loops(model, self.work, self.launch, quiet=quiet, ends=ends)
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
