@@ -39,7 +39,8 @@ def hook(
     b.clamp(body.nodes("fixed"))
     down = (0.0, 0.0, -pull)
     rise = 0.5 * hold
-    b.add_traction(body.surface("pull"), ([0.0, rise, hold, hold + 0.01], [(0, 0, 0), down, down, (0, 0, 0)]))
+    times = [0.0, rise, hold, hold + 0.01, hold + 0.02]
+    b.add_traction(body.surface("pull"), (times, [(0, 0, 0), down, down, (0, 0, 0), (0, 0, 0)]))
     b.add_probe("saddle", body.surface("pull"))
     b.add_probe("tip", body.nodes(lambda X: (X[:, 0] > 0.03) & (X[:, 2] > 0.065)))
     return b

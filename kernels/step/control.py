@@ -27,10 +27,10 @@ REPORT = (
 )
 """Columns of the report of a step, [world, column] in float64; probes follow."""
 
-GROWTH = ("share", "largest", "turnover", "added", "since", "steps")
+GROWTH = ("share", "largest", "turnover", "added", "since", "steps", "next")
 """Columns of the watch over the energy that the integrator adds: its share of the energy, the largest energy that was
 stored, J, the sum of |work| and of what viscosity took, J, what was added, J, when the share first exceeded
-`growth_told`, s, and substeps."""
+`growth_told`, s, substeps since loads set in, and the turnover, J, at which they count as setting in again."""
 
 
 @wp.struct

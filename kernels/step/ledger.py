@@ -78,14 +78,21 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     def watch(step: Step, world: int, before: f64, energy: f64, turnover: f64, added: f64):
         """Net energy that the integrator has added, over the largest that was stored plus the sum of |work|.
 
-        Net, for schemes of order 2 exchange energy with the motion to and fro.
+        Net, for schemes of order 2 exchange energy with the motion to and fro; and not in the first steps from rest, nor
+        in those after work that exceeds all energy so far.
         """
-        steps = step.growth[world, 5] + f64(1.0)
-        largest = wp.max(wp.max(step.growth[world, 1], step.least_energy), wp.max(before, energy))
+        largest = wp.max(wp.max(step.growth[world, 1], step.least_energy), before)
         turned = step.growth[world, 2] + turnover
-        total = f64(0.0)
+        steps = step.growth[world, 5] + f64(1.0)
+        if step.growth[world, 1] == f64(0.0) and before > f64(0.5) * energy:
+            steps = f64(SETTLING) + f64(1.0)  # it moves already
+        if turned > step.growth[world, 6]:
+            steps = f64(1.0)
+            step.growth[world, 6] = f64(2.0) * turned + largest
+        largest = wp.max(largest, energy)
+        total = step.growth[world, 3]
         if steps > f64(SETTLING):
-            total = step.growth[world, 3] + added
+            total += added
         share = total / (largest + turned)
         step.growth[world, 0] = share
         step.growth[world, 1] = largest

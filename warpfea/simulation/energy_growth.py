@@ -4,7 +4,7 @@ The measure is net: what the ledger's `integrator` and `viscous` have fallen by 
 kinetic + strain + contact energy since plus the sum of |work| and of what viscosity took. Schemes of order 2 exchange
 energy with the motion to and fro, by O(h^2) of it, and that does not add up; an instability does. Where damping is
 stiff, `viscous` has too much by what `integrator` has too little: their sum is what counts. The first steps of a motion
-that sets in are left out.
+that sets in from rest are left out.
 """
 
 from __future__ import annotations
