@@ -10,7 +10,7 @@ from warpfea.builder.scene import scene
 MESH = pathlib.Path(__file__).with_name("hook.msh")
 
 
-@scene(dt=1.0 / 240.0, t_end=0.26, tol=1e-3, fps=240.0, speed=0.1, picture=0.15)
+@scene(dt=1.0 / 240.0, t_end=0.26, integrator="bdf2", tol=1e-3, fps=240.0, speed=0.1, picture=0.15)
 def hook(
     *,
     pull: float = 900.0,

@@ -47,6 +47,7 @@ def loop_kernels() -> _types.SimpleNamespace:
         sums[world, 1] += report[world, wp.static(column["pcg"])]
         if status == wp.static(STATUS["failed"]):
             stepped[world] = 0
+        sums[world, 7] = wp.max(sums[world, 7], report[world, wp.static(column["energy_growth"])])
         if status != wp.static(running):
             return
         stepped[world] = 1
@@ -56,7 +57,6 @@ def loop_kernels() -> _types.SimpleNamespace:
         sums[world, 4] = wp.max(sums[world, 4], report[world, wp.static(column["residual"])])
         sums[world, 5] = wp.max(sums[world, 5], floor)
         sums[world, 6] = wp.max(sums[world, 6], report[world, wp.static(column["violation"])])
-        sums[world, 7] = wp.max(sums[world, 7], report[world, wp.static(column["energy_growth"])])
         sums[world, 8] = wp.min(sums[world, 8], report[world, wp.static(column["min_J"])])
 
     @wp.kernel(module=module)
