@@ -5,10 +5,10 @@ import warnings
 import numpy as np
 import pytest
 import warp as wp
+from warpfea.kernels.step.control import GROWTH
 
 import warpfea as wf
 from warpfea.cli import main
-from warpfea.kernels.step.control import GROWTH
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 SPIN = np.array([1.0, 2.0, 10.0])
@@ -83,8 +83,7 @@ def test_each_world_is_watched_where_nothing_is_read_back(device):
     rows[1, GROWTH.index("share")] = 0.2  # as if it had added a fifth
     calm.state.energy_growth.assign(rows)
     with pytest.warns(wf.ModelWarning, match="bdf2 adds energy.* in world 1"):
-        report = calm.step()
-        assert report.status.tolist() == [0, 1]
+        assert calm.step().status.tolist() == [0, 1]
     plain = wf.Simulation(model, slow_and_fast(model), **options, **QUIET)
     plain.step(21)
     for name in ("displacement", "velocity", "ledger", "energy_growth"):
@@ -111,8 +110,8 @@ def test_what_is_not_watched_costs_nothing_and_is_told():
     for choice, more in (("refuse", {}), ("warn", {}), ("ignore", {}), ("refuse", {"ledger": False})):
         sim = wf.Simulation(rotor(), dt=DT, integrator="generalized_alpha", energy_growth=choice, **more)
         sims[choice, bool(more)] = sim
-    watched = {key: "energy_growth" in sim.state.names for key, sim in sims.items()}
-    assert watched == {("refuse", False): True, ("warn", False): True, ("ignore", False): False, ("refuse", True): False}
+    watched = [key for key, sim in sims.items() if "energy_growth" in sim.state.names]
+    assert watched == [("refuse", False), ("warn", False)]
     texts = {key: sim.info()["energy_growth"] for key, sim in sims.items()}
     assert texts["refuse", False] == "watched: warned of above 1%, refused above 10%"
     assert texts["warn", False] == "watched: warned of above 1%"

@@ -78,8 +78,8 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     def watch(step: Step, world: int, before: f64, energy: f64, turnover: f64, added: f64):
         """Net energy that the integrator has added, over the largest that was stored plus the sum of |work|.
 
-        Net, for schemes of order 2 exchange energy with the motion to and fro; and not in the first steps from rest, nor
-        in those after work that exceeds all energy so far.
+        Net, for schemes of order 2 exchange energy with the motion to and fro; and not in the first steps from rest,
+        nor in those after work that exceeds all energy so far.
         """
         largest = wp.max(wp.max(step.growth[world, 1], step.least_energy), before)
         turned = step.growth[world, 2] + turnover

@@ -127,15 +127,15 @@ def _warn_of_constants(body: Body) -> None:
         if dense and E < LEAST_E and (low := float(np.min(material.density))) > METAL:
             speed = math.sqrt(E / low)
             warnings.warn(
-                f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3 is a metal as soft as rubber (waves run "
-                f"at {speed:.2g} m/s). Is E in MPa? Steel is E=2.1e11, density=7850",
+                f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3 is a metal as soft as rubber "
+                f"(waves run at {speed:.2g} m/s). Is E in MPa? Steel is E=2.1e11, density=7850",
                 ModelWarning,
                 stacklevel=4,
             )
         if body.family.solid and nu > LARGEST_NU:
             warnings.warn(
-                f"body {body.name!r}: {law} with nu = {nu:.6g} locks: elements are far too stiff beyond {LARGEST_NU}; take "
-                "nu=0.49, or a finer mesh and see whether the result stays",
+                f"body {body.name!r}: {law} with nu = {nu:.6g} locks: elements are far too stiff beyond {LARGEST_NU}; "
+                "take nu=0.49, or a finer mesh and see whether the result stays",
                 ModelWarning,
                 stacklevel=4,
             )

@@ -79,7 +79,12 @@ def add_accuracy(names: Any) -> None:
     judge.add_argument(
         "--measure", default="l2", metavar="NAME", help="error that counts: l2 (default), end, energy, field"
     )
-    judge.add_argument("--target", type=positive, metavar="X", help="name the cheapest setting with at most this error, that of the mesh included")
+    judge.add_argument(
+        "--target",
+        type=positive,
+        metavar="X",
+        help="name the cheapest setting with at most this error, in time and mesh",
+    )
     judge.add_argument(
         "--split", default="best", metavar="ROWS", help="parts of the error of the best row (default), of all, or none"
     )

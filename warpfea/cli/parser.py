@@ -171,7 +171,7 @@ def _add_model(to: argparse.ArgumentParser) -> None:
         "--energy-growth",
         choices=("refuse", "warn", "ignore"),
         default="refuse",
-        help="energy that the integrator adds: above 1 %% of all a warning, above 10 %% refused (default); or as chosen",
+        help="energy that the integrator adds: above 1 %% a warning, above 10 %% refused (default), or not",
     )
 
 

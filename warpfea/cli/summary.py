@@ -57,7 +57,7 @@ WORST = 4
 SHARE = 0.05
 """Of the energy turned over that the integrator may take without a word."""
 LESS = {
-    "backward_euler": "--integrator bdf2 takes far less of slow motion, energy_momentum nothing; a smaller --dt helps too",
+    "backward_euler": "--integrator bdf2 takes far less of slow motion, energy_momentum nothing; a smaller --dt less",
     "bdf2": "--integrator energy_momentum takes nothing, a smaller --dt less",
     "generalized_alpha": "--integrator bdf2 or energy_momentum, or a smaller --dt",
     "energy_momentum": "contact takes it at the end of steps; a smaller --dt takes less",

@@ -80,8 +80,8 @@ class EnergyGrowth:
         refused = f"; steps are refused above {REFUSED:.0%}" if self.choice == "refuse" else ""
         where = f" in world {world}" if sim.model.worlds > 1 else ""
         warnings.warn(
-            f"{sim.integrator.label} adds energy: from t = {since:.6g} s on more than {TOLD:.0%} of the largest, by now "
-            f"{worst:.1%}{where}{refused}; {remedy(sim)}",
+            f"{sim.integrator.label} adds energy: from t = {since:.6g} s on more than {TOLD:.0%} of the largest, by "
+            f"now {worst:.1%}{where}{refused}; {remedy(sim)}",
             ModelWarning,
             stacklevel=4,
         )
@@ -100,8 +100,10 @@ def remedy(sim: Any) -> str:
 
 
 def integrator_share(sim: Any) -> float:
-    """What the ledger's `integrator` took, or gave, of the largest energy and the sum of |work|, in the worst world; NaN
-    where that is not watched."""
+    """Part of the energy turned over that the ledger's `integrator` took or gave, in the worst world.
+
+    NaN where it is not watched.
+    """
     if not sim.energy_growth.watched:
         return float("nan")
     rows = sim.state.energy_growth.numpy()
@@ -116,6 +118,6 @@ def growth_error(sim: Any, world: int) -> str:
     rows[world] = 0.0
     sim.state.energy_growth.assign(rows)
     return (
-        f"{sim.integrator.label} has added {share:.1%} to the largest energy, more than {TOLD:.0%} from t = {since:.6g} s "
-        f"on; {remedy(sim)}; energy_growth='warn' lets it pass"
+        f"{sim.integrator.label} has added {share:.1%} to the largest energy, more than {TOLD:.0%} from t = "
+        f"{since:.6g} s on; {remedy(sim)}; energy_growth='warn' lets it pass"
     )

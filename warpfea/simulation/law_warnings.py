@@ -33,8 +33,8 @@ def warn_of_ends(sim: Any, t_end: float) -> None:
         told = ", ".join(f"{name} (t = {end:g} s)" for name, end in list(ended.items())[:SHOWN])
         told += f" and {len(ended) - SHOWN} more" if len(ended) > SHOWN else ""
         warnings.warn(
-            f"time laws end before the run, at t = {t_end:g} s, and hold their last values: {told}; where that is meant, "
-            "end them with two equal samples, such as ([0, 1, 2], [0, v, v])",
+            f"time laws end before the run, at t = {t_end:g} s, and hold their last values: {told}; where that is "
+            "meant, end them with two equal samples, such as ([0, 1, 2], [0, v, v])",
             ModelWarning,
             stacklevel=3,
         )
@@ -55,8 +55,8 @@ def warn_of_jumps(sim: Any) -> None:
             continue
         law = support.law or support.node_laws[0]
         warnings.warn(
-            f"{law.name} moves nodes by {worst:.3g} m in the first step: at t = {time:g} s it is not where they are; let "
-            "it begin there, such as ([0, 0.1], [0, value]), or assemble the model with solve_static",
+            f"{law.name} moves nodes by {worst:.3g} m in the first step: at t = {time:g} s it is not where they are; "
+            "let it begin there, such as ([0, 0.1], [0, value]), or assemble the model with solve_static",
             ModelWarning,
             stacklevel=3,
         )

@@ -142,7 +142,8 @@ def idle_report(sim: Any) -> StepReport:
     """The report of a simulation that has done no step since it was made or resumed."""
     count = sim.model.worlds
     zero, none = np.zeros(count, int), np.zeros(count)
-    return StepReport(sim.status == 0, zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero, none, none, none)
+    counts = (zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero)
+    return StepReport(sim.status == 0, *counts, none, none, none)
 
 
 def step_text(dt: Any) -> str:

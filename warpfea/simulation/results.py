@@ -34,8 +34,7 @@ class Results:
     state: State
 
     def info(self) -> dict[str, Any]:
-        """`Model.info`, the integrator with its options, what "auto" stands for in "methods", and whether the energy that
-        the integrator adds is watched."""
+        """`Model.info`, "integrator" with its options, "methods", and whether "energy_growth" is watched."""
         own: Any = self
         more = {"integrator": own.integrator.label, "methods": own.methods, "energy_growth": str(own.energy_growth)}
         return self.model.info() | more

@@ -141,7 +141,8 @@ class Simulation(Digests):
             return Stepper(
                 model, state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
-                adapt=adapt, quiet=quiet, ends=t_end is not None, growth=self.energy_growth, on_compile=on_compile or bar,
+                adapt=adapt, quiet=quiet, ends=t_end is not None, growth=self.energy_growth,
+                on_compile=on_compile or bar,
             )  # fmt: skip
 
         self.model = model
