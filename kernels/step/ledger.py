@@ -84,8 +84,9 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         largest = wp.max(wp.max(step.growth[world, 1], step.least_energy), before)
         turned = step.growth[world, 2] + turnover
         steps = step.growth[world, 5] + f64(1.0)
-        if step.growth[world, 1] == f64(0.0) and before > f64(0.5) * energy:
-            steps = f64(SETTLING) + f64(1.0)  # it moves already
+        if step.growth[world, 1] == f64(0.0) and before > f64(0.5) * energy:  # it moves already
+            steps = f64(SETTLING) + f64(1.0)
+            step.growth[world, 6] = before
         if turned > step.growth[world, 6]:
             steps = f64(1.0)
             step.growth[world, 6] = f64(2.0) * turned + largest

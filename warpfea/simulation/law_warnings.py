@@ -10,6 +10,7 @@ import numpy as np
 from ..base.errors import ModelWarning
 
 if TYPE_CHECKING:
+    from ..laws import TimeLaw
     from ..model.description import Support
 
 __all__ = ["warn_of_ends", "warn_of_jumps"]
@@ -41,19 +42,24 @@ def warn_of_ends(sim: Any, t_end: float) -> None:
 
 
 def warn_of_jumps(sim: Any) -> None:
-    """Warn of drives that are not where their nodes are at the start of a motion, in the first world."""
-    supports = [s for s in sim.model.description.supports if s.law is not None or s.node_laws]
-    if sim.integrator.static or not supports:
+    """Warn of a drive that is not where its nodes are at the start of a motion, in the first world.
+
+    What a control says is the caller's.
+    """
+    laws = {id(law): law for s in sim.model.description.supports for law in [s.law, *(s.node_laws or [])]
+            if law is not None and law.control is None}  # fmt: skip
+    if sim.integrator.static or not laws:
         return
-    number = {id(law): k for k, law in enumerate(sim.model.terms.laws.laws)}
     time = float(sim.time[0])
-    values = sim.stepper.law_values(time)[0]
+    values = _values(sim, laws, time)
     u = sim.state.displacement.numpy()[0].astype(float)
-    for support in supports:
-        away = np.linalg.norm(_prescribed(support, values, number, u), axis=1)
-        if not (worst := float(away.max(initial=0.0))) > JUMP * sim.model.size:
+    for support in sim.model.description.supports:
+        law = support.law or (support.node_laws or [None])[0]
+        if law is None or id(law) not in values:
             continue
-        law = support.law or support.node_laws[0]
+        worst = float(np.linalg.norm(_away(support, values, u), axis=1).max(initial=0.0))
+        if not worst > JUMP * sim.model.size:
+            continue
         warnings.warn(
             f"{law.name} moves nodes by {worst:.3g} m in the first step: at t = {time:g} s it is not where they are; "
             "let it begin there, such as ([0, 0.1], [0, value]), or assemble the model with solve_static",
@@ -63,19 +69,27 @@ def warn_of_jumps(sim: Any) -> None:
         return
 
 
-def _prescribed(support: Support, values: np.ndarray, number: dict[int, int], u: np.ndarray) -> np.ndarray:
-    """(slots, 3) m: what the prescribed components of a support's positions are away from its laws (laws, 3)."""
+def _values(sim: Any, laws: dict[int, TimeLaw], time: float) -> dict[int, np.ndarray]:
+    """(3,) of each law at a time, s, by `id`; of functions from the device."""
+    if any(law.function is not None for law in laws.values()):
+        found = sim.stepper.law_values(time)[0]
+        return {id(law): found[k] for k, law in enumerate(sim.model.terms.laws.laws) if id(law) in laws}
+    return {key: np.array([np.interp(time, law.times, law.values[:, c]) for c in range(3)]) for key, law in laws.items()}
+
+
+def _away(support: Support, values: dict[int, np.ndarray], u: np.ndarray) -> np.ndarray:
+    """(slots, 3) m: how far the prescribed components of a support's positions are from where its laws want them."""
     body = support.body
     chosen = np.flatnonzero(body.slot_kind[support.slots] == 0)
     slots = support.slots[chosen]
     if support.rotation is not None:
         anchor, axis = support.rotation
-        angle = values[number[id(support.law)], 0]
+        angle = values[id(support.law)][0]
         arm = body.reference[slots] + body.origin - anchor
         turn = np.cross(axis, arm)
         target = np.sin(angle) * turn + (1.0 - np.cos(angle)) * np.cross(axis, turn)
     elif support.node_laws:
-        target = values[[number[id(law)] for law in support.node_laws]][chosen]
+        target = np.array([values[id(support.node_laws[k])] for k in chosen])
     else:
-        target = np.broadcast_to(values[number[id(support.law)]], (len(slots), 3))
+        target = values[id(support.law)]
     return np.asarray((target - u[slots + body.slot_offset]) * np.asarray(support.components, dtype=float))
