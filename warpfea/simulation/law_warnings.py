@@ -74,7 +74,7 @@ def _values(sim: Any, laws: dict[int, TimeLaw], time: float) -> dict[int, np.nda
     if any(law.function is not None for law in laws.values()):
         found = sim.stepper.law_values(time)[0]
         return {id(law): found[k] for k, law in enumerate(sim.model.terms.laws.laws) if id(law) in laws}
-    return {key: np.array([np.interp(time, law.times, law.values[:, c]) for c in range(3)]) for key, law in laws.items()}
+    return {k: np.array([np.interp(time, law.times, column) for column in law.values.T]) for k, law in laws.items()}
 
 
 def _away(support: Support, values: dict[int, np.ndarray], u: np.ndarray) -> np.ndarray:
