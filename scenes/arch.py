@@ -42,7 +42,7 @@ def arch(
         nu: Poisson's ratio.
         density: kg/m^3.
     """
-    b = wf.ModelBuilder(gravity=([0.0, ramp], [(0.0, 0.0, 0.0), (0.0, 0.0, -9.81)]))
+    b = wf.ModelBuilder(gravity=([0.0, ramp, 2.0 * ramp], [(0.0, 0.0, 0.0), (0.0, 0.0, -9.81), (0.0, 0.0, -9.81)]))
     material = wf.SVK(E=E, nu=nu, density=density)
     ground = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)), name="ground")
     options: dict[str, Any] = {"mu": mu, "restitution": 0.1, "stiffness": stiffness}

@@ -6,7 +6,7 @@ import warpfea as wf
 from warpfea.builder.scene import scene
 
 
-@scene(dt=2.5e-3, t_end=0.5, fps=120.0, speed=0.2, picture=0.2)
+@scene(dt=2.5e-3, t_end=0.5, integrator="bdf2", fps=120.0, speed=0.2, picture=0.2)
 def cantilever(
     *,
     length: float = 1.0,

@@ -10,7 +10,7 @@ from warpfea.builder.scene import scene
 MESH = pathlib.Path(__file__).with_name("hook.msh")
 
 
-@scene(dt=1.0 / 240.0, t_end=0.26, tol=1e-3, fps=240.0, speed=0.1, picture=0.15)
+@scene(dt=1.0 / 240.0, t_end=0.26, integrator="bdf2", tol=1e-3, fps=240.0, speed=0.1, picture=0.15)
 def hook(
     *,
     pull: float = 900.0,
@@ -39,7 +39,8 @@ def hook(
     b.clamp(body.nodes("fixed"))
     down = (0.0, 0.0, -pull)
     rise = 0.5 * hold
-    b.add_traction(body.surface("pull"), ([0.0, rise, hold, hold + 0.01], [(0, 0, 0), down, down, (0, 0, 0)]))
+    times = [0.0, rise, hold, hold + 0.01, hold + 0.02]
+    b.add_traction(body.surface("pull"), (times, [(0, 0, 0), down, down, (0, 0, 0), (0, 0, 0)]))
     b.add_probe("saddle", body.surface("pull"))
     b.add_probe("tip", body.nodes(lambda X: (X[:, 0] > 0.03) & (X[:, 2] > 0.065)))
     return b

@@ -58,7 +58,7 @@ def rollup(
     b.clamp(beam.start, slots="position+section")
     b.clamp(beam.nodes(lambda X: X[:, 0] > -1.0), slots="all", components="y")
     moment = -2.0 * math.pi * turns * E * width * height**3 / 12.0 / length  # about -y the beam rolls up
-    b.add_moment(beam.end, ([0.0, duration], [(0, 0, 0), (0, moment, 0)]))
+    b.add_moment(beam.end, ([0.0, duration, 2.0 * duration], [(0, 0, 0), (0, moment, 0), (0, moment, 0)]))
     b.add_probe("end", beam.end)
     b.add_probe("middle", beam.at((0.5 * length, 0, 0)))
     return b

@@ -43,7 +43,8 @@ def twist(
     mesh = wf.mesh.box((length, width, width), cells=(cells, across, across), origin=(0.0, -half, -half), name="bar")
     bar = b.add_solid(mesh, material=wf.MooneyRivlin(mu10=mu10, mu01=mu01, k=k, density=density))
     b.clamp(bar.nodes("x-"))
-    angle = ([0.0, duration], [0.0, 2.0 * math.pi * turns])
+    end = 2.0 * math.pi * turns
+    angle = ([0.0, duration, 2.0 * duration], [0.0, end, end])  # then held
     b.drive(bar.nodes("x+"), rotation=wf.Rotation(anchor=(length, 0, 0), axis=(1, 0, 0), angle=angle))
     b.add_probe("corner", bar.at((length, half, half)))
     b.add_probe("middle", bar.at((0.5 * length, half, half)))

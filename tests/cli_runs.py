@@ -16,7 +16,8 @@ def bar(force):
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(wf.mesh.box((1, .2, .2), cells=(2, 1, 1)), material=wf.SVK(E=1e7, nu=.3, density=1000))
     b.clamp(body.nodes("x-"))
-    b.add_traction(body.surface("x+"), ([0, .01, .02], [(0, 0, 0), (0, 0, -100), (0, 0, -100 - force)]))
+    loads = [(0, 0, 0), (0, 0, -100), (0, 0, -100 - force), (0, 0, -100 - force)]
+    b.add_traction(body.surface("x+"), ([0, .01, .02, .03], loads))
     b.add_probe("tip", body.surface("x+"))
     return b
 

@@ -72,7 +72,8 @@ def test_summary_equals_what_python_gives(folder, capfd):
     code, out, _ = run(capfd, *SHORT, "--json", "-")
     assert code == 0
     found = json.loads(out)["probes"]["tip"]
-    sim = wf.Simulation(find("cantilever")(cells=2).finalize(device="cpu"), dt=0.002)
+    scene = find("cantilever")
+    sim = wf.Simulation(scene(cells=2).finalize(device="cpu"), dt=0.002, integrator=scene.integrator)
     sim.run(0.01)
     record = sim.probe("tip")
     for name, values in found.items():

@@ -11,6 +11,7 @@ from .base.errors import (
     MeshError as MeshError,
     MeshWarning as MeshWarning,
     ModelError as ModelError,
+    ModelWarning as ModelWarning,
     OutputError as OutputError,
     PenetrationError as PenetrationError,
     StabilityError as StabilityError,

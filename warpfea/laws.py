@@ -63,6 +63,7 @@ class TimeLaw:
         scalar: whether the value is a scalar.
         control: what holds the values, or None.
         ramped: a control grows with the load of statics.
+        name: of what it drives, for messages.
     """
 
     times: np.ndarray
@@ -71,6 +72,7 @@ class TimeLaw:
     scalar: bool = False
     control: Control | None = None
     ramped: bool = True
+    name: str = ""
 
 
 def _widen(values: np.ndarray, scalar: bool) -> np.ndarray:
@@ -97,9 +99,9 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
         if value.size != (1 if scalar else 3):
             needed = SIZES[1 if scalar else 3]
             raise ModelError(f"{what}: control {value.name!r} has size {value.size}, but {needed} is to be driven")
-        return TimeLaw(np.zeros(0), np.zeros((0, 3)), scalar=scalar, control=value)
+        return TimeLaw(np.zeros(0), np.zeros((0, 3)), scalar=scalar, control=value, name=what)
     if isinstance(value, wp.Function):
-        return TimeLaw(np.zeros(0), np.zeros((0, 3)), value, scalar)
+        return TimeLaw(np.zeros(0), np.zeros((0, 3)), value, scalar, name=what)
     if callable(value):
         name = getattr(value, "__name__", type(value).__name__).replace("<lambda>", "a lambda")
         raise ModelError(
@@ -130,4 +132,4 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
             raise ModelError(f"{what} has shape {values.shape[1:]}, expected {width or 'a number'}{hint}")
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise ModelError(f"{what}: {value!r} holds a value that is not finite")
-    return TimeLaw(times, _widen(values, scalar), None, scalar)
+    return TimeLaw(times, _widen(values, scalar), None, scalar, name=what)

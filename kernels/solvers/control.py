@@ -7,6 +7,7 @@ import warp as wp
 __all__ = [
     "FAIL_CONSTRAINT",
     "FAIL_CURVATURE",
+    "FAIL_ENERGY",
     "FAIL_ERROR",
     "FAIL_FLOOR",
     "FAIL_GROWTH",
@@ -37,6 +38,7 @@ FAIL_FLOOR = 9
 FAIL_INVERTED = 10
 FAIL_WORK = 11
 FAIL_ERROR = 12
+FAIL_ENERGY = 13
 
 GROUP_ROWS = 6  # squared norms of g, f_int, loads, inertia, rounding; strain energy
 FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|

@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-__all__ = ["REPORT", "SAME_TIME", "STATUS", "Coefficients", "step_span", "step_struct"]
+__all__ = ["GROWTH", "REPORT", "SAME_TIME", "STATUS", "Coefficients", "step_span", "step_struct"]
 
 STATUS = {"running": 0, "failed": 1, "frozen": 2}
 
@@ -24,11 +24,16 @@ REPORT = (
     "residual_force",
     "rough",
     "floor",
+    "energy_growth",
 )
 """Columns of the report of a step, [world, column] in float64; probes follow."""
 
 SAME_TIME = 1e-6
 """Part of a step within which two times are one."""
+GROWTH = ("share", "largest", "turnover", "added", "since", "steps", "next")
+"""Columns of the watch over the energy that the integrator adds: its share of the energy, the largest energy that was
+stored, J, the sum of |work| and of what viscosity took, J, what was added, J, when the share first exceeded
+`growth_told`, s, substeps since loads set in, and the turnover, J, at which they count as setting in again."""
 
 
 @wp.struct
@@ -93,6 +98,11 @@ def step_struct():
         stabilise: wp.float64  # N/m per kg, of statics: springs from the last equilibrium, none at full load
         total_J: wp.array(dtype=wp.float64)
         ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
+        growth: wp.array2d(dtype=wp.float64)  # [world, GROWTH], in the state; where it is watched
+        watched: wp.int32  # the energy that the integrator adds is
+        growth_told: wp.float64  # part of the energy from which on the time is kept
+        growth_limit: wp.float64  # beyond which no further step is taken
+        least_energy: wp.float64  # J, below which energies are rounding
 
     return StepControl
 

@@ -41,6 +41,8 @@ STORED, WORK, LOSS, NUMERICAL, HELD_VISCOUS = range(5)
 loss of a force that counts among the dead loads."""
 
 LEDGER_ROWS = 10
+SETTLING = 8.0
+"""Substeps whose energy is not watched: beside what a motion that sets in has by then, no step resolves it."""
 
 
 @functools.cache
@@ -71,6 +73,35 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     Newton = control_struct()
     Topology, Balance = topology_struct(dtype), balance_struct(dtype)
     Booked = booked_struct()
+
+    @wp.func
+    def watch(step: Step, world: int, before: f64, energy: f64, turnover: f64, added: f64):
+        """Net energy that the integrator has added, over the largest that was stored plus the sum of |work|.
+
+        Net, for schemes of order 2 exchange energy with the motion to and fro; and not in the first steps from rest,
+        nor in those after work that exceeds all energy so far.
+        """
+        largest = wp.max(wp.max(step.growth[world, 1], step.least_energy), before)
+        turned = step.growth[world, 2] + turnover
+        steps = step.growth[world, 5] + f64(1.0)
+        if step.growth[world, 1] == f64(0.0) and before > f64(0.5) * energy:  # it moves already
+            steps = f64(SETTLING) + f64(1.0)
+            step.growth[world, 6] = before
+        if turned > step.growth[world, 6]:
+            steps = f64(1.0)
+            step.growth[world, 6] = f64(2.0) * turned + largest
+        largest = wp.max(largest, energy)
+        total = step.growth[world, 3]
+        if steps > f64(SETTLING):
+            total += added
+        share = total / (largest + turned)
+        step.growth[world, 0] = share
+        step.growth[world, 1] = largest
+        step.growth[world, 2] = turned
+        step.growth[world, 3] = total
+        step.growth[world, 5] = steps
+        if share > step.growth_told and step.growth[world, 4] == f64(0.0):
+            step.growth[world, 4] = step.time[world]
 
     @wp.kernel(module=module)
     def ledger_rows(
@@ -141,16 +172,17 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
             numerical += sums[8, world] - change_K
         else:
             numerical += sums[0, world]
-        work = f64(0.0)
+        work, turnover = f64(0.0), f64(0.0)
         fields = sums[7, world]
-        stored = f64(0.0)
-        lost = f64(0.0)
+        stored, lost = f64(0.0), f64(0.0)
+        energy = kinetic + strain
         for k in range(booked.kind.shape[0]):
             amount = booked.sums[k, world]
             column = booked.column[k]
             if booked.kind[k] == STORED:
                 change = amount - ledger[world, column]
                 stored += change
+                energy += amount
                 if booked.nonpotential[k] != 0:
                     fields += change
                 else:
@@ -158,6 +190,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
                 ledger[world, column] = amount
             elif booked.kind[k] == WORK:
                 work += amount
+                turnover += wp.abs(amount)
                 if booked.nonpotential[k] != 0:
                     fields -= amount
                 ledger[world, column] = ledger[world, column] + amount
@@ -183,5 +216,10 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         balance -= loads + sums[4, world] + fields + work
         ledger[world, 8] = ledger[world, 8] + balance
         ledger[world, 9] = ledger[world, 9] + sums[6, world]
+        if step.watched != 0:
+            turnover += wp.abs(loads) + wp.abs(sums[4, world]) + wp.abs(fields) + wp.abs(viscous)
+            # where damping is stiff, `viscous` has too much by what `numerical` has too little
+            added = -(numerical + viscous)
+            watch(step, world, energy - (change_K + change_W + stored), energy, turnover, added)
 
     return _types.SimpleNamespace(ledger_rows=ledger_rows, ledger_update=ledger_update)

@@ -11,9 +11,9 @@ from .control import REPORT, SAME_TIME, STATUS
 
 __all__ = ["MOTION", "TALLY", "VALUES", "loop_kernels", "observation_kernels"]
 
-TALLY = ("newton", "pcg", "rough", "floored", "residual", "floor", "violation", "min_J")
+TALLY = ("newton", "pcg", "rough", "floored", "residual", "floor", "violation", "energy_growth", "min_J")
 """Columns of what steps add up to: sums, then largest values, then the smallest."""
-LARGEST = 7
+LARGEST = 8
 MOTION = {"position": 0, "displacement": 1, "velocity": 2}
 """Kinds of observed vectors."""
 TURN = 2.0 * math.pi
@@ -47,6 +47,7 @@ def loop_kernels() -> _types.SimpleNamespace:
         sums[world, 1] += report[world, wp.static(column["pcg"])]
         if status == wp.static(STATUS["failed"]):
             stepped[world] = 0
+        sums[world, 7] = wp.max(sums[world, 7], report[world, wp.static(column["energy_growth"])])
         if status != wp.static(running):
             return
         stepped[world] = 1
@@ -56,7 +57,7 @@ def loop_kernels() -> _types.SimpleNamespace:
         sums[world, 4] = wp.max(sums[world, 4], report[world, wp.static(column["residual"])])
         sums[world, 5] = wp.max(sums[world, 5], floor)
         sums[world, 6] = wp.max(sums[world, 6], report[world, wp.static(column["violation"])])
-        sums[world, 7] = wp.min(sums[world, 7], report[world, wp.static(column["min_J"])])
+        sums[world, 8] = wp.min(sums[world, 8], report[world, wp.static(column["min_J"])])
 
     @wp.kernel(module=module)
     def clear_tally(sums: wp.array2d(dtype=f64)):

@@ -13,7 +13,7 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
-from ..solvers.control import FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
+from ..solvers.control import FAIL_ENERGY, FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
 from .control import STATUS, step_span, step_struct
 from .ledger import ledger_kernels
@@ -56,12 +56,17 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
-        """Open a step of every world that has not failed and is not at the end of the run."""
+        """Open a step of every world that has not failed and is not at the end of the run; of one whose energy has grown
+        the step is refused."""
         world = wp.tid()
         time = step.time[world]
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
         if time >= end_of(step, world) - slack_of(step, world):
             alive = 0
+        if alive != 0 and step.watched != 0 and step.growth[world, 0] > step.growth_limit:
+            alive = 0
+            step.status[world] = wp.static(STATUS["failed"])
+            newton.failed[world] = FAIL_ENERGY
         step.running[world] = alive
         step.refused[world] = 0
         newton.total_iterations[world] = 0
@@ -343,6 +348,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         report[world, 11] = newton.force[world]
         report[world, 12] = f64(newton.rough[world])
         report[world, 13] = newton.step_floor[world]
+        report[world, 14] = f64(0.0)
+        if step.watched != 0:
+            report[world, 14] = step.growth[world, 0]
         if wp.static(gated):
             largest = f64(0.0)
             for c in range(newton.components):

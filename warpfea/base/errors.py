@@ -13,6 +13,7 @@ __all__ = [
     "MeshError",
     "MeshWarning",
     "ModelError",
+    "ModelWarning",
     "OutputError",
     "PenetrationError",
     "StabilityError",
@@ -28,7 +29,11 @@ class MeshError(Error):
     """A mesh file or mesh can't be used; the text names file, element or node, and value."""
 
 
-class MeshWarning(UserWarning):
+class ModelWarning(UserWarning):
+    """A model or a run is valid, but looks unintended; the text tells what to write."""
+
+
+class MeshWarning(ModelWarning):
     """A mesh was usable, but something in it was left out or looks unintended."""
 
 

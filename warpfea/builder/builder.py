@@ -422,7 +422,8 @@ class ModelBuilder:
             CapacityError: the device has too little memory.
 
         Warns:
-            MeshWarning: a size, mass or density that a wrong unit is likely to have made.
+            ModelWarning: a size, mass, density or E that a wrong unit is likely to have made (MeshWarning the first
+                three), or a nu at which solids lock.
         """
         check_densities(self.gravity, self.description)
         with quiet_warp():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..base.errors import MeshWarning, ModelError
+from ..base.errors import MeshWarning, ModelError, ModelWarning
 from ..base.names import did_you_mean, listing
 from ..laws import Control, TimeLaw, time_law
 from ..materials import Material
@@ -37,6 +38,10 @@ SIZES = (1e-6, 1e3)
 """Least and largest plausible size of a body, m: the longest side of its box."""
 MASSES = (1e-12, 1e7)
 """Least and largest plausible mass of a body, kg: a grain of dust, and more than a steel tower of 300 m."""
+LEAST_E, METAL = 1e6, 2500.0
+"""Pa and kg/m^3: metals in MPa have at most 4.1e5; soft matter is lighter, dense rubber stiffer."""
+LARGEST_NU = 0.499
+"""Of solids; beyond it the volumetric locking of a coarse mesh decides."""
 LEAST_DENSITY = 1.0
 """Least plausible density, kg/m^3: an aerogel; t/mm^3 are far below. Heavy bodies stand for others in models."""
 HANDLES: dict[type, str] = {
@@ -94,6 +99,7 @@ def warn_implausible(model: Any) -> None:
     """Warn (MeshWarning) of a size, mass or density that a wrong unit is likely to have made."""
     for body in model.bodies:
         _warn_of_densities(body)
+        _warn_of_constants(body)
         low, high = body.mesh.bounding_box()
         size = float(np.max(high - low))
         mass = None
@@ -110,6 +116,30 @@ def warn_implausible(model: Any) -> None:
             if large:
                 hint = f"is {body.mesh.label} in mm? Then give scale=1e-3 (--scale 1e-3); it is read in metres"
         warnings.warn(f"body {body.name!r} {what}: {hint}", MeshWarning, stacklevel=3)
+
+
+def _warn_of_constants(body: Body) -> None:
+    """Warn of a metal whose E is likely in MPa, and of a solid that locks."""
+    for group, material in body.materials:
+        law = type(material).__name__ + (f" of group {group!r}" if group else "")
+        lam, mu = material.lame
+        E, nu = mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
+        dense = material.density is not None and not callable(material.density)
+        if dense and E < LEAST_E and (low := float(np.min(material.density))) > METAL:
+            speed = math.sqrt(E / low)
+            warnings.warn(
+                f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3 is a metal as soft as rubber "
+                f"(waves run at {speed:.2g} m/s). Is E in MPa? Steel is E=2.1e11, density=7850",
+                ModelWarning,
+                stacklevel=4,
+            )
+        if body.family.solid and nu > LARGEST_NU:
+            warnings.warn(
+                f"body {body.name!r}: {law} with nu = {nu:.6g} locks: elements are far too stiff beyond {LARGEST_NU}; "
+                "take nu=0.49, or a finer mesh and see whether the result stays",
+                ModelWarning,
+                stacklevel=4,
+            )
 
 
 def _warn_of_densities(body: Body) -> None:

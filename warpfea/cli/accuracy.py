@@ -39,7 +39,8 @@ how to read it:
   compilation and set-up apart; digits are -log10(error x s); Pareto marks rows that no other beats in both. Parts of
   the error (space, time, algebra, rounding) are differences to a run that is finer in one of them;
   space is in the rows' errors only where the mesh is swept, or they are against a closed form or a file of the true
-  motion, and is told beside them otherwise.
+  motion; otherwise errors are in time, space is told beside them, and --target is for the sum. --split none estimates
+  no space: the target is one in time then.
   steps of runs that adapt are those that were accepted; in the CSV their "asked error" stands beside "error".
 
 With --out a study that was stopped by Ctrl-C goes on where it was: the same command again runs what is missing, and the
@@ -78,7 +79,12 @@ def add_accuracy(names: Any) -> None:
     judge.add_argument(
         "--measure", default="l2", metavar="NAME", help="error that counts: l2 (default), end, energy, field"
     )
-    judge.add_argument("--target", type=positive, metavar="X", help="name the cheapest setting with at most this error")
+    judge.add_argument(
+        "--target",
+        type=positive,
+        metavar="X",
+        help="name the cheapest setting with at most this error, in time and mesh",
+    )
     judge.add_argument(
         "--split", default="best", metavar="ROWS", help="parts of the error of the best row (default), of all, or none"
     )

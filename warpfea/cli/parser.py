@@ -168,6 +168,12 @@ def _add_model(to: argparse.ArgumentParser) -> None:
         default="refuse",
         help="a step that turns an element inside out is refused (default), or passes where the law allows it",
     )
+    how.add_argument(
+        "--energy-growth",
+        choices=("refuse", "warn", "ignore"),
+        default="refuse",
+        help="energy that the integrator adds: above 1 %% a warning, above 10 %% refused (default), or not",
+    )
 
 
 def _add_run(commands: Any) -> None:

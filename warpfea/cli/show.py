@@ -66,12 +66,10 @@ def info(options: argparse.Namespace) -> int:
         model = source.model()
         sim = source.simulation(model, progress(options))
         launcher = sim.stepper.launch
-        content = {"scene": source.label, "parameters": source.parameters} | model.info()
+        content = {"scene": source.label, "parameters": source.parameters} | sim.info()
         content |= {"bounding_box": model_box(model)}
         if is_mesh(options.what):
             content["mesh"] = mesh_facts(model.bodies[0].mesh)
-        content["integrator"] = sim.integrator.label
-        content["methods"] = sim.methods
         content["bytes"] = sim.bytes()
         content["bytes_per_unknown"] = sum(sim.bytes().values()) / max(content["unknowns"], 1)
         content["kernels"] = sorted(launcher.kernels)
@@ -126,6 +124,7 @@ def _info_table(content: dict[str, Any]) -> str:
     methods = c["methods"]
     details = [f"{name} {value}" for name, value in methods.items() if name != "solver"]
     rows.append(["solver", ", ".join([methods["solver"], *details])])
+    rows.append(["energy growth", c["energy_growth"]])
     rows.append(["used", ", ".join(c["features"])])
     rows.append(["left out", ", ".join(c["left_out"])])
     groups: dict[str, int] = {}

@@ -33,7 +33,7 @@ class Source:
         label: what the user wrote.
         scene: the scene. values: what it is called with.
         parameters: what a summary says.
-        dt, integrator, dtype, device, tol, solver, inversion, error: of the run.
+        dt, integrator, dtype, device, tol, solver, inversion, error, energy_growth: of the run.
         load_steps, static_tol: of statics; None: a motion, the solver's default. stabilise: of statics.
     """
 
@@ -52,6 +52,7 @@ class Source:
     static_tol: float | None = None
     stabilise: bool = False
     error: float | None = None
+    energy_growth: str = "refuse"
 
     def model(self) -> Model:
         """Call the scene and finalize."""
@@ -78,6 +79,7 @@ class Source:
                 integrator=self.integrator,
                 solver=solver,
                 inversion=self.inversion,
+                energy_growth=self.energy_growth,
                 on_compile=bar,
             )
 
@@ -156,4 +158,5 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         static_tol=options.tol,
         stabilise=getattr(options, "stabilise", False),
         error=error,
+        energy_growth=options.energy_growth,
     )

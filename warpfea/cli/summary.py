@@ -12,6 +12,7 @@ from ..base.provenance import versions
 from ..kernels.elements.materials import ANY_J
 from ..kernels.step.control import SAME_TIME
 from ..model.model import Model
+from ..simulation.energy_growth import integrator_share
 from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
 from .source import Source
@@ -58,6 +59,15 @@ MANY = 12
 """Joints and contacts that are listed one by one."""
 WORST = 4
 """Joints and contacts listed of more."""
+SHARE = 0.05
+"""Of the energy turned over that the integrator may take without a word."""
+LESS = {
+    "backward_euler": "--integrator bdf2 takes far less of slow motion, energy_momentum nothing; a smaller --dt less",
+    "bdf2": "--integrator energy_momentum takes nothing, a smaller --dt less",
+    "generalized_alpha": "--integrator bdf2 or 'energy_momentum(rho_inf=0.8)', or a smaller --dt",
+    "energy_momentum": "contact takes it at the end of steps; a smaller --dt takes less",
+}
+"""What to write where it takes more."""
 NO_J = 1e30
 """What a step reports for the smallest J where no element has one."""
 
@@ -166,6 +176,7 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
     if s["load"] is None:
         lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
         rows.append(["", f"lost by the integrator {lost} J, unbalanced {left} J"])
+        rows += _suggestion(sim)
         if s["contacts"]:
             stored = _text((e["contact"] or 0.0) + (e["contact_pairs"] or 0.0))
             lost = f"lost to restitution {_text(e['contact_loss'])}, to friction {_text(e['friction'])} J"
@@ -184,6 +195,14 @@ def _times(s: dict[str, Any]) -> str:
     """What the run took."""
     setup, kernels, solve, output = (f"{s[f'{name}_s']:.1f} s" for name in ("setup", "compile", "solve", "output"))
     return f"{s['wall_s']:.1f} s: set-up {setup} (kernels {kernels}), solve {solve}, output {output}"
+
+
+def _suggestion(sim: Simulation) -> list[list[str]]:
+    """What to write where the integrator takes or gives much of the energy that is turned over."""
+    share, name = integrator_share(sim), sim.integrator.name
+    if not share > SHARE:
+        return []
+    return [["", f"that is {share:.0%} of the energy turned over: {LESS[name]}"]]
 
 
 def _steps(s: dict[str, Any], sim: Simulation) -> str:

@@ -24,6 +24,8 @@ __all__ = ["ArraySpec", "State", "words_of"]
 
 MEMORY = ("preconditioner", "operator", "predictor", "summed")
 """What names of arrays begin with that a state can do without: memory of solvers, roundings of the time."""
+WATCH = ("energy_growth",)
+"""Arrays of what is watched, without which a state goes on as well."""
 
 
 @dataclass(frozen=True)
@@ -140,12 +142,15 @@ class State:
         return {name: array.numpy().copy() for name, array in self._arrays.items()}
 
     def load(self, values: dict[str, np.ndarray]) -> None:
-        """Set all arrays from the host. What solvers remember begins anew where `values` are of another solver.
+        """Set all arrays from the host. What solvers remember begins anew where `values` are of another solver, and so
+        does a watch that they lack.
 
         Raises:
             CheckpointError: a missing name or another shape; nothing is set then.
         """
-        own, given = ({name for name in names if not remembered(name)} for names in (self._arrays, values))
+        own, given = (
+            {name for name in names if not (remembered(name) or name in WATCH)} for names in (self._arrays, values)
+        )
         if own != given:
             raise CheckpointError(
                 f"state arrays differ: missing {sorted(own - given)}, unknown {sorted(given - own)}; a state goes on "
@@ -153,11 +158,10 @@ class State:
             )
         host = {name: array.numpy() for name, array in self._arrays.items()}
         memory = [name for name in host if remembered(name)]
-        if any(name not in values or values[name].shape != host[name].shape for name in memory):
-            values = {name: value for name, value in values.items() if name not in memory}
-            for name in memory:
-                values[name] = np.zeros_like(host[name])
-                values[name][...] = self.specs[name].initial
+        for group in (memory, *([name] for name in WATCH if name in host)):
+            if any(name not in values or values[name].shape != host[name].shape for name in group):
+                fresh = {name: np.full_like(host[name], self.specs[name].initial) for name in group}
+                values = values | fresh
         for name in self._arrays:
             expected = host[name]
             if values[name].shape != expected.shape or values[name].dtype != expected.dtype:

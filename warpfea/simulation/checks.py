@@ -74,12 +74,12 @@ def check_mask(mask: wp.array, model: Model) -> None:
         )
 
 
-def check_choice(name: str, value: Any, *words: str) -> None:
-    """Raise ModelError for what is none of some words."""
-    if value not in words:
-        if len(words) == 2:
-            raise ModelError(f"{name} = {value!r} is neither {words[0]!r} nor {words[1]!r}")
-        raise ModelError(f"{name} = {value!r} is none of {', '.join(map(repr, words))}")
+def check_choice(name: str, value: Any, *known: str) -> None:
+    """Raise ModelError for what is none of the known words."""
+    if value not in known:
+        if len(known) == 2:
+            raise ModelError(f"{name} = {value!r} is neither {known[0]!r} nor {known[1]!r}")
+        raise ModelError(f"{name} = {value!r} is none of {', '.join(map(repr, known))}")
 
 
 def check_constraint_tol(value: Any) -> None:

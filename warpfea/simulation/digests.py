@@ -10,6 +10,7 @@ import numpy as np
 from ..base.errors import ConstraintError, ConvergenceError
 from ..kernels.step.control import REPORT, STATUS
 from ..kernels.step.loops import TALLY
+from .energy_growth import EnergyGrowth
 from .failures import step_error
 from .records import Records
 from .reports import StepReport
@@ -57,6 +58,7 @@ class Digests(Records):
     _history: Any = Fresh()
     on_failure: str | None
     record: bool
+    energy_growth: EnergyGrowth
 
     def _open_digest(self, quiet: bool) -> None:
         B = self.model.worlds
@@ -85,6 +87,7 @@ class Digests(Records):
             key = f"max_{name}"
             setattr(self, key, max(getattr(self, key), float(sums[:, TALLY.index(name)].max())))
         self.min_J = min(self.min_J, float(sums[:, TALLY.index("min_J")].min()))
+        self.energy_growth.tell(self, sums[:, TALLY.index("energy_growth")])
         self._stepped = stepped
         if self._recorded:
             self._history = [self._row(rows)]
@@ -112,6 +115,7 @@ class Digests(Records):
             outer=column["outer"].astype(int),
             residual_force=column["residual_force"],
             floor=column["floor"],
+            energy_growth=column["energy_growth"],
             **(self.stepper.adaptive.counts() if self.stepper.adaptive else {}),
         )
 
@@ -141,6 +145,7 @@ class Digests(Records):
             if not self.record:
                 self._history.clear()
             self._history.append(self._row(rows))
+        self.energy_growth.tell(self, last.energy_growth)
         if fresh.any():
             fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
             if fatal:

@@ -10,6 +10,7 @@ from ..base.errors import ConstraintError, ConvergenceError
 from ..kernels.solvers.control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
+    FAIL_ENERGY,
     FAIL_ERROR,
     FAIL_FLOOR,
     FAIL_GROWTH,
@@ -24,6 +25,7 @@ from ..kernels.solvers.control import (
 from ..kernels.solvers.judging import NEAR
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
+from .energy_growth import growth_error
 from .jumps import jumping_drives
 from .overload import overload_text
 
@@ -59,6 +61,9 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     time = float(sim.last.time[world])
     # the last refusal was not followed by a halving
     halvings = min(int(sim.last.halvings[world]) - 1, sim.solver.max_halvings)
+    if code == FAIL_ENERGY:
+        text = f"{_step_from(sim, time, world)} was not taken in world {world}: {growth_error(sim, world)}"
+        return ConvergenceError(text, time=time, world=world, state=sim.state)
     if code == FAIL_CONSTRAINT:
         return _unsatisfied(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1

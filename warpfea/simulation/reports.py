@@ -33,6 +33,8 @@ class StepReport:
         time: s.
         residual_force: |g| over the free components, N, of the last attempt.
         violation: largest of the constraints, m.
+        energy_growth: net energy that the integrator has added since the start, over the largest kinetic + strain +
+            contact energy plus the sum of |work|; 0 where it is not watched.
         outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
         stable: of statics at full load: objects True, False, or None where it can't be known (`StaticResult.stability`
             has why). None in place of the array where it was not judged.
@@ -53,6 +55,7 @@ class StepReport:
     outer: np.ndarray
     residual_force: np.ndarray
     floor: np.ndarray
+    energy_growth: np.ndarray
     substeps: np.ndarray | None = None
     rejected: np.ndarray | None = None
     least_h: np.ndarray | None = None
@@ -152,7 +155,8 @@ def idle_report(sim: Any) -> StepReport:
     """The report of a simulation that has done no step since it was made or resumed."""
     count = sim.model.worlds
     zero, none = np.zeros(count, int), np.zeros(count)
-    return StepReport(sim.status == 0, zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero, none, none)
+    counts = (zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero)
+    return StepReport(sim.status == 0, *counts, none, none, none)
 
 
 def step_text(dt: Any) -> str:

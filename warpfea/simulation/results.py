@@ -33,6 +33,12 @@ class Results:
     model: Model
     state: State
 
+    def info(self) -> dict[str, Any]:
+        """`Model.info`, "integrator" with its options, "methods", and whether "energy_growth" is watched."""
+        own: Any = self
+        more = {"integrator": own.integrator.label, "methods": own.methods, "energy_growth": str(own.energy_growth)}
+        return self.model.info() | more
+
     def check_body(self, body: Any, what: str) -> None:
         """Raise ModelError unless `body` is the handle of a body of this model; the text begins with `what`."""
         if not isinstance(body, Body):

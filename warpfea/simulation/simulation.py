@@ -37,7 +37,9 @@ from .checks import (
 )
 from .controls import Controls
 from .digests import Digests
+from .energy_growth import CHOICES, EnergyGrowth
 from .failures import check_closed
+from .law_warnings import warn_of_ends, warn_of_jumps
 from .observations import Observations
 from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, describe, idle_report
 from .run_loop import run_steps
@@ -77,10 +79,14 @@ class Simulation(Digests):
             several only once all have failed.
         inversion: a step that turns an element inside out, J <= 0 at a quadrature point where J was positive, is
             refused ("refuse"), or passes where the law allows it ("report": StepReport.min_J tells).
+        energy_growth: energy that the integrator has added in a world, net, over the largest kinetic + strain + contact
+            energy plus the sum of |work|: above 1 % a warning, above 10 % steps are refused ("refuse"), or go on
+            ("warn"); "ignore" and ledger=False: not watched.
 
     Attributes:
         controls: what the caller writes between steps, see Controls.
         compile_s, output_s: s that it took to make the simulation, kernels included, and that writers of runs took.
+        energy_growth: how the energy that the integrator adds is watched, as a text.
 
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
@@ -106,6 +112,7 @@ class Simulation(Digests):
         capture: bool = True,
         on_failure: str | None = None,
         inversion: str = "refuse",
+        energy_growth: str = "refuse",
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
         scheme, options = integrators.get(integrator), solvers.get(solver)
@@ -113,6 +120,8 @@ class Simulation(Digests):
         if not scheme.static:
             require_density(model.bodies, "motion")
         check_choice("inversion", inversion, "refuse", "report")
+        check_choice("energy_growth", energy_growth, *CHOICES)
+        self.energy_growth = EnergyGrowth(energy_growth, ledger=ledger, static=scheme.static)
         if on_failure is not None:
             check_choice("on_failure", on_failure, "raise", "freeze")
         given = {"error": error, "interval": interval, "horizon": horizon}
@@ -135,7 +144,8 @@ class Simulation(Digests):
             return Stepper(
                 model, state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
-                adapt=adapt, quiet=quiet, ends=t_end is not None, on_compile=on_compile or bar,
+                adapt=adapt, quiet=quiet, ends=t_end is not None, growth=self.energy_growth,
+                on_compile=on_compile or bar,
             )  # fmt: skip
 
         self.model = model
@@ -161,6 +171,8 @@ class Simulation(Digests):
         if t_end is not None:
             self.t_end = t_end
         check_closed(self)
+        warn_of_jumps(self)
+        self.ended_laws: set[int] = set()
         self._load: np.ndarray | None = None
 
     def __repr__(self) -> str:
@@ -293,6 +305,8 @@ class Simulation(Digests):
             if total == 0 and t_end != now and self.steps == 0:
                 raise ModelError(f"t_end = {t_end:g} s is within {SAME_TIME:g} dt of the start at t = {now:g} s, so no "
                                  "step would be done; take a later t_end")  # fmt: skip
+        if not self.integrator.static:
+            warn_of_ends(self, t_end)
         self.stepper.loops.stop_at(t_end, total)
         try:
             run_steps(self, total, t_end, outputs, on_step, progress)

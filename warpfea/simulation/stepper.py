@@ -23,6 +23,7 @@ from ..terms.workspace import Workspace
 from .adaptive import Adapt, Adaptive
 from .checks import write_times
 from .compiling import OnCompile, load_modules
+from .energy_growth import EnergyGrowth
 from .integrators import Integrator
 from .loops import Loops
 from .opening import Opening
@@ -57,6 +58,7 @@ class Stepper:
         adapt: Adapt | None = None,
         quiet: bool = False,
         ends: bool = False,
+        growth: EnergyGrowth | None = None,
         on_compile: OnCompile | None = None,
     ) -> None:
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
@@ -118,6 +120,8 @@ class Stepper:
             tries = solver.max_halvings
             self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
+        if growth:
+            growth.bind(self.work.step, model, state)
         self.loops = Loops(model, self.work, self.launch, quiet=quiet, ends=ends)
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True

@@ -43,7 +43,8 @@ KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyFo
 LATER: tuple[str, ...] = ()
 """Features of later versions, which `info` lists as left out."""
 STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
-         "previous_velocity", "previous_step", "previous_end", "summed_time")  # fmt: skip
+         "previous_velocity", "previous_step", "previous_end", "summed_time",
+         "energy_growth")  # fmt: skip
 """Arrays of the state that are no term's."""
 FIELDS = ("von_mises", "displacement")
 """Fields of every model, see simulation.results."""

@@ -20,10 +20,10 @@ MARKERS = "osD^vP*X"
 SHOWN = 6
 """Lines of omissions."""
 MEANING = {
-    "l2": "error (L2 over time) / largest travel",
-    "end": "error at the end / largest travel",
+    "l2": "error {} (L2 over time) / largest travel",
+    "end": "error {} at the end / largest travel",
     "energy": "drift of energy / largest energy exchanged",
-    "field": "error of the field / its norm",
+    "field": "error {} of the field / its norm",
 }
 
 
@@ -53,7 +53,7 @@ def draw(study: Any, path: pathlib.Path) -> None:
         style = {"color": "#c00000", "marker": "x", "linestyle": "none", "markersize": 9, "markeredgewidth": 2}
         axes.plot(at, [0.97] * len(at), transform=axes.get_xaxis_transform(), label="failed", **style)
     axes.set_xlabel("run time of all steps, median, without compilation and set-up, s")
-    axes.set_ylabel(MEANING[study.measure])
+    axes.set_ylabel(MEANING[study.measure].format(study.kind))
     about = textwrap.shorten(study.references[0]["about"], 90) if study.references else ""
     axes.set_title(f"{study.name}, against {about}", fontsize=10, wrap=True)
     axes.legend(fontsize=8)

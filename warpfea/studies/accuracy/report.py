@@ -42,6 +42,7 @@ class Row:
         probes: l2 and end of each probe.
         resolved: the error is at least ten times that of the reference, and above rounding.
         own_error: that of the reference, in the same measure.
+        mesh_error: estimate of what the mesh leaves, where `error` is in time alone and a target hangs on it.
         orders: observed, from the next coarser row, by swept size.
         seconds, seconds_min: of all steps, median and minimum of `repeats` runs, without compilation and set-up.
         compile_s, setup_s: making the simulation (kernels, graphs), and making the model, in the first run.
@@ -66,6 +67,7 @@ class Row:
     probes: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
     resolved: bool = False
     own_error: float = 0.0
+    mesh_error: float | None = None
     orders: dict[str, float] = dataclasses.field(default_factory=dict)
     seconds: float | None = None
     seconds_min: float | None = None
@@ -88,8 +90,8 @@ class Row:
 
     @property
     def reaches(self) -> float:
-        """What the error is certainly not beyond: with that of the reference. inf where there is none."""
-        return math.inf if self.error is None else self.error + self.own_error
+        """The error, with that of the reference and of the mesh as far as it was estimated. inf where there is none."""
+        return math.inf if self.error is None else self.error + self.own_error + (self.mesh_error or 0.0)
 
     def curve(self, axes: Axes) -> tuple[tuple[str, Any], ...]:
         """What the rows of one curve share."""
@@ -187,6 +189,13 @@ class Study(Sequence[Row]):
         found = "" if self.target is None else f", target {self.target:g} {'reached' if self.answer else 'not reached'}"
         return f"Study({self.name!r}, {len(self.rows)} rows{found})"
 
+    @property
+    def kind(self) -> str:
+        """Which error it is: "in time" alone, against finer steps on the same mesh, or "in time and mesh"."""
+        swept = any(name in self.axes.over for name in self.axes.mesh)
+        known = self.references and all(ref.get("known", False) for ref in self.references)
+        return "in time and mesh" if swept or known else "in time"
+
     def curves(self) -> dict[str, list[Row]]:
         """Rows by curve, in words."""
         out: dict[str, list[Row]] = {}
@@ -240,7 +249,8 @@ class Study(Sequence[Row]):
             at = ", ".join(f"{k} = {word(v)}" for k, v in ref["values"].items())
             own = ", ".join(f"{k} {number(v, 2)}" for k, v in ref["own_error"].items())
             text.append(f"reference{f' at {at}' if at else ''}: {ref['about']}; its own error: {own or 'none'}")
-        text.append(f"errors over the largest travel, {', '.join(number(r['travel']) for r in self.references)} m")
+        travel = ", ".join(number(r["travel"]) for r in self.references)
+        text.append(f"errors {self.kind}, over the largest travel, {travel} m")
         text += [f"order {f['order']:.2f} in {f['size']} of {f['curve']}, {f['rows']} rows" for f in self.fits()]
         for row in self.rows:
             if row.split is not None:
@@ -263,6 +273,9 @@ class Study(Sequence[Row]):
         if self.answer is not None:
             r = self.answer
             found = f"error {number(r.error or 0.0, 3)} in {number(r.seconds or 0.0, 3)} s"
+            if self.kind == "in time":
+                mesh = "not estimated" if r.mesh_error is None else f"of {number(r.mesh_error, 2)} included"
+                found += f" (in time; mesh error {mesh})"
             text = f"cheapest that reaches {self.target:g}: {self.label(r)}: {found}\n  {self.command}"
             for c in self.checks:
                 size = f"error={word(c.setting.error)}" if c.setting.error else f"dt={word(c.setting.dt)}"
@@ -271,6 +284,13 @@ class Study(Sequence[Row]):
         near = min(self.rows, key=lambda r: r.reaches)
         if near.error is None:
             return f"no setting was measured to reach {self.target:g}"
+        if near.mesh_error is not None and near.error + near.own_error <= (self.target or 0.0):
+            missed = f"mesh error {number(near.mesh_error, 2)}"
+            if near.mesh_error <= (self.target or 0.0):
+                missed = f"with {missed} the sum {number(near.reaches, 3)}"
+            found = f"error {number(near.error, 3)} in {number(near.seconds or 0.0, 3)} s"
+            more = f"refine {', '.join(self.axes.mesh)}"
+            return f"reached in time; {missed} misses {self.target:g}: {self.label(near)}: {found}; {more}"
         own = f" (and {number(near.own_error, 2)} of the reference)" if near.own_error else ""
         return f"no setting was measured to reach {self.target:g}; nearest: {self.label(near)}: {near.error:.3g}{own}"
 

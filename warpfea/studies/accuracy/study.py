@@ -84,7 +84,8 @@ def study(
         finer: options and parameters of the finer run, in place of the chosen ones.
         mesh: parameters that refine the mesh; by default cells, elements, across.
         measure: the error that counts: "l2", "end", "energy" or "field".
-        target: error that the cheapest setting is wanted for.
+        target: error that the cheapest setting is wanted for: in time and, where the mesh is not swept, by the estimate
+            of `split` for its cells.
         split: parts of the error: of the "best" row (the answer to the target, else that with most digits of efficacy),
             of "all" rows, or "none".
         repeat: runs of each setting for the times; those longer than 2 s are not repeated.
@@ -149,12 +150,11 @@ def study(
         work = _Work(found, axes, store, repeat, limit, progress, known, probes, dict(finer or {}), measure, base)
         try:
             rows, references, motions = work.rows(settings)
+            rows = work.judged(rows, motions, split, target)
             answer = _answer(rows, target)
-            rows = work.split(rows, motions, split, answer)
             checks = [] if answer is None else work.checks(answer, motions)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(store.told()) from None
-    answer = None if answer is None else _answer(rows, target)
     command = None if answer is None else answer.setting.command(what, found)
     told = {
         "t_end": base.t_end, "repeat": repeat, "limit": limit, "split": split, "parameters": base.values, "dt": base.dt,
@@ -227,7 +227,7 @@ def _reference(
 
 
 def _answer(rows: Sequence[Row], target: float | None) -> Row | None:
-    """The row with the smallest median time of those whose error, with that of the reference, is within the target."""
+    """The row with the smallest median time of those whose error, with those of reference and mesh, is within it."""
     good = [r for r in rows if target is not None and r.status == DONE and r.reaches <= target]
     return min(good, key=lambda r: r.seconds or 0.0) if good else None
 
@@ -293,8 +293,9 @@ class _Work:
                 if name in motions:
                     m, values = motions[name], {k: group[0].get(k) for k in self.axes.physical}
                     references.append(
-                        {"values": values, "about": m.about, "travel": m.travel, "own_error": m.own, "runs": m.runs}
-                    )
+                        {"values": values, "about": m.about, "travel": m.travel, "own_error": m.own, "runs": m.runs,
+                         "known": known is not None}
+                    )  # fmt: skip
         found = [outcomes[id(s)] for s in settings]
         if all(o.status == REFUSED for o in found):
             raise ModelError(found[0].why)
@@ -329,12 +330,31 @@ class _Work:
             row, error=error, own_error=own, resolved=error >= max(RESOLVED * own, ROUNDING), efficacy=digits, **away
         )  # fmt: skip
 
+    def judged(self, rows: list[Row], motions: dict[str, Motion], which: str, target: float | None) -> list[Row]:
+        """The rows with parts of the error, and with that of the mesh where the cheapest one hangs on it."""
+        while True:
+            answer = _answer(rows, target)
+            rows = self.split(rows, motions, which, answer)
+            answer = _answer(rows, target)
+            if answer is None or answer.split is None or answer.mesh_error is not None or not self._in_time(answer):
+                return rows
+            space, values = answer.split["space"], answer.setting.values
+            if space is None:
+                return rows
+            rows = [replace(r, mesh_error=space) if r.error is not None and r.setting.values == values else r
+                    for r in rows]  # fmt: skip
+
+    def _in_time(self, row: Row) -> bool:
+        """Whether the error of a row leaves out that of the mesh, and an estimate of it can be added."""
+        swept = any(name in self.axes.over for name in self.axes.mesh)
+        return self.measured in ("l2", "end") and not swept and self.known(row.setting) is None
+
     def split(self, rows: list[Row], motions: dict[str, Motion], which: str, answer: Row | None) -> list[Row]:
         """The rows with parts of the error where asked for."""
         from tqdm import tqdm
 
         done = [r for r in rows if r.status == DONE and r.error is not None]
-        if which == "none" or not done:
+        if which == "none" or not done or (answer is None and any(r.split is not None for r in rows)):
             return rows
         best = answer or max(done, key=lambda r: -math.inf if r.efficacy is None else r.efficacy)
         out = []
@@ -342,7 +362,7 @@ class _Work:
             desc="parts of the error", unit="run", leave=False, disable=not self.show, file=sys.stderr
         ) as self.bar:
             for row in rows:
-                if row.error is not None and (which == "all" or row is best):
+                if row.error is not None and row.split is None and (which == "all" or row is best):
                     motion = motions[self._problem(row.setting)]
                     row = replace(row, split=parts_of_error(row.setting, self.axes, motion, self.run))
                 out.append(row)

@@ -34,6 +34,7 @@ from ...model.shapes import HalfSpace
 from ...simulation.simulation import Simulation
 from ...solvers import NewtonPCG
 from .measure import by_label, write
+from .scenes import STATED
 
 __all__ = ["PriceCase", "PriceRow", "cases", "force_in", "measure", "price"]
 
@@ -166,7 +167,8 @@ class _Runner:
     def __init__(self, b: ModelBuilder, scene: Scene, device: Any) -> None:
         self.model = b.finalize(device=device)
         how = NewtonPCG(tol=scene.tol)
-        self.sim = Simulation(self.model, dt=scene.dt, integrator=scene.integrator, solver=how)
+        method = STATED.get(scene.name, scene.integrator)
+        self.sim = Simulation(self.model, dt=scene.dt, integrator=method, solver=how)
         self.sim.step(WARM_UP)
         self.times: list[float] = []
 

@@ -1,0 +1,95 @@
+"""Warnings of time laws: those that end before a run, and drives that jump in the first step."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..base.errors import ModelWarning
+
+if TYPE_CHECKING:
+    from ..laws import TimeLaw
+    from ..model.description import Support
+
+__all__ = ["warn_of_ends", "warn_of_jumps"]
+
+JUMP = 1e-4
+"""Distance of driven nodes from where their law begins that counts, over the model's size; of joints one is refused."""
+SHOWN = 4
+"""Laws that a message names."""
+
+
+def warn_of_ends(sim: Any, t_end: float) -> None:
+    """Warn of sampled laws that still change where they end, before the run does (s); once of each."""
+    ended: dict[str, float] = {}
+    for law in sim.model.terms.laws.laws:
+        if len(law.times) < 2 or law.times[-1] >= t_end - 1e-9 * abs(t_end) or id(law) in sim.ended_laws:
+            continue
+        sim.ended_laws.add(id(law))
+        if np.any(law.values[-1] != law.values[-2]):
+            ended.setdefault(law.name, float(law.times[-1]))
+    if ended:
+        told = ", ".join(f"{name} (t = {end:g} s)" for name, end in list(ended.items())[:SHOWN])
+        told += f" and {len(ended) - SHOWN} more" if len(ended) > SHOWN else ""
+        warnings.warn(
+            f"time laws end before the run, at t = {t_end:g} s, and hold their last values: {told}; where that is "
+            "meant, end them with two equal samples, such as ([0, 1, 2], [0, v, v])",
+            ModelWarning,
+            stacklevel=3,
+        )
+
+
+def warn_of_jumps(sim: Any) -> None:
+    """Warn of a drive that is not where its nodes are at the start of a motion, in the first world.
+
+    What a control says is the caller's.
+    """
+    laws = {id(law): law for s in sim.model.description.supports for law in [s.law, *(s.node_laws or [])]
+            if law is not None and law.control is None}  # fmt: skip
+    if sim.integrator.static or not laws:
+        return
+    time = float(sim.time[0])
+    values = _values(sim, laws, time)
+    u = sim.state.displacement.numpy()[0].astype(float)
+    for support in sim.model.description.supports:
+        law = support.law or (support.node_laws or [None])[0]
+        if law is None or id(law) not in values:
+            continue
+        worst = float(np.linalg.norm(_away(support, values, u), axis=1).max(initial=0.0))
+        if not worst > JUMP * sim.model.size:
+            continue
+        warnings.warn(
+            f"{law.name} moves nodes by {worst:.3g} m in the first step: at t = {time:g} s it is not where they are; "
+            "let it begin there, such as ([0, 0.1], [0, value]), or assemble the model with solve_static",
+            ModelWarning,
+            stacklevel=3,
+        )
+        return
+
+
+def _values(sim: Any, laws: dict[int, TimeLaw], time: float) -> dict[int, np.ndarray]:
+    """(3,) of each law at a time, s, by `id`; of functions from the device."""
+    if any(law.function is not None for law in laws.values()):
+        found = sim.stepper.law_values(time)[0]
+        return {id(law): found[k] for k, law in enumerate(sim.model.terms.laws.laws) if id(law) in laws}
+    return {k: np.array([np.interp(time, law.times, column) for column in law.values.T]) for k, law in laws.items()}
+
+
+def _away(support: Support, values: dict[int, np.ndarray], u: np.ndarray) -> np.ndarray:
+    """(slots, 3) m: how far the prescribed components of a support's positions are from where its laws want them."""
+    body = support.body
+    chosen = np.flatnonzero(body.slot_kind[support.slots] == 0)
+    slots = support.slots[chosen]
+    if support.rotation is not None:
+        anchor, axis = support.rotation
+        angle = values[id(support.law)][0]
+        arm = body.reference[slots] + body.origin - anchor
+        turn = np.cross(axis, arm)
+        target = np.sin(angle) * turn + (1.0 - np.cos(angle)) * np.cross(axis, turn)
+    elif support.node_laws:
+        target = np.array([values[id(support.node_laws[k])] for k in chosen])
+    else:
+        target = values[id(support.law)]
+    return np.asarray((target - u[slots + body.slot_offset]) * np.asarray(support.components, dtype=float))
