@@ -204,7 +204,7 @@ def test_the_command_line_refuses_warns_and_suggests(tmp_path, capsys):
     assert "has added 1" in told
     assert main([*words, "--t-end", "1.5", "--energy-growth", "warn"]) == 0
     done = capsys.readouterr()
-    assert "% of the energy turned over: --integrator bdf2 or energy_momentum" in done.out
+    assert "% of the energy turned over: --integrator bdf2 or 'energy_momentum(rho_inf=0.8)'" in done.out
     assert main([*words, "--integrator", "backward_euler", "--t-end", "0.6"]) == 0
     assert "of the energy turned over: --integrator bdf2 takes far less" in capsys.readouterr().out
     assert main([*words, "--integrator", "energy_momentum", "--t-end", "0.6"]) == 0

@@ -56,8 +56,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
-        """Open a step of every world that has not failed and is not at the end of the run; of one whose energy has grown
-        the step is refused."""
+        """Open a step of the worlds that run and are not at their end; refuse it where energy has grown."""
         world = wp.tid()
         time = step.time[world]
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)

@@ -67,9 +67,7 @@ class Stepper:
         self.terms = model.terms
         self.launch.parts |= model.terms.parts
         if integrator.midpoint and isinstance(solver, Jacobi):
-            raise ModelError(
-                f"integrator {integrator.name!r} needs Newton's method: solver=NewtonPCG(...) in the place of Jacobi"
-            )
+            raise ModelError(f"integrator {integrator.name!r} needs Newton's method: solver=NewtonPCG(...), not Jacobi")
         self.kernels = step_kernels(model.dtype, integrator, model.terms.traits)
         vec3 = model.types.vec3
         state.sealed = False
@@ -90,13 +88,11 @@ class Stepper:
         state.register("status", wp.int32)
         state.register("summed_time", wp.float64)
         self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
-        midpoint = integrator.midpoint
-        loss = integrator.dissipation
+        midpoint, loss = integrator.midpoint, integrator.dissipation
         self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint, dissipation=loss)
         self.at = At(
-            model, self.work, self.launch, state, self.u_before,
-            inertia=not integrator.static, midpoint=midpoint, dissipation=loss,
-            accelerated=integrator.accelerated,
+            model, self.work, self.launch, state, self.u_before, inertia=not integrator.static,
+            midpoint=midpoint, dissipation=loss, accelerated=integrator.accelerated,
         )  # fmt: skip
         self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)

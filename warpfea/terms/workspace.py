@@ -135,7 +135,8 @@ class Workspace:
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative = self.pcg.negative
-        unused = ("b", "q_a", "stretch", "any_refused", "summed", "ends", "growth") + (() if midpoint else ("stage_time",))
+        unused = ("b", "q_a", "stretch", "any_refused", "summed", "ends", "growth")
+        unused += () if midpoint else ("stage_time",)
         self.step = self.struct(step_struct(), B, skip=unused, stop=(2,))
         self.stage_time = self.step.stage_time if midpoint else self.step.new_time
         self.balance = balance_struct(model.dtype)()
