@@ -124,12 +124,13 @@ class Simulation(Digests):
         self.energy_growth = EnergyGrowth(energy_growth, ledger=ledger, static=scheme.static)
         if on_failure is not None:
             check_choice("on_failure", on_failure, "raise", "freeze")
-        adapt = adapt_of(dt, error=error, interval=interval, horizon=horizon, model=model, scheme=scheme, solver=options)
+        times = {"error": error, "interval": interval, "horizon": horizon}
+        adapt = adapt_of(dt, **times, model=model, scheme=scheme, solver=options)
         if adapt is None:
             check_times("dt", dt, model, positive=True)
         if t_end is not None:
             if adapt or scheme.static:
-                raise ModelError(f"t_end = {t_end!r}: only steps of a fixed size end there; run(t_end) does with others")
+                raise ModelError(f"t_end = {t_end!r}: only steps of a fixed size end there; otherwise run(t_end)")
             check_times("t_end", t_end, model)
         # accelerations at the start are found on the host
         quiet = on_failure == "freeze" and not record and not (adapt or scheme.accelerated or scheme.static)
