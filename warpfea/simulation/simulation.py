@@ -153,7 +153,7 @@ class Simulation(Digests):
         self.state = model.state() if state is None else state
         check_state(model, self.state)
         self.integrator, self.solver = scheme, options
-        self.on_failure, self.record = on_failure, record
+        self.on_failure, self.record, self.ended_laws = on_failure, record, set[int]()
         room = enough_memory(f"a simulation of {model.worlds} worlds", model.device)
         with quiet_warp(), room, compile_bar(None if on_compile is None else False) as bar:
             self.stepper = stepper(model, self.state, capture)
@@ -170,7 +170,6 @@ class Simulation(Digests):
             self.t_end = t_end
         check_closed(self)
         warn_of_jumps(self)
-        self.ended_laws: set[int] = set()
         self._load: np.ndarray | None = None
 
     def __repr__(self) -> str:
