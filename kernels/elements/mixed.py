@@ -48,7 +48,7 @@ def mixed_product(dtype: str, law: str, slots: int, points: int, affine: bool, f
         for point in range(block.gradient.shape[0]):
             G = fn.gradient_of(block, U, point, elem)
             dG = fn.gradient_of(block, P, point, elem)
-            dP = fn.point_increment(block, G, dG, mat33(), history, c, dq, world, point, elem)
+            dP = fn.point_increment(block, G, dG, mat33(), history, c, dq, 0, world, point, elem)
             local = fn.into_axes(block, G, point, elem)
             if mixed[world] == 1:
                 ahead = fn.into_axes(block, fn.gradient_of(block, step, point, elem), point, elem)

@@ -39,9 +39,10 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """Flag the worlds whose next solve tells an error; clear both sums there."""
         world, slot = wp.tid()
+        asks = ctl.active[world] != 0 and ctl.strict[world] == 1  # one that ended since keeps its positions
         if slot == 0:
-            flags[world] = wp.where(ctl.strict[world] == 1, 1, 0)
-        if ctl.strict[world] == 1:
+            flags[world] = wp.where(asks, 1, 0)
+        if asks:
             moved[world, slot] = vec3()
             total[world, slot] = vec3()
 
