@@ -21,7 +21,7 @@ __all__ = ["step_kernels"]
 
 FULL = 1e-9
 """Part of the load that may lack where all of it counts as acting."""
-STRETCH = 2.0
+STRETCH = 4.0
 """Largest growth of a step that accelerations are extrapolated for: after many halvings they are those of an event."""
 
 
@@ -102,6 +102,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             # a state that was set, reset or advanced by another scheme since has no past
             if step.previous_end[world] == step.time[world]:
                 previous = step.previous_h[world]
+        if wp.static(accelerated):
+            previous = wp.max(step.previous_h[world], f64(1.0 / STRETCH) * h)
+            step.h_before[world] = previous
         c = coefficients(h, previous, step.parameter)
         step.a0[world] = c.a0
         step.a1[world] = c.a1
@@ -109,7 +112,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.b[world] = c.b
         if wp.static(accelerated):
             step.q_a[world] = c.q_a
-            step.stretch[world] = wp.min(h / step.previous_h[world], f64(STRETCH))
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
             step.ramp[world] = step.new_time[world]
@@ -119,11 +121,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.dq_dv[world] = c.dq_dv
             step.mass_factor[world] = c.mass_factor
             step.ramp[world] = f64(1.0)
-
-    @wp.func
-    def averaged(stretch: f64, a: vec3, w: vec3) -> vec3:
-        """a_n for the step at hand: a is that of the last one's, of a time as far from w's as it was long."""
-        return w + T(stretch) * (a - w)
 
     @wp.kernel(module=module)
     def predict(
@@ -158,8 +155,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         if wp.static(takes_velocity):
             q += T(step.b[world]) * v_n[world, slot]
         if wp.static(accelerated):
-            c = coefficients(step.h[world], f64(0.0), step.parameter)
-            a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
+            c = coefficients(step.h[world], step.h_before[world], step.parameter)
+            a = u_before[world, slot]
             q += T(c.q_a) * a
             w += T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
         q_tilde[world, slot] = q
@@ -293,8 +290,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
                 step.previous_h[world] = step.h[world]
                 step.previous_end[world] = step.new_time[world]
         if wp.static(accelerated):
-            c = coefficients(step.h[world], f64(0.0), step.parameter)
-            a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
+            c = coefficients(step.h[world], step.h_before[world], step.parameter)
+            a = u_before[world, slot]
             new = v[world, slot]
             before = v_n[world, slot] + T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
             u_before[world, slot] = T(c.a_v) * (new - v_n[world, slot]) - T(c.a_a) * a

@@ -128,7 +128,7 @@ class Workspace:
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative = self.pcg.negative
-        unused = ("b", "q_a", "stretch", "any_refused") + (() if midpoint else ("stage_time",))
+        unused = ("b", "q_a", "h_before", "any_refused") + (() if midpoint else ("stage_time",))
         self.step = self.struct(step_struct(), B, skip=unused)
         self.stage_time = self.step.stage_time if midpoint else self.step.new_time
         self.balance = balance_struct(model.dtype)()
