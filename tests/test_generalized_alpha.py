@@ -172,7 +172,7 @@ def test_order_of_a_mode_where_steps_change(mode, rho, change, dtype):
 def test_order_of_a_pendulum_where_steps_change(change):
     """A soft link that falls and turns on its hinge by 0.6 rad: its tip against the limit of equal steps.
 
-    Fails on 8934ce7: ratios of 2.2 (0.4/1.6) and 3.5 (random).
+    Fails on 8934ce7: a ratio of 2.0 with 0.4/1.6.
     """
 
     def tip(kind, count, dtype="float64"):
