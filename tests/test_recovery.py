@@ -214,7 +214,7 @@ def test_work_that_is_spent_within_rounding_names_the_precision():
 @pytest.mark.parametrize("most", [1, 200])
 @pytest.mark.parametrize("preconditioner", ["block-jacobi", "two-level", "banded"])
 def test_work_ends_within_a_solve(preconditioner, most):
-    """Fails on 8934ce7: with max_work = 1 block-jacobi takes 20000 iterations, two-level 2263, and 7 are 9 with a band."""
+    """Fails on 8934ce7: with max_work = 1 block-jacobi takes 20000 iterations, two-level 2263, with 7 a band 9."""
     most = 7 if preconditioner == "banded" and most == 200 else most
     sim = begin_static(
         thin("T10", "float64"),

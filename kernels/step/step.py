@@ -103,7 +103,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             if step.previous_end[world] == step.time[world]:
                 previous = step.previous_h[world]
         if wp.static(accelerated):
-            previous = wp.max(step.previous_h[world], f64(1.0 / STRETCH) * h)
+            previous = wp.max(step.previous_h[world], h / f64(STRETCH))
             step.h_before[world] = previous
         c = coefficients(h, previous, step.parameter)
         step.a0[world] = c.a0

@@ -373,5 +373,5 @@ def refuse(model: Model, integrator: Integrator, driven: bool) -> None:
         what = f"joint {model.constraints.joints[0].name!r}" if model.constraints is not None else "a drive"
         raise ModelError(
             f"{integrator!r}: with rho_inf = 1 the forces of joints and drives grow from step to step, and the model "
-            f"has {what}; take rho_inf below 1, such as 0.8"
+            f"has {what}; take rho_inf below 1, such as 0.2"
         )

@@ -10,8 +10,8 @@ c = am - af, with the step h_n that led there. With r = h_n / h and D = 1 + c - 
 
     am = am_1 / D,  af = af_1,  gamma = (1/2 - c r) / D,  beta = gamma beta_1 / gamma_1,
 
-where index 1 is of equal steps (Chung and Hulbert), all averages are taken at those times, so that the order is two for
-any steps, dq/dv is h beta_1 / gamma_1 for any r, and stiff components decay for r from 1/4 to 4 and all rho_inf below 1.
+where index 1 is of equal steps (Chung and Hulbert), all averages are of those times, so that the order is two for any
+steps; dq/dv is h beta_1 / gamma_1, and stiff components decay for r from 1/4 to 4 and rho_inf below 1.
 """
 
 import math
@@ -53,13 +53,15 @@ class GeneralizedAlpha(Integrator):
 
     Args:
         rho_inf: spectral radius at infinite frequency, 0 to 1: the factor by which a step damps what it does not
-            resolve. 1 conserves the energy of linear systems; models with joints or drives need less than 1.
+            resolve. 1 conserves the energy of linear systems; models with joints or drives need less than 1. Bodies that
+            turn gain energy, by more the larger rho_inf is (Kuhl and Crisfield 1999): 0.2 adds none up to 2 rad a step,
+            0.5 does from 0.6 rad on, 0.8 from 0.2 rad on.
 
     Raises:
         ModelError: rho_inf is not between 0 and 1.
     """
 
-    def __init__(self, *, rho_inf: float = 0.8) -> None:
+    def __init__(self, *, rho_inf: float = 0.2) -> None:
         known = isinstance(rho_inf, (int, float)) and not isinstance(rho_inf, bool)
         if not (known and math.isfinite(rho_inf) and 0.0 <= rho_inf <= 1.0):
             raise ModelError(f"GeneralizedAlpha: rho_inf = {rho_inf!r} must lie between 0 and 1")
