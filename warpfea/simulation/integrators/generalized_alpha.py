@@ -53,9 +53,9 @@ class GeneralizedAlpha(Integrator):
 
     Args:
         rho_inf: spectral radius at infinite frequency, 0 to 1: the factor by which a step damps what it does not
-            resolve. 1 conserves the energy of linear systems; models with joints or drives need less than 1. Bodies that
-            turn gain energy, by more the larger rho_inf is (Kuhl and Crisfield 1999): 0.2 adds none up to 2 rad a step,
-            0.5 does from 0.6 rad on, 0.8 from 0.2 rad on.
+            resolve. 1 conserves the energy of linear systems; models with joints or drives need less than 1. Bodies
+            that turn gain energy, by more the larger rho_inf is (Kuhl and Crisfield 1999): with 0.2 none up to 2 rad a
+            step, with 0.5 from 0.6 rad on, with 0.8 from 0.2 rad on.
 
     Raises:
         ModelError: rho_inf is not between 0 and 1.
