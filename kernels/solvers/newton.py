@@ -240,6 +240,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
         ctl.rounds[world] = ctl.rounds[world] + 1
         ctl.searches[world] = 0
+        ctl.grown[world] = wp.where(ctl.negative[world] != 0 and ctl.equilibrium != 0, 0, -1)
         if wp.static(walls):
             ctl.lower[world] = wp.vec2d(f64(0.0), ctl.slope_sum[0, world])
             ctl.upper[world] = wp.vec2d()
