@@ -355,6 +355,53 @@ def test_float32_runs_and_refuses_what_it_does_not_resolve():
     assert np.abs(tips[0] - tips[1]).max() < 1e-3
 
 
+@pytest.mark.parametrize(("E", "error", "horizon", "end"), [(1e7, 1e-4, 2.0, 0.25), (1e9, 1e-5, 0.3, 0.1)])
+def test_float32_takes_what_it_promises_on_a_pendulum(E, error, horizon, end):
+    """A bar on a hinge falls: what rounds the displacements is no error of the step.
+
+    Fails on 8934ce7: refused at 0.1875 s and 0.0703 s, "no step is short enough for the error asked for".
+    """
+    tips, counts = [], []
+    for dtype in ("float64", "float32"):
+        b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+        law = wf.SVK(E=E, nu=0.3, density=1000.0)
+        rod = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(6, 1, 1)), material=law)
+        b.add_joint("revolute", parent=wf.GROUND, child=rod.surface("x-"), axis=(0, 1, 0))
+        b.add_probe("tip", rod.surface("x+"))
+        model = b.finalize(device="cpu", dtype=dtype)
+        sim = auto(model, error, integrator="bdf2", horizon=horizon, interval=horizon / 64)
+        sim.run(end)
+        tips.append(sim.probe("tip").position[0, -1])
+        counts.append(sim.totals["substeps"][0])
+    assert np.linalg.norm(tips[1] - tips[0]) < error * model.size  # 0.08 and 0.15 of it
+    assert counts[1] < 1.1 * counts[0]
+
+
+def test_a_longer_run_settles_its_own_interval():
+    """A pulse of 1 ms with a run of its own, then 1 s. Fails on 8934ce7: 64 109 substeps, intervals of the pulse's."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    law = wf.SVK(E=1e6, nu=0.3, density=1000.0, damping=wf.KelvinVoigt(eta=1e3))
+    body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=law)
+    b.clamp(body.nodes("x-"))
+    b.add_traction(body.surface("x+"), ([0.0, 5e-4, 1e-3], [(0, 0, 0), (0, 0, 3e4), (0, 0, 0)]))
+    b.add_probe("tip", body.surface("x+"))
+    model = b.finalize(device="cpu")
+    split, whole = auto(model, integrator="bdf2"), auto(model, integrator="bdf2")
+    split.run(1e-3)
+    assert split.dt == pytest.approx(1e-3 / 64)
+    for sim in (split, whole):
+        sim.run(1.001)
+    assert split.dt == pytest.approx(1.0 / 64)
+    assert whole.totals["substeps"][0] < split.totals["substeps"][0] < 2 * whole.totals["substeps"][0]
+    fine = auto(model, 1e-4, integrator="bdf2")
+    fine.run(1.001)
+    tips = [sim.probe("tip").displacement[0, -1] for sim in (split, fine)]
+    assert np.linalg.norm(tips[0] - tips[1]) < 1e-3 * model.size
+    interval = split.dt
+    split.run(1.5)  # no longer than the last
+    assert split.dt == interval
+
+
 def test_dt_can_not_be_set():
     sim = auto()
     with pytest.raises(wf.ModelError, match="made with dt = 'auto'"):

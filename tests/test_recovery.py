@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warpfea as wf
+from warpfea.simulation.statics import begin_static
 from warpfea.studies.stress.case import Setting
 from warpfea.studies.stress.cases import inside_out
 from warpfea.studies.stress.cases.stretch import stretch
@@ -208,6 +209,69 @@ def test_work_that_is_spent_within_rounding_names_the_precision():
     with pytest.raises(wf.ConvergenceError, match="max_work = 9000") as caught:
         wf.solve_static(thin("T10", "float64"), load_steps=3, solver=solver)
     assert "can't hold" not in str(caught.value)
+
+
+def truss(kind, rise, side, E):
+    """Two bars on hinges, half a span of 1 m, under 1.2 times the load that snaps them through, and the apex's height
+    then: bars that Euler's load bends before, by the closed form of bars that stay straight."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    length, law = float(np.hypot(1.0, rise)), wf.SVK(E=E, nu=0.0)
+
+    def load(z):
+        return -E * side**2 * (z * z - rise**2) / length**2 * z / length
+
+    ends = []
+    for sign in (-1.0, 1.0):
+        foot = np.array([sign, 0.0, 0.0])
+        along = (np.array([0.0, 0.0, rise]) - foot) / length
+        across = np.cross(along, (0, 1, 0))
+        if kind == "3243":
+            section = wf.Rectangle(side, side)
+            bar = b.add_beam([foot, foot + length * along], elements=1, section=section, normal=across, material=law)
+            near, far = bar.start, bar.end
+            b.add_point_load(far, (0, 0, -0.6 * load(rise / np.sqrt(3.0))))
+        else:
+            mesh = wf.mesh.box((length, side, side), cells=(1, 1, 1), origin=(0.0, -side / 2, -side / 2))
+            bar = b.add_solid(mesh, material=law, transform=(np.stack([along, (0, 1, 0), across], axis=1), foot))
+            near, far = bar.surface("x-"), bar.surface("x+")
+            b.add_traction(far, (0, 0, -0.6 * load(rise / np.sqrt(3.0)) / side**2))
+        ends.append(far)
+        b.add_joint("revolute", parent=wf.GROUND, child=near, axis=(0, 1, 0))
+    b.add_joint("revolute", parent=ends[0], child=ends[1], axis=(0, 1, 0))
+    b.add_probe("apex", ends[0])
+    heights = np.linspace(-2.0 * rise, -rise, 100001)
+    return b.finalize(device="cpu"), heights[np.argmin(np.abs(load(heights) - 1.2 * load(rise / np.sqrt(3.0))))]
+
+
+@pytest.mark.parametrize(
+    ("kind", "rise", "side", "steps", "most"),
+    [
+        ("3243", 0.3, 0.1, 10, 300),
+        ("3243", 0.1, 0.02, 10, 150),
+        ("T10", 0.1, 0.02, 10, 200),
+        ("T10", 0.3, 0.02, 10, 180),
+    ],
+)
+def test_trusses_snap_through_in_few_iterations(kind, rise, side, steps, most):
+    """Bars that buckle on the way: 129, 74, 95, 87 Newton iterations. Fails on 8934ce7: 509, refused, refused, 333."""
+    model, height = truss(kind, rise, side, 2e11)
+    found = wf.solve_static(model, load_steps=steps)
+    assert found.probe("apex").position[0, -1, 2] == pytest.approx(height, rel=1e-4)
+    assert found.newton[0] <= most
+
+
+@pytest.mark.parametrize("most", [1, 200])
+@pytest.mark.parametrize("preconditioner", ["block-jacobi", "two-level", "banded"])
+def test_work_ends_within_a_solve(preconditioner, most):
+    """Fails on 8934ce7: with max_work = 1 block-jacobi takes 20000 iterations, two-level 2263, with 7 a band 9."""
+    most = 7 if preconditioner == "banded" and most == 200 else most
+    sim = begin_static(
+        thin("T10", "float64"),
+        load_steps=1,
+        solver=wf.NewtonPCG(max_work=most, max_pcg=20000, preconditioner=preconditioner),
+    )
+    with pytest.raises(wf.ConvergenceError, match=f"has taken {most} iterations .* raise max_work = {most}"):
+        sim.step()
 
 
 @pytest.mark.parametrize("element", ["T10", "H3843"])

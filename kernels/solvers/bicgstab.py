@@ -203,7 +203,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         if norm <= f64(0.5) * bi.mark[world]:
             bi.mark[world] = norm
             bi.since[world] = 0
-        more = norm > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations
+        more = norm > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations and ctl.total[world] < ctl.max_work
         more = more and bi.since[world] < STALLED
         if more and wp.isfinite(beta) and wp.isfinite(norm) and rho != f64(0.0):
             bi.going[world] = 1
@@ -255,7 +255,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             return
         if not ctl.norm[world] <= bi.best[world]:
             ctl.norm[world] = bi.best[world]
-        if first != 0 and ctl.norm[world] > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations:
+        if first != 0 and ctl.norm[world] > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations and ctl.total[world] < ctl.max_work:
             bi.again[world] = 1
             wp.atomic_max(bi.any_again, 0, 1)
         elif newton.strict[world] != 0 and not ctl.norm[world] <= f64(FOUND) * ctl.first_norm[world]:

@@ -59,6 +59,7 @@ def control_struct():
         failed: wp.array(dtype=wp.int32)  # 0 or a FAIL_ code
         iterations: wp.array(dtype=wp.int32)  # of this attempt
         searches: wp.array(dtype=wp.int32)
+        grown: wp.array(dtype=wp.int32)  # doublings of the step along a concave Phi; -1: no more
         total_iterations: wp.array(dtype=wp.int32)  # of this step
         alpha: wp.array(dtype=wp.float64)
         phi: wp.array(dtype=wp.float64)

@@ -231,7 +231,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         open_search(ctl, world)
 
     @wp.kernel(module=module)
-    def begin_search(ctl: Control, pcg: PCG, max_work: int):
+    def begin_search(ctl: Control, pcg: PCG):
         """Take the slope along the new direction; try the full step first."""
         world = wp.tid()
         if ctl.active[world] == 0:
@@ -243,6 +243,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
         ctl.rounds[world] = ctl.rounds[world] + 1
         ctl.searches[world] = 0
+        ctl.grown[world] = wp.where(ctl.negative[world] != 0 and ctl.equilibrium != 0, 0, -1)
         if wp.static(walls):
             ctl.lower[world] = wp.vec2d(f64(0.0), ctl.slope_sum[0, world])
             ctl.upper[world] = wp.vec2d()
@@ -256,12 +257,12 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if wp.static(gated):
             if ctl.classical == 0:
                 ctl.outer[world] = ctl.outer[world] + 1
-        if ctl.strict[world] != 0 and pcg.total[world] < max_work:
+        if ctl.strict[world] != 0 and pcg.total[world] < pcg.max_work:
             # the error that is left is judged before the direction is followed
             ctl.strict[world] = 2
             ctl.searching[world] = 0
             wp.atomic_max(ctl.any_hard, 0, 1)
-        elif pcg.total[world] >= max_work:
+        elif pcg.total[world] >= pcg.max_work:
             give_up(ctl, world, FAIL_WORK)
         elif ctl.rounds[world] > ROUNDS * patience(ctl, world) * ctl.max_iterations:
             give_up(ctl, world, FAIL_ITERATIONS)

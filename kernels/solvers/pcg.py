@@ -50,7 +50,8 @@ def pcg_struct():
         exact: wp.array(dtype=wp.int32)  # the preconditioner is the inverse of the operator, up to rounding
         taken: wp.array(dtype=wp.int32)  # its z is the solution
         flip: wp.array(dtype=wp.int32)  # such a direction is taken as if its curvature were positive
-        max_iterations: wp.int32
+        max_iterations: wp.int32  # of a solve
+        max_work: wp.int32  # of a step
 
     return PCGControl
 
@@ -179,6 +180,8 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         if ctl.strict[world] != 0:
             # a residual of rough roundings hides the smooth error: its norm is no guide to when that is found
             ctl.target[world] = f64(0.0)
+        if ctl.total[world] >= ctl.max_work:
+            return  # the step is given up, see `begin_search`
         if norm > ctl.target[world] and rz > f64(0.0) and ctl.max_iterations > 0:
             checked = newton.iterations[world] >= TRUSTED or newton.mixed[world] != 0 or ctl.strict[world] != 0
             if ctl.exact[world] != 0 and not checked:
@@ -253,7 +256,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             ctl.norm[world] = norm
             ctl.iterations[world] = count
             ctl.total[world] = ctl.total[world] + 1
-            more = norm > ctl.target[world] and count < ctl.max_iterations
+            more = norm > ctl.target[world] and count < ctl.max_iterations and ctl.total[world] < ctl.max_work
             if ctl.strict[world] != 0 and count % STRICT_CHECK == 0:
                 energy = ctl.energy[world]
                 more = more and energy - ctl.seen[world] > f64(STRICT_GAIN) * energy

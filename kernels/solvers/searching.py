@@ -21,6 +21,7 @@ equilibrium over iterates whose membrane energy is far above that of both ends (
 TURN, SHRINK = 0.5, 0.4
 """Most that such a step turns or stretches an element, and what remains of it when the best iterate was restored."""
 LOST = 10  # solves that lead to no step before the tangent is followed as it is; with 0 soft solids take longer
+GROWN = 30  # doublings of a step along which Phi is concave
 EXCURSIONS = 1  # full steps deep into an obstacle in an attempt: the way back may end where it began
 KINK, KINKS = 0.5, 8
 """With contact: where the slope of Phi at a trial is positive and more than this part of that at the iterate, points
@@ -32,7 +33,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     """Kernels in the module of Newton's, and the function `lost`."""
     f64 = wp.float64
     Control = control_struct()
-    stored, walls, midpoint = traits.stored, traits.walls, traits.midpoint
+    stored, walls, midpoint, limited = traits.stored, traits.walls, traits.midpoint, traits.limited
     judging = judging_functions(traits)
     objective, magnitude, measure = judging.objective, judging.magnitude, judging.measure
     settle, fail = judging.settle, judging.fail
@@ -143,6 +144,23 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             fail(ctl, world, why)
 
     @wp.func
+    def lengthen(ctl: Control, world: int, good: bool, slope: f64) -> bool:
+        """Double the step where Phi falls ever faster along it, or take the last doubling back where the trial is none:
+        off a saddle, for evaluations in place of solves. Statics, after a solve that met negative curvature."""
+        alpha = ctl.alpha[world]
+        longer = good and slope <= ctl.slope[world] and ctl.grown[world] >= 0 and ctl.grown[world] < GROWN
+        if wp.static(limited):
+            longer = longer and f64(2.0) * alpha <= ctl.limit[world]
+        if longer:
+            ctl.grown[world] = ctl.grown[world] + 1
+            ctl.alpha[world] = f64(2.0) * alpha
+        elif not good and ctl.grown[world] > 0:
+            ctl.grown[world] = -1
+            ctl.alpha[world] = f64(0.5) * alpha
+            longer = True
+        return longer
+
+    @wp.func
     def between(ctl: Control, world: int, slope: f64) -> f64:
         """The next length of a search whose trial is on the far side of a kink of Phi, or still steep before it: by
         the Illinois method on slopes (Dowell and Jarratt 1971)."""
@@ -208,6 +226,8 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
                 ctl.searches[world] = ctl.searches[world] + 1
                 ctl.alpha[world] = between(ctl, world, slope)
                 return
+        if lengthen(ctl, world, good and not (stands or reused), ctl.slot_sums[6, world] - alpha * bend):
+            return
         leap = ctl.wish[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or leap:
             take(ctl, world, stands, leap)

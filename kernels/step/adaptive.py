@@ -7,7 +7,9 @@ running mean of the accepted sizes, and enters the running mean m of the rates a
 
 at all places: local errors then add up over the horizon to a share of what was asked. Errors of vibrations change their
 sign and add up to nothing: with their means alone held, a vibration smaller than the error asked for is not resolved.
-Where a velocity jumps, e is of order h however short the substep is: the pace lets it pass.
+Where a velocity jumps, e is of order h however short the substep is: the pace lets it pass. What rounding of the
+displacements may explain does not count, in single precision: at most ROUNDING eps |u| of e, and of the mean of n rates
+1/n of that, for roundings do not add up, and only as far as the rates scatter.
 """
 
 import functools
@@ -48,6 +50,8 @@ AVERAGE = 16.0
 """Substeps that the mean of rates looks back over."""
 CAP = 4.0
 """A rate may be this many times what their mean may be."""
+ROUNDING = 2.0
+"""Roundings of the largest displacement that an estimate is off by at most."""
 
 
 @functools.cache
@@ -60,6 +64,8 @@ def adaptive_struct():
         span: wp.array(dtype=wp.float64)  # s, that the error of this attempt counts over
         rate: wp.array(dtype=wp.float64)  # largest rate of this attempt, m/s
         mean: wp.array(dtype=wp.float64)  # largest mean of rates with it, m/s
+        scatter: wp.array(dtype=wp.float64)  # largest difference of the two, m/s
+        moved: wp.array(dtype=wp.float64)  # largest displacement, m
         tries: wp.array(dtype=wp.int32)  # refusals in a row that are none of the estimate's
         work: wp.array(dtype=wp.int32)  # PCG iterations of the substeps before
         kept: wp.array2d(dtype=wp.float64)  # KEPT, in the state
@@ -67,6 +73,7 @@ def adaptive_struct():
         horizon: wp.array(dtype=wp.float64)  # [1] s, over which errors may add up
         first: wp.array(dtype=wp.float64)  # [1] s, size of the first substep
         tolerance: wp.float64  # m
+        eps: wp.float64  # rounding unit of displacements
         max_tries: wp.int32
 
     return AdaptiveControl
@@ -126,6 +133,8 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         ctl.span[world] = wp.max(step.h[world], f64(SPREAD) * ctl.kept[world, 1])
         ctl.rate[world] = f64(0.0)
         ctl.mean[world] = f64(0.0)
+        ctl.scatter[world] = f64(0.0)
+        ctl.moved[world] = f64(0.0)
 
     @wp.func
     def rate_of(step: Step, ctl: Adaptive, world: int, v: vec3, v_n: vec3, v_before: vec3) -> vec3:
@@ -161,12 +170,13 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         ctl: Adaptive,
         arm: wp.array(dtype=T),
         free: wp.array(dtype=vec3),
+        u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3),
         v_before: wp.array2d(dtype=vec3),
         means: wp.array2d(dtype=vec3),
     ):
-        """Largest rate and mean of rates of a free place. A maximum does not depend on the order.
+        """Largest rate, mean of rates and displacement of a free place. A maximum does not depend on the order.
 
         `arm`: what an unknown moves by 1, m: 1 of positions, half the section of gradients across it, else 0.
         """
@@ -176,7 +186,10 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         reach = arm[slot] * free[slot]
         rate = rate_of(step, ctl, world, v[world, slot], v_n[world, slot], v_before[world, slot])
         wp.atomic_max(ctl.rate, world, size_of(wp.cw_mul(reach, rate)))
-        wp.atomic_max(ctl.mean, world, size_of(wp.cw_mul(reach, mean_of(ctl, world, means[world, slot], rate))))
+        mean = mean_of(ctl, world, means[world, slot], rate)
+        wp.atomic_max(ctl.mean, world, size_of(wp.cw_mul(reach, mean)))
+        wp.atomic_max(ctl.scatter, world, size_of(wp.cw_mul(reach, rate - mean)))
+        wp.atomic_max(ctl.moved, world, size_of(wp.cw_mul(reach, u[world, slot])))
 
     @wp.func
     def starts(step: Step, world: int) -> int:
@@ -229,8 +242,11 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         pace = ctl.kept[world, 1]
         span = ctl.span[world]
         limit = f64(SHARE) * ctl.tolerance / ctl.horizon[0]
-        rate = ctl.rate[world]
-        steady = wp.max(ctl.mean[world], rate / f64(CAP))
+        rounding = f64(ROUNDING) * ctl.eps * ctl.moved[world] / span
+        rate = wp.max(ctl.rate[world] - rounding, f64(0.0))
+        part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(AVERAGE))
+        mean = wp.max(ctl.mean[world] - part * wp.min(rounding, ctl.scatter[world]), f64(0.0))
+        steady = wp.max(mean, rate / f64(CAP))
         ratio = wp.min(rate, steady) / limit
         n = wp.static(order) + 1
         if starts(step, world) != 0:

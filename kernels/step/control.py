@@ -85,7 +85,7 @@ def step_struct():
         a1: wp.array(dtype=wp.float64)
         b: wp.array(dtype=wp.float64)  # of schemes that take v_n
         q_a: wp.array(dtype=wp.float64)  # of schemes that keep accelerations
-        stretch: wp.array(dtype=wp.float64)  # of those: step over the one before
+        h_before: wp.array(dtype=wp.float64)  # of those: s, the step that led to a_n, not far below this one
         dq_dv: wp.array(dtype=wp.float64)
         mass_factor: wp.array(dtype=wp.float64)  # of the inertia; in statics that of springs, `stabilise`
         ramp: wp.array(dtype=wp.float64)  # factor of constant loads

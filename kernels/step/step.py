@@ -24,7 +24,7 @@ FULL = 1e-9
 """Part of the load that may lack where all of it counts as acting."""
 LARGEST_GROWTH = {"float64": 1e9, "float32": 1e4}
 """Growth of a step up to which a multistep scheme takes the step before: its differences are rounding beyond."""
-STRETCH = 2.0
+STRETCH = 4.0
 """Largest growth of a step that accelerations are extrapolated for: after many halvings they are those of an event."""
 
 
@@ -118,6 +118,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             known = step.previous_end[world] == step.time[world]
             if known and h <= f64(GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
+        if wp.static(accelerated):
+            previous = wp.max(step.previous_h[world], h / f64(STRETCH))
+            step.h_before[world] = previous
         c = coefficients(h, previous, step.parameter)
         step.a0[world] = c.a0
         step.a1[world] = c.a1
@@ -125,7 +128,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.b[world] = c.b
         if wp.static(accelerated):
             step.q_a[world] = c.q_a
-            step.stretch[world] = wp.min(h / step.previous_h[world], f64(STRETCH))
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
             step.ramp[world] = step.new_time[world]
@@ -135,11 +137,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.dq_dv[world] = c.dq_dv
             step.mass_factor[world] = c.mass_factor
             step.ramp[world] = f64(1.0)
-
-    @wp.func
-    def averaged(stretch: f64, a: vec3, w: vec3) -> vec3:
-        """a_n for the step at hand: a is that of the last one's, of a time as far from w's as it was long."""
-        return w + T(stretch) * (a - w)
 
     @wp.kernel(module=module)
     def predict(
@@ -174,8 +171,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         if wp.static(takes_velocity):
             q += T(step.b[world]) * v_n[world, slot]
         if wp.static(accelerated):
-            c = coefficients(step.h[world], f64(0.0), step.parameter)
-            a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
+            c = coefficients(step.h[world], step.h_before[world], step.parameter)
+            a = u_before[world, slot]
             q += T(c.q_a) * a
             w += T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
         q_tilde[world, slot] = q
@@ -314,8 +311,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
                 step.previous_h[world] = step.h[world]
                 step.previous_end[world] = step.time[world]
         if wp.static(accelerated):
-            c = coefficients(step.h[world], f64(0.0), step.parameter)
-            a = averaged(step.stretch[world], u_before[world, slot], v_before[world, slot])
+            c = coefficients(step.h[world], step.h_before[world], step.parameter)
+            a = u_before[world, slot]
             new = v[world, slot]
             before = v_n[world, slot] + T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
             u_before[world, slot] = T(c.a_v) * (new - v_n[world, slot]) - T(c.a_a) * a

@@ -118,7 +118,7 @@ class Masses:
 
     def of_world(self, world: int) -> sp.csr_matrix:
         """(slots, slots) CSR, kg."""
-        return self._csr(world) if self.varied else self.matrix
+        return self._csr(world % len(self.table))
 
     def of_worlds(self, worlds: int) -> np.ndarray:
         """(worlds, slots) lumped masses, kg."""

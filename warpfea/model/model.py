@@ -116,11 +116,11 @@ class Model:
 
     @property
     def mass(self) -> float | None:
-        """kg; None where a material has no density."""
+        """kg, of the first world; None where a material has no density."""
         laws = [law for body in self.bodies for _, law in body.materials]
         if any(law.density is None for law in laws):
             return None
-        return float(self.lumped_host[self.slot_kind == 0].sum())
+        return float(self.masses.lumped[0][self.slot_kind == 0].sum())
 
     # construction
 

@@ -12,7 +12,7 @@ import warp as wp
 from ..base.checks import is_number, number_hint
 from ..base.errors import ModelError
 from ..kernels.step.adaptive import COUNTS, KEPT, adaptive_kernels, adaptive_struct
-from ..solvers import NewtonPCG
+from ..solvers.newton import EPS, NewtonPCG
 from .instants import Instants
 from .integrators import INTEGRATORS, Integrator
 
@@ -34,8 +34,8 @@ class Adapt:
 
     Attributes:
         error: over the model's size.
-        interval: s between common instants at most; None: a 64th of the first run, 1/60 s of steps without a run.
-        horizon: s, over which the error may build up; None: the first run, 64 intervals of steps without one.
+        interval: s between common instants at most; None: a 64th of the longest run yet, 1/60 s of steps without one.
+        horizon: s, over which the error may build up; None: the longest run yet, 64 intervals of steps without one.
     """
 
     error: float
@@ -117,6 +117,7 @@ class Adaptive:
         self.control.kept = at.state.register("adaptive", wp.float64, (len(KEPT),))
         self.means = at.state.register("adaptive_means", model.types.vec3, (model.slots,))
         self.control.tolerance = asked.error * float(model.size)
+        self.control.eps = EPS[model.dtype]
         self.control.max_tries = max_tries
 
     def aim(self, time: np.ndarray) -> None:
@@ -133,8 +134,8 @@ class Adaptive:
         if end < now:
             return -1
         self.instants.follow(outputs)
-        if end > now and not self.instants.settled:
-            self.instants.settle(now, end)
+        if end > now:
+            self.instants.begin_run(now, end)
         return self.instants.count(now, end) if end > now else 0
 
     def open(self) -> None:
@@ -145,7 +146,7 @@ class Adaptive:
         """Before the kernel `end_attempt`: estimate the error of what has converged, and refuse what is too far off."""
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
-        args = [w.step, ctl, self.arm, m.topology.free, w.v, self.velocity, self.v_before, self.means]
+        args = [w.step, ctl, self.arm, m.topology.free, w.u, w.v, self.velocity, self.v_before, self.means]
         launch(k.local_error, self.dim, args)
         launch(k.judge, m.worlds, [w.step, w.newton, w.pcg, ctl])
 

@@ -26,7 +26,8 @@ ROUNDED = 64.0
 
 
 class Instants:
-    """When worlds meet. What is not given is settled once, by the first run or step, and is then part of checkpoints.
+    """When worlds meet. What is not given is settled by the first run or step, and by each run that is longer than the
+    horizon; it is part of checkpoints.
 
     Attributes:
         interval: s between common instants, at most.
@@ -49,6 +50,11 @@ class Instants:
     def settled(self) -> bool:
         """Whether interval and horizon are known."""
         return math.isfinite(self.interval)
+
+    def begin_run(self, now: float, end: float) -> None:
+        """Before a run from `now` to `end`, both s: settle what is not given where the run is the longest yet."""
+        if not self.settled or end - now > (1.0 + SLACK) * self.horizon:
+            self.settle(now, end)
 
     def settle(self, now: float, end: float | None = None) -> None:
         """Take interval and horizon from a run from `now` to `end`, both s, or from steps without one.

@@ -60,6 +60,7 @@ class Opening:
         self.count = 0
         self._breaks: tuple[float, np.ndarray, np.ndarray] = (0.0, np.zeros(0), np.zeros((2, 0)))
         self._mass: dict[int, list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]] = {}
+        self._version = -1  # of the parameters that the factors in _mass are of
         self._world = 0  # that is started now
         refuse(at.model, integrator, self.driven)
 
@@ -106,6 +107,9 @@ class Opening:
 
     def _start(self, flags: np.ndarray, time: np.ndarray, ahead: np.ndarray, dt: float) -> None:
         state: Any = self.at.state
+        if self._version != self.model.parameters.version:
+            self._version = self.model.parameters.version
+            self._mass.clear()
         laws = self._law_motion(flags, ahead, dt)
         u, v = state.displacement.numpy().astype(float), state.velocity.numpy().astype(float)
         before = self._kinetic(v)
@@ -369,5 +373,5 @@ def refuse(model: Model, integrator: Integrator, driven: bool) -> None:
         what = f"joint {model.constraints.joints[0].name!r}" if model.constraints is not None else "a drive"
         raise ModelError(
             f"{integrator!r}: with rho_inf = 1 the forces of joints and drives grow from step to step, and the model "
-            f"has {what}; take rho_inf below 1, such as 0.8"
+            f"has {what}; take rho_inf below 1, such as 0.2"
         )

@@ -63,8 +63,8 @@ class Simulation(Digests):
             meet it, and on the device the world is then frozen, until it is reset. None: no end.
         error: of dt="auto": largest error of a position at the end, over the model's size (`model.size`).
         interval: of dt="auto": s between common instants at most; they are multiples of it, times of outputs, kinks of
-            time laws and the ends of runs. None: a 64th of the first run, 1/60 s of steps without one.
-        horizon: of dt="auto": s over which the error may build up. None: the first run, or 64 intervals.
+            time laws and the ends of runs. None: a 64th of the longest run yet, 1/60 s of steps without one.
+        horizon: of dt="auto": s over which the error may build up. None: the longest run yet, or 64 intervals.
         integrator: "backward_euler", "bdf2", "energy_momentum", or wf.GeneralizedAlpha(rho_inf=0.5), as a text
             "generalized_alpha(rho_inf=0.5)", or wf.EnergyMomentum(rho_inf=0.8), likewise.
         solver: "newton-pcg", "jacobi" or "direct", or options: wf.NewtonPCG(...), wf.Jacobi(...).
@@ -180,7 +180,7 @@ class Simulation(Digests):
     @property
     def dt(self) -> Any:
         """Step, s, or (worlds,) where each has its own; of dt="auto" the interval between common instants, NaN before
-        the first run or step settles it."""
+        the first run or step settles it; a longer run settles it again."""
         if self.stepper.adaptive:
             return self.stepper.adaptive.instants.interval
         return self.stepper.work.step.dt.numpy().copy() if self._dt is None else self._dt

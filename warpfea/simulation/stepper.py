@@ -147,7 +147,7 @@ class Stepper:
             w.step.b = w.array("b", (self.model.worlds,), wp.float64)
         if self.integrator.accelerated:
             w.step.q_a = w.array("q_a", (self.model.worlds,), wp.float64)
-            w.step.stretch = w.array("stretch", (self.model.worlds,), wp.float64)
+            w.step.h_before = w.array("h_before", (self.model.worlds,), wp.float64)
         if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
             w.step.previous_end = state.acceleration_end if self.integrator.accelerated else state.previous_end

@@ -57,9 +57,9 @@ class NewtonPCG:
         max_newton: iterations before a step is rejected.
         max_pcg: iterations per linear solve.
         max_halvings: how often a rejected step may be halved.
-        max_work: iterations of the conjugate gradients in a step, refused attempts included, before it is given up. A
-            refused attempt is not halved either once the step's iterations of Newton's method, each counted as 20 of
-            those, with contact as 100, have reached it (not with dt="auto").
+        max_work: iterations of the conjugate gradients in a step, refused attempts included, at which it is given up,
+            also within a solve. A refused attempt is not halved either once the step's iterations of Newton's method,
+            each counted as 20 of those, with contact as 100, have reached it (not with dt="auto").
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
             serves; in statics of short chains of beams factors of the whole), "banded" (Cholesky factors of the whole,
             kept as well; on the CPU, for chains, strips and slender or small bodies), "deflated" (3x3 blocks of every
@@ -190,8 +190,9 @@ class NewtonLoop:
         )
         kind_of_solver = BiCGStab if at.midpoint else PCG  # its operator is unsymmetric
         self.pcg = kind_of_solver(
-            model, work, launch, self.residual, self.preconditioner, max_iterations=options.max_pcg, deflate=inertia
-        )
+            model, work, launch, self.residual, self.preconditioner,
+            max_iterations=options.max_pcg, max_work=options.max_work, deflate=inertia,
+        )  # fmt: skip
         self.methods = {
             "solver": "newton-pcg",
             "linear": options.linear,
@@ -220,7 +221,6 @@ class NewtonLoop:
         ctl.floor_bound = FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
         ctl.linear_stress = int(all(block.key.law in ANY_J for block in model.blocks))
-        self.max_work = options.max_work
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.nonpotential = int(traits.nonpotential or rate)
         ctl.classical = int(self.classical)
@@ -341,7 +341,7 @@ class NewtonLoop:
         launch(k.set_base, self.dim, [w.newton, w.v, w.base, w.best])
         launch(k.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
-        launch(k.begin_search, self.model.worlds, [w.newton, w.pcg, self.max_work])
+        launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
         self._any(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
         self._rarely(self._search_on)

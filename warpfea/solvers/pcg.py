@@ -28,7 +28,7 @@ class PCG:
 
     def __init__(
         self, model: Model, work: Workspace, launch: Launcher, residual: Residual, preconditioner: Preconditioner,
-        *, max_iterations: int, deflate: bool,
+        *, max_iterations: int, max_work: int, deflate: bool,
     ) -> None:  # fmt: skip
         self.model, self.work, self.launch = model, work, launch
         self.residual = residual
@@ -37,6 +37,7 @@ class PCG:
         self.dim = (model.worlds, model.slots)
         self.deflate = deflate and model.group_count > 0
         work.pcg.max_iterations = max_iterations
+        work.pcg.max_work = max_work
 
     @labelled("vectors")
     def solve(self, active: wp.array) -> None:

@@ -176,6 +176,16 @@ _ENTRIES = (
         results=("contact_integrators_cpu.json",),
     ),
     Entry(
+        name="spinning",
+        module="surveys.spinning",
+        summary="energy that generalized-alpha adds to bodies that spin, for each rho_inf",
+        about="A bar of 0.5 x 0.2 x 0.1 m that spins, free or on a joint, in 300 steps of 0.1 to 1 rad: the largest "
+        "energy over that of the start for rho_inf from 0 to 0.9 and E from 1e7 to 2e11 Pa.",
+        options=("device", "quick"),
+        example="--out tests/results/spinning_cpu.json",
+        results=("spinning_cpu.json",),
+    ),
+    Entry(
         name="precision",
         module="surveys.precision",
         summary="at which error rounding ends the curve of float32, for each family",

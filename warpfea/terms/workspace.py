@@ -135,7 +135,7 @@ class Workspace:
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative = self.pcg.negative
-        unused = ("b", "q_a", "stretch", "any_refused", "summed", "ends", "growth")
+        unused = ("b", "q_a", "h_before", "any_refused", "summed", "ends", "growth")
         unused += () if midpoint else ("stage_time",)
         self.step = self.struct(step_struct(), B, skip=unused, stop=(2,))
         self.stage_time = self.step.stage_time if midpoint else self.step.new_time

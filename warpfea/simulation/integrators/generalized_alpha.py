@@ -5,8 +5,13 @@
     (1 - am) a_{n+1} + am a_n = (1 - af) w_{n+1} + af w_n
     M w_{n+1} + f_int + J^T lambda = f at t_{n+1}
 
-The forces are in equilibrium with w = q'' at the end of the step; a are averages of w, of the time t + (am - af) h:
-where the step changes, the next one takes w_n + (h / h_before) (a_n - w_n).
+The forces are in equilibrium with w = q'' at the end of the step; a are averages of w: a_n is of the time t_n + c h_n,
+c = am - af, with the step h_n that led there. With r = h_n / h and D = 1 + c - c r
+
+    am = am_1 / D,  af = af_1,  gamma = (1/2 - c r) / D,  beta = gamma beta_1 / gamma_1,
+
+where index 1 is of equal steps (Chung and Hulbert), all averages are of those times, so that the order is two for any
+steps; dq/dv is h beta_1 / gamma_1, and stiff components decay for r from 1/4 to 4 and rho_inf below 1.
 """
 
 import math
@@ -23,14 +28,16 @@ __all__ = ["GeneralizedAlpha", "generalized_alpha"]
 @wp.func
 def generalized_alpha(h: wp.float64, previous: wp.float64, parameter: wp.float64):
     """Coefficients for the spectral radius `parameter` at infinite frequency: a_{n+1} and w_{n+1} eliminated for v."""
-    one, two, half = wp.float64(1.0), wp.float64(2.0), wp.float64(0.5)
-    am = (two * parameter - one) / (parameter + one)
+    one, half = wp.float64(1.0), wp.float64(0.5)
     af = parameter / (parameter + one)
-    gamma = half - am + af
-    beta = half * half * (gamma + half) * (gamma + half)
+    early = (parameter - one) / (parameter + one)  # am_1 - af, and beta_1 = (1 - early)^2 / 4
+    r = previous / h
+    d = one + early - early * r
+    am = (early + af) / d
+    gamma = (half - early * r) / d
     c = Coefficients()
     c.a0 = one
-    c.dq_dv = h * beta / gamma
+    c.dq_dv = half * half * h * (one - early) * (one - early) / (half - early)
     c.b = h - c.dq_dv
     c.q_a = h * (half * h - c.dq_dv)
     c.mass_factor = (one - am) / (h * gamma * (one - af))
@@ -46,13 +53,15 @@ class GeneralizedAlpha(Integrator):
 
     Args:
         rho_inf: spectral radius at infinite frequency, 0 to 1: the factor by which a step damps what it does not
-            resolve. 1 conserves the energy of linear systems; models with joints or drives need less than 1.
+            resolve. 1 conserves the energy of linear systems; models with joints or drives need less than 1. Bodies
+            that turn gain energy, by more the larger rho_inf is (Kuhl and Crisfield 1999): with 0.2 none up to 2 rad a
+            step, with 0.5 from 0.6 rad on, with 0.8 from 0.2 rad on.
 
     Raises:
         ModelError: rho_inf is not between 0 and 1.
     """
 
-    def __init__(self, *, rho_inf: float = 0.8) -> None:
+    def __init__(self, *, rho_inf: float = 0.2) -> None:
         known = isinstance(rho_inf, (int, float)) and not isinstance(rho_inf, bool)
         if not (known and math.isfinite(rho_inf) and 0.0 <= rho_inf <= 1.0):
             raise ModelError(f"GeneralizedAlpha: rho_inf = {rho_inf!r} must lie between 0 and 1")
