@@ -61,6 +61,11 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     Newton, Control, Recursion = control_struct(), pcg_struct(), bicgstab_struct()
     module = kernel_module(f"bicgstab_{dtype}{'_gated' if gated else ''}")
 
+    @wp.func
+    def has_work(ctl: Control, world: int) -> bool:
+        """Iterations are left, of the solve and of the step."""
+        return ctl.iterations[world] < ctl.max_iterations and ctl.total[world] < ctl.max_work
+
     @wp.kernel(module=module)
     def begin(newton: Newton, ctl: Control, bi: Recursion):
         """Set the norm at which the solve ends: by Eisenstat and Walker, but no tighter than Newton's method needs."""
@@ -203,7 +208,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         if norm <= f64(0.5) * bi.mark[world]:
             bi.mark[world] = norm
             bi.since[world] = 0
-        more = norm > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations and ctl.total[world] < ctl.max_work
+        more = norm > ctl.target[world] and has_work(ctl, world)
         more = more and bi.since[world] < STALLED
         if more and wp.isfinite(beta) and wp.isfinite(norm) and rho != f64(0.0):
             bi.going[world] = 1
@@ -255,7 +260,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             return
         if not ctl.norm[world] <= bi.best[world]:
             ctl.norm[world] = bi.best[world]
-        if first != 0 and ctl.norm[world] > ctl.target[world] and ctl.iterations[world] < ctl.max_iterations and ctl.total[world] < ctl.max_work:
+        if first != 0 and ctl.norm[world] > ctl.target[world] and has_work(ctl, world):
             bi.again[world] = 1
             wp.atomic_max(bi.any_again, 0, 1)
         elif newton.strict[world] != 0 and not ctl.norm[world] <= f64(FOUND) * ctl.first_norm[world]:
