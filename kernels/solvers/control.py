@@ -134,6 +134,7 @@ def control_struct():
         floor_bound: wp.float64  # largest that is
         floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, residual part, lane]
         negative: wp.array(dtype=wp.int32)  # the last solve met a direction without positive curvature
+        unsolved: wp.array(dtype=wp.int32)  # the last solve for a step ended at `max_iterations`
         # the first iterate
         bent: wp.array(dtype=wp.int32)  # a solve of this attempt did
         potential: wp.array(dtype=wp.float64)  # strain energy of the state, J

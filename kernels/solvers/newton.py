@@ -84,6 +84,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         ctl.strict[world] = 0
         ctl.strict_count[world] = 0
         ctl.negative[world] = 0
+        ctl.unsolved[world] = 0
         ctl.bent[world] = 0
         ctl.rounds[world] = 0
         ctl.eta[world] = f64(1.0e30)
@@ -188,6 +189,9 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if ctl.strict[world] != 2:
             return
         ctl.strict[world] = 0
+        if ctl.unsolved[world] != 0 and ctl.eps > f64(COARSE):  # nor would this solve find the error
+            give_up(ctl, world, FAIL_FLOOR)
+            return
         dq = ctl.dq_dv[world]
         largest, whole = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):

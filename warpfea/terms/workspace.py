@@ -109,7 +109,7 @@ class Workspace:
         self.residual_group_partial = self.array(
             "residual_group_partial", (*sums, LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
         )
-        skip: tuple[str, ...] = ("violation", "negative", "component_of_group")  # of others
+        skip: tuple[str, ...] = ("violation", "negative", "unsolved", "component_of_group")  # of others
         skip += () if traits.gated else ("outer", "open")
         skip += () if traits.stored else ("term_sums", "stepped")
         skip += () if traits.limited else ("limit",)
@@ -134,7 +134,7 @@ class Workspace:
         self.newton.components, self.newton.groups = C, groups
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
-        self.newton.negative = self.pcg.negative
+        self.newton.negative, self.newton.unsolved = self.pcg.negative, self.pcg.unsolved
         unused = ("b", "q_a", "h_before", "any_refused", "summed", "ends", "growth")
         unused += () if midpoint else ("stage_time",)
         self.step = self.struct(step_struct(), B, skip=unused, stop=(2,))
