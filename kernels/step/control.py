@@ -102,7 +102,7 @@ def step_struct():
         watched: wp.int32  # the energy that the integrator adds is
         growth_told: wp.float64  # part of the energy from which on the time is kept
         growth_limit: wp.float64  # beyond which no further step is taken
-        least_energy: wp.float64  # J, below which energies are rounding
+        least_energy: wp.array(dtype=wp.float64)  # [world] J, below which energies are rounding
 
     return StepControl
 

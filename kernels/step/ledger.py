@@ -81,7 +81,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         Net, for schemes of order 2 exchange energy with the motion to and fro; and not in the first steps from rest,
         nor in those after work that exceeds all energy so far.
         """
-        largest = wp.max(wp.max(step.growth[world, 1], step.least_energy), before)
+        largest = wp.max(wp.max(step.growth[world, 1], step.least_energy[world]), before)
         turned = step.growth[world, 2] + turnover
         steps = step.growth[world, 5] + f64(1.0)
         if step.growth[world, 1] == f64(0.0) and before > f64(0.5) * energy:  # it moves already

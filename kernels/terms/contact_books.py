@@ -32,7 +32,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     k = touch_functions(dtype, meshes)
     touch, in_plane, hold, pull, acts, Touch = k.touch, k.in_plane, k.hold, k.pull, k.acts, k.Touch
     plane, record_of, friction_force = k.plane, k.record_of, k.friction_force
-    coefficient, lagrange = k.coefficient, k.lagrange
+    coefficient, lagrange, recovered = k.coefficient, k.lagrange, k.recovered
     elastic = law_functions().elastic
     g = collider_functions(meshes)
     side_after, released, SLIPS = g.side_after, g.released, g.SLIPS
@@ -128,10 +128,11 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if con.spin[kc] >= 0:
             angle = at.angle[world, kc] - his.angle[world, kc]
             carried = angle * wp.cross(con.axis[kc], x - con.anchor[kc])
-        out.given = wp.dot(out.force, carried)
+        risen = recovered(con, his, clock, world, c, point)
+        out.given = wp.dot(out.force, carried) + normal * risen
         # the ledger takes for the integrator what the work of the force leaves; it is to find these formulas
         x_n = his.turn[world, kc] * at.start[world, point] + his.place[world, kc]
-        turned = -wp.dot(out.force, x - x_n - carried) - (normal * change + wp.dot(pulled, t.slip))
+        turned = -wp.dot(out.force, x - x_n - carried) - (normal * (change - risen) + wp.dot(pulled, t.slip))
         out.left = chord + turned + wp.dot(out.force, x - x_n) + gain + out.loss + out.rubbed
         return out
 

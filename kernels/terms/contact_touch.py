@@ -8,7 +8,7 @@ import warp as wp
 
 from ..common.types import precision
 from .contact_colliders import collider_functions
-from .contact_data import attempt_struct, contact_struct, facet_struct, history_struct, of_world
+from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct, of_world
 from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
 from .contact_mesh import MESH
 
@@ -21,7 +21,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     T = precision(dtype).T
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
-    History, Attempt = history_struct(), attempt_struct(dtype)
+    History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
     colliders, laws = collider_functions(meshes), law_functions()
     distance, sweep, deepening, known_side = (
         colliders.distance,
@@ -116,6 +116,13 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         """What is left of a stored overlap."""
         left = f64(1.0) - (time - his.born[world]) / con.decay[c]
         return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
+
+    @wp.func
+    def recovered(con: Contacts, his: History, clock: Clock, world: int, c: int, point: int) -> f64:
+        """How far the surface of a stored overlap moves out in a substep, m: its force does work."""
+        now = clock.new_time[world]
+        before = allowance(con, his, world, c, point, now - clock.h[world])
+        return before - allowance(con, his, world, c, point, now)
 
     @wp.func
     def reach(con: Contacts, his: History, world: int, c: int, point: int, time: f64, grown: f64) -> f64:
@@ -317,7 +324,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return f64(1.0)
 
     return _types.SimpleNamespace(
-        Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, allowance=allowance, rate_of=rate_of,
+        Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, allowance=allowance, recovered=recovered, rate_of=rate_of,
         depth_before=depth_before, touch=touch, in_plane=in_plane, coefficient=coefficient, put_explicit=put_explicit,
         hold=hold, pull=pull, friction_potential=friction_potential, friction_force=friction_force,
         point_stiffness=point_stiffness, acts=acts, shape_of=shape_of, lagrange=lagrange, monomial=monomial,

@@ -28,13 +28,14 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
     Attempt, Clock = attempt_struct(dtype), clock_struct()
     Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
     k, jet = touch_functions(dtype, False), place_functions(dtype).jet
-    Touch, in_plane, pull, plane, friction_force, coefficient = (
+    Touch, in_plane, pull, plane, friction_force, coefficient, recovered = (
         k.Touch,
         k.in_plane,
         k.pull,
         k.plane,
         k.friction_force,
         k.coefficient,
+        k.recovered,
     )
     elastic = law_functions().elastic
     touch_of = pair_functions(dtype).touch_of
@@ -155,6 +156,9 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
             add(booked, 0, world, row, share * stored)
             add(booked, 1, world, row, share * (normal - spring[0]) * s.rise)
             add(booked, 2, world, row, share * rubbed)
+            work = share * normal * recovered(con, his, clock, world, c, point)
+            add(booked, 3, world, row, work)
+            add(booked, 4, world, row, work)
             place = jet(mas, t.C, t.D, world, f, t.spot[world, point])
             add(at.rows, 6, world, row, share * normal)
             tell_force(at, world, row, (mas.sign[c] * share) * force, place.x)

@@ -18,7 +18,6 @@ import warp as wp
 from ..base.errors import ModelWarning
 from ..kernels.step.control import GROWTH
 from ..model.assembly import element_volumes
-from ..model.contact_points import effective_modulus
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -66,9 +65,24 @@ class EnergyGrowth:
         rows = state.register("energy_growth", wp.float64, (len(GROWTH),))
         rows.zero_()
         step.growth, step.watched = rows, 1
+        self._rows, self._least, self._model = rows, wp.zeros(model.worlds, dtype=wp.float64, device=model.device), model
+        self._written, self._writes = 0, np.zeros(model.worlds, dtype=np.int64)
+        self._least.assign(least_energy(model))
         step.growth_told = TOLD
         step.growth_limit = REFUSED if self.choice == "refuse" else np.inf
-        step.least_energy = least_energy(model)
+        step.least_energy = self._least
+
+    def follow(self) -> None:
+        """Begin anew in the worlds whose parameters were set: what that does to energies is not the integrator's."""
+        if not self.watched or self._written == self._model.terms.written:
+            return
+        writes = self._model.terms.writes
+        chosen, self._writes = writes > self._writes, writes.copy()
+        self._written = self._model.terms.written
+        rows = self._rows.numpy()
+        rows[chosen] = 0.0
+        self._rows.assign(rows)
+        self._least.assign(least_energy(self._model))
 
     def tell(self, sim: Any, shares: np.ndarray) -> None:
         """Warn once where a world's part (worlds,) is above TOLD."""
@@ -87,10 +101,15 @@ class EnergyGrowth:
         )
 
 
-def least_energy(model: Model) -> float:
-    """Energy below which all of it may be rounding, J: of a strain of some units of rounding in the whole model."""
-    unit = ROUNDING * float(np.finfo(model.dtype).eps)
-    return unit**2 * sum(effective_modulus(b)[0] * float(element_volumes(b).sum()) for b in model.bodies)
+def least_energy(model: Model) -> np.ndarray:
+    """Energy below which all of it may be rounding, (worlds,) J: of a strain of some units of rounding everywhere."""
+    unit, out = ROUNDING * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
+    for body in model.bodies:
+        volume = float(element_volumes(body).sum())
+        worlds = range(model.worlds) if model.parameters.varies(body) else [None]
+        moduli = [model.parameters.modulus(world)(body, None)[0] for world in worlds]
+        out += unit**2 * volume * np.array(moduli)
+    return out
 
 
 def remedy(sim: Any) -> str:

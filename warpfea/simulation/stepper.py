@@ -116,6 +116,7 @@ class Stepper:
             tries = solver.max_halvings
             self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
         self._bind()
+        self.growth = growth
         if growth:
             growth.bind(self.work.step, model, state)
         self.loops = Loops(model, self.work, self.launch, quiet=quiet, ends=ends)
@@ -210,6 +211,8 @@ class Stepper:
 
         The ledger has the jump of those energies as the work of who set them, among that of fields.
         """
+        if self.growth:
+            self.growth.follow()
         parameters = self.model.parameters
         if self._version == parameters.version:
             return

@@ -26,7 +26,7 @@ from .contact_starts import reference_place, refuse_sunk, store_overlaps, touchi
 from .facet_tables import LISTED
 from .pair_solves import PairSolves
 from .pair_survey import survey
-from .term import LOSS, STORED, At, Column, part
+from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, part
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -47,7 +47,13 @@ class Pairs(PairSolves):
     """
 
     name = "pairs"
-    columns = (Column("contact_pairs", STORED), Column("contact_loss", LOSS), Column("friction", LOSS))
+    columns = (
+        Column("contact_pairs", STORED),
+        Column("contact_loss", LOSS),
+        Column("friction", LOSS),
+        Column("collider_work", WORK),
+        Column("", NUMERICAL),
+    )
     fields = CONTACT_FIELDS
     parts = {"pairs": "contact between bodies: search, forces, products, history"}
 

@@ -83,6 +83,7 @@ class TermSet:
         self.dead = self.find(DeadLoads)
         self.side_topology: Any = None
         self.written = 0
+        self.writes: np.ndarray | None = None
         self._check()
 
     def _check(self) -> None:
@@ -260,8 +261,12 @@ class TermSet:
         owners = [term.parameters() for term in self.all] + [materials.setters(), {"gravity": self.dead.set_gravity}]
         found = [known[name] for known in owners if name in known]
         if len(found) == 1:
-            found[0](values, chosen_worlds("set_parameter", mask, self.model.worlds))
+            chosen = chosen_worlds("set_parameter", mask, self.model.worlds)
+            found[0](values, chosen)
             self.written += 1
+            if self.writes is None:
+                self.writes = np.zeros(self.model.worlds, dtype=np.int64)
+            self.writes[chosen] += 1
             return
         if found:
             raise ModelError(f"set_parameter: {name!r} is a parameter of {len(found)} things of that name; rename one")
