@@ -226,7 +226,7 @@ def test_statics_tells_an_unstable_equilibrium(folder, capfd):
     assert (code, json.loads(out)["stable"]) == (0, False)
     assert "warpfea: warning: the equilibrium is unstable in world 0: body 'strut' buckles" in err
     code, out, err = run(capfd, *command, "--unstable", "refuse", "--json", "-")
-    assert (code, json.loads(out)["status"]) == (3, "not converged")
+    assert (code, json.loads(out)["status"]) == (3, "unstable")
     assert "warpfea: error: the equilibrium is unstable" in err
     code, out, err = run(capfd, *command, "--unstable", "ignore", "--json", "-")
     assert (code, json.loads(out)["stable"], err) == (0, None, "")

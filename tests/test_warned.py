@@ -92,6 +92,52 @@ def test_a_law_that_ends_before_the_run():
     silent(lambda: wf.Simulation(held, dt=2e-3).run(0.03))
 
 
+S = np.linspace(0.0, 1.0, 21)
+
+
+@pytest.mark.parametrize(
+    ("shape", "warned"),
+    [
+        (np.sin(np.pi / 2 * S), False),  # comes to rest; before d66a448 each of these was warned of
+        (S**2 * (3.0 - 2.0 * S), False),
+        (np.sin(np.pi * S), False),  # a pulse, over at its end
+        (np.interp(S, [0, 0.5, 1], [0, 1, 0]), False),
+        (S, True),
+        (S**2, True),
+        (np.interp(S, [0, 0.5, 1], [0, 1, 0.5]), True),
+        (np.sin(2 * np.pi * S), True),  # a period of a vibration
+        (np.where(S < 1.0, 0.0, 1.0), True),
+    ],
+)
+def test_laws_that_are_over_where_they_end(shape, warned):
+    law = (0.01 * S, shape[:, None] * (0.0, 0.0, -1.0))
+    sim = wf.Simulation(bar(load=law), dt=1e-2)
+    if warned:
+        with pytest.warns(wf.ModelWarning, match="time laws end before the run"):
+            sim.run(0.02)
+    else:
+        silent(lambda: sim.run(0.02))
+
+
+def test_pairs_and_ragged_samples():
+    """On d66a448 numpy's ValueError came through."""
+    pairs = [(0, (0, 0, 0)), (1, (0, 0, 1.0))]
+    with pytest.raises(wf.ModelError, match=r"traction on 'x\+'.*write pairs as \(\[t for t, _ in pairs\], \["):
+        bar(load=pairs)
+    bar(load=([t for t, _ in pairs], [v for _, v in pairs]))
+    with pytest.raises(wf.ModelError, match=r"traction on 'x\+'.*numbers, all values of one shape"):
+        bar(load=([0, 1], [(0, 0, 0), (0, 1.0)]))
+
+
+def test_steel_in_grams_per_cubic_centimetre():
+    """On d66a448 only densities below 1 kg/m^3 were warned of."""
+    with pytest.warns(wf.MeshWarning, match=r"the density of SVK is 7.85 kg/m\^3. Is it in another unit"):
+        bar(E=2.1e11, density=7.85)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", wf.MeshWarning)
+        bar(E=1e5, density=7.85)  # a foam
+
+
 @pytest.mark.parametrize("name", names())
 def test_no_scene_is_warned_of(name):
     scene = find(name)

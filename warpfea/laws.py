@@ -83,6 +83,14 @@ def _widen(values: np.ndarray, scalar: bool) -> np.ndarray:
     return out
 
 
+def _is_row(value: Any) -> bool:
+    """Whether a value is a flat list of entries; ragged ones are not."""
+    try:
+        return np.ndim(value) == 1
+    except ValueError:
+        return False
+
+
 def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
     """The time law that a user has given.
 
@@ -109,9 +117,12 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
             "with times = np.linspace(0, t_end, 201), or write a def with @wp.func above it"
         )
     width = () if scalar else (3,)
-    if isinstance(value, (tuple, list)) and len(value) == 2 and np.ndim(value[0]) == 1:
-        times = np.asarray(value[0], dtype=float)
-        values = np.asarray(value[1], dtype=float)
+    if isinstance(value, (tuple, list)) and len(value) == 2 and _is_row(value[0]):
+        try:
+            times, values = np.asarray(value[0], dtype=float), np.asarray(value[1], dtype=float)
+        except (TypeError, ValueError) as error:
+            text = f"{what} = {value!r}: times and values must be numbers, all values of one shape"
+            raise ModelError(text) from error
         if values.shape != (len(times), *width):
             raise ModelError(
                 f"{what}: values have shape {values.shape}, expected {(len(times), *width)} for {len(times)} times"
@@ -125,7 +136,10 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
             values = np.asarray(value, dtype=float)[None]
         except (TypeError, ValueError) as error:
             kinds = "number, vector, (times, values), wp.func or Control"
-            raise ModelError(f"{what} = {value!r} is not a {kinds}{number_hint(value)}") from error
+            rows = value if isinstance(value, (tuple, list)) else []
+            pairs = len(rows) > 0 and all(isinstance(row, (tuple, list)) and len(row) == 2 for row in rows)
+            hint = "; write pairs as ([t for t, _ in pairs], [v for _, v in pairs])" if pairs else number_hint(value)
+            raise ModelError(f"{what} = {value!r} is not a {kinds}{hint}") from error
         times = np.zeros(1)
         if values.shape != (1, *width):
             hint = f"; write a vector such as (0, 0, {value!r})" if values.shape == (1,) else ""

@@ -44,6 +44,8 @@ LARGEST_NU = 0.499
 """Of solids; beyond it the volumetric locking of a coarse mesh decides."""
 LEAST_DENSITY = 1.0
 """Least plausible density, kg/m^3: an aerogel; t/mm^3 are far below. Heavy bodies stand for others in models."""
+FOAM, STIFFEST_FOAM = 25.0, 1e9
+"""kg/m^3 and Pa: nothing lighter is stiffer, but solids in g/cm^3 are."""
 HANDLES: dict[type, str] = {
     Body: "the body",
     NodeSet: "nodes (body.nodes)",
@@ -148,7 +150,9 @@ def _warn_of_densities(body: Body) -> None:
             continue
         values = material.density(body.mesh.points) if callable(material.density) else material.density
         low = float(np.min(values))
-        if low >= LEAST_DENSITY:
+        lam, mu = material.lame
+        stiff = mu * (3.0 * lam + 2.0 * mu) / (lam + mu) > STIFFEST_FOAM
+        if low >= (FOAM if stiff else LEAST_DENSITY):
             continue
         law = type(material).__name__ + (f" of group {group!r}" if group else "")
         warnings.warn(

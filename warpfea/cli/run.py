@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..base.console import quiet_warp, write_json
-from ..base.errors import ConstraintError, ConvergenceError, OutputError, UsageError
+from ..base.errors import ConstraintError, ConvergenceError, OutputError, StabilityError, UsageError
 from ..base.names import did_you_mean
 from ..base.writer import Output, check_folder, check_target
 from ..kernels.step.control import SAME_TIME
@@ -71,8 +71,8 @@ def run(options: argparse.Namespace) -> int:
             else:
                 sim.run(t_end, outputs=outputs, progress=progress(options))
             status = "done"
-        except (ConvergenceError, ConstraintError):
-            status = "not converged"
+        except (ConvergenceError, ConstraintError) as error:
+            status = "unstable" if isinstance(error, StabilityError) else "not converged"
             raise
         except OutputError:
             status = "output failed"

@@ -64,10 +64,12 @@ SHARE = 0.05
 LESS = {
     "backward_euler": "--integrator bdf2 takes far less of slow motion, energy_momentum nothing; a smaller --dt less",
     "bdf2": "--integrator energy_momentum takes nothing, a smaller --dt less",
-    "generalized_alpha": "--integrator bdf2 or 'energy_momentum(rho_inf=0.8)', or a smaller --dt",
+    "generalized_alpha": "--integrator energy_momentum takes nothing, a larger rho_inf or a smaller --dt less",
     "energy_momentum": "contact takes it at the end of steps; a smaller --dt takes less",
 }
 """What to write where it takes more."""
+ADDED = "--integrator bdf2 or 'energy_momentum(rho_inf=0.8)', or a smaller --dt"
+"""What to write where generalized-alpha was warned of adding energy."""
 NO_J = 1e30
 """What a step reports for the smallest J where no element has one."""
 
@@ -202,7 +204,8 @@ def _suggestion(sim: Simulation) -> list[list[str]]:
     share, name = integrator_share(sim), sim.integrator.name
     if not share > SHARE:
         return []
-    return [["", f"that is {share:.0%} of the energy turned over: {LESS[name]}"]]
+    text = ADDED if name == "generalized_alpha" and sim.energy_growth.told else LESS[name]
+    return [["", f"that is {share:.0%} of the energy turned over: {text}"]]
 
 
 def _steps(s: dict[str, Any], sim: Simulation) -> str:

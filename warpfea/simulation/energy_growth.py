@@ -121,13 +121,14 @@ def remedy(sim: Any) -> str:
 def integrator_share(sim: Any) -> float:
     """Part of the energy turned over that the ledger's `integrator` took or gave, in the worst world.
 
-    NaN where it is not watched.
+    NaN where it is not watched; 0 where nothing was yet, as after a refused step.
     """
     if not sim.energy_growth.watched:
         return float("nan")
     rows = sim.state.energy_growth.numpy()
     scale = rows[:, GROWTH.index("largest")] + rows[:, GROWTH.index("turnover")]
-    return float(np.max(np.abs(sim.energies()["integrator"]) / np.maximum(scale, 1e-300)))
+    taken = np.abs(sim.energies()["integrator"])
+    return float(np.max(np.divide(taken, scale, out=np.zeros_like(taken), where=scale > 0.0)))
 
 
 def growth_error(sim: Any, world: int) -> str:

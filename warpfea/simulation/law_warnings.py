@@ -17,6 +17,8 @@ __all__ = ["warn_of_ends", "warn_of_jumps"]
 
 JUMP = 1e-4
 """Distance of driven nodes from where their law begins that counts, over the model's size; of joints one is refused."""
+SMOOTH, PULSE = 0.05, 1e-9
+"""Slope at the end of a law that counts as none, over the largest; value there that counts as 0."""
 SHOWN = 4
 """Laws that a message names."""
 
@@ -28,7 +30,7 @@ def warn_of_ends(sim: Any, t_end: float) -> None:
         if len(law.times) < 2 or law.times[-1] >= t_end - 1e-9 * abs(t_end) or id(law) in sim.ended_laws:
             continue
         sim.ended_laws.add(id(law))
-        if np.any(law.values[-1] != law.values[-2]):
+        if _changes(law):
             ended.setdefault(law.name, float(law.times[-1]))
     if ended:
         told = ", ".join(f"{name} (t = {end:g} s)" for name, end in list(ended.items())[:SHOWN])
@@ -39,6 +41,21 @@ def warn_of_ends(sim: Any, t_end: float) -> None:
             ModelWarning,
             stacklevel=3,
         )
+
+
+def _changes(law: TimeLaw) -> bool:
+    """Whether a sampled law still changes where it ends: its slope there is not small, nor is it a pulse back at 0."""
+    slopes = np.diff(law.values, axis=0) / np.diff(law.times)[:, None]
+    if len(slopes) < 2:
+        return bool(np.any(slopes))
+    lengths = np.diff(law.times)
+    end = slopes[-1] + (slopes[-1] - slopes[-2]) * lengths[-1] / (lengths[-1] + lengths[-2])
+    end[slopes[-1] == 0.0] = 0.0
+    if np.abs(end).max() <= SMOOTH * np.abs(slopes).max():
+        return False
+    none = PULSE * np.abs(law.values).max()
+    one_sided = (law.values >= -none).all(axis=0) | (law.values <= none).all(axis=0)
+    return not (one_sided.all() and np.abs(law.values[-1]).max() <= none)
 
 
 def warn_of_jumps(sim: Any) -> None:

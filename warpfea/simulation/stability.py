@@ -87,10 +87,11 @@ def announce(result: Any, *, refuse: bool) -> None:
     where = ", ".join(f"{x + 0.0:.3g}" for x in np.round(place, 12))
     way = ", ".join(f"{x + 0.0:.2g}" for x in np.round(found.mode[world, slot], 3))
     many = f"{len(worlds)} of {m.worlds} worlds, the first of them {world}" if len(worlds) > 1 else f"world {world}"
+    size_m = f"{1e-3 * m.size:.1g}"
     text = (
         f"the equilibrium is unstable in {many}: body {body.name!r} buckles or snaps through; its mode is largest at "
-        f"({where}) m, along ({way}). What follows needs an imperfection: r.mode(body) times a size on the points of "
-        f"the mesh, a small load across, or a damped motion from r.perturbed({1e-3 * m.size:.1g})"
+        f"({where}) m, along ({way}). What follows needs an imperfection: {size_m} * r.mode(body)[{world}] added to "
+        f"the points it is built from, a small load across, or a damped motion from r.perturbed({size_m})"
     )
     if refuse:
         error = StabilityError(text, time=1.0, world=world, state=sim.state)
