@@ -24,7 +24,7 @@ STANDS = 7.8373
 BOTH = pytest.mark.parametrize("dtype", ["float64", "float32"])
 
 
-def column(factor, dtype="float64", across=0.0, element="3243"):
+def column(factor, dtype="float64", across=0.0, element="3243", device="cpu"):
     """A cantilever under so many times Euler's load."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     law = wf.SVK(E=E, nu=0.0)
@@ -38,7 +38,7 @@ def column(factor, dtype="float64", across=0.0, element="3243"):
         body = b.add_solid(wf.mesh.box((L, H, H), cells=(16, 1, 1)), material=law, name="column")
         b.clamp(body.nodes("x-"))
         b.add_traction(body.surface("x+"), load / H**2)
-    return b.finalize(device="cpu", dtype=dtype), body
+    return b.finalize(device=device, dtype=dtype), body
 
 
 def solve(model, **options):
@@ -84,6 +84,16 @@ def test_a_perfect_column(factor):
 def test_in_single_precision(factor, across):
     model, _ = column(factor, "float32", across=across)
     assert solve(model).report.stable.tolist() == [factor < 1.0]
+
+
+@pytest.mark.cuda
+@BOTH
+@pytest.mark.parametrize("factor", [0.99, 1.1])
+def test_a_perfect_column_on_a_gpu(factor, dtype):
+    model, body = column(factor, dtype, device="cuda:0")
+    found = solve(model)
+    assert found.report.stable.tolist() == [factor < 1.0]
+    assert np.linalg.norm(found.mode(body), axis=2).max() == (0.0 if factor < 1.0 else pytest.approx(1.0))
 
 
 def test_a_buckled_column_in_single_precision_is_refused():
