@@ -253,7 +253,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def finish(newton: Newton, ctl: Control, bi: Recursion, first: int):
-        """Which worlds begin once more; `first`: they may."""
+        """Mark the worlds that begin once more; `first`: they may."""
         world = wp.tid()
         bi.again[world] = 0
         if newton.active[world] == 0 or ctl.iterations[world] == 0:
@@ -268,7 +268,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin_again(newton: Newton, ctl: Control, bi: Recursion):
-        """r^ = B r anew, with r of the best."""
+        """r^ = B r with r of the best."""
         world = wp.tid()
         if bi.again[world] != 0 and ctl.sums[0, world] != f64(0.0) and wp.isfinite(ctl.sums[0, world]):
             bi.rho[world] = ctl.sums[0, world]
@@ -289,7 +289,9 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     ):
         """x and r of the least residual."""
         world, slot = wp.tid()
-        if newton.active[world] != 0 and not ctl.norm[world] <= bi.best[world]:
+        if newton.active[world] == 0 or ctl.iterations[world] == 0:
+            return  # there is no best
+        if not ctl.norm[world] <= bi.best[world]:
             x[world, slot] = best_x[world, slot]
             r[world, slot] = best_r[world, slot]
 

@@ -119,7 +119,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def rounded(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
-        """Whether in double precision a group's residual is that of rounded positions, and within the tolerance of all
+        """True where, in float64, a group's residual is that of rounded positions, and within the tolerance of all
         groups of its component: solving on would not make it smaller."""
         if ctl.groups == ctl.components or ctl.eps > f64(COARSE) or norm > f64(ROUNDED) * rounding:
             return False

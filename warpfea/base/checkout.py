@@ -1,4 +1,4 @@
-"""What a source checkout is: `kernels/` and `scenes/` lie beside the package there."""
+"""Source checkouts, where `kernels/` and `scenes/` lie beside the package."""
 
 import importlib.util
 import pathlib

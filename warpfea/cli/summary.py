@@ -194,13 +194,13 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
 
 
 def _times(s: dict[str, Any]) -> str:
-    """What the run took."""
+    """Seconds of the run and its parts."""
     setup, kernels, solve, output = (f"{s[f'{name}_s']:.1f} s" for name in ("setup", "compile", "solve", "output"))
     return f"{s['wall_s']:.1f} s: set-up {setup} (kernels {kernels}), solve {solve}, output {output}"
 
 
 def _suggestion(sim: Simulation) -> list[list[str]]:
-    """What to write where the integrator takes or gives much of the energy that is turned over."""
+    """A row that names other schemes where the integrator takes or gives much of the energy that is turned over."""
     share, name = integrator_share(sim), sim.integrator.name
     if not share > SHARE:
         return []

@@ -214,7 +214,7 @@ class Model:
         return term and term.tables
 
     def _upload_components(self) -> None:
-        """What residuals are judged by: components, and in each materials of like stiffness; errors by part as well."""
+        """Group slots by component, and in each by materials of like stiffness, for residuals; by part for errors."""
         self.residual_groups = slot_groups(self, self.component)
         self.residual_parts = slot_groups(self, self.part)
         if self.component_count > 1:

@@ -113,7 +113,7 @@ def least_energy(model: Model) -> np.ndarray:
 
 
 def remedy(sim: Any) -> str:
-    """What to write in place of the integrator."""
+    """Schemes to write in place of the integrator."""
     others = [f"{other!r}" for other in CALMER.get(sim.integrator.name, ())]
     return f"take integrator={', '.join(others)} or a smaller dt" if others else "take a smaller dt"
 
@@ -132,7 +132,7 @@ def integrator_share(sim: Any) -> float:
 
 
 def growth_error(sim: Any, world: int) -> str:
-    """The message of a step that is refused since the integrator has added too much; the world's watch begins anew."""
+    """The message of a step that is refused since the integrator has added too much; the world's watch begins again."""
     rows = sim.state.energy_growth.numpy()
     share, since = (float(rows[world, GROWTH.index(name)]) for name in ("share", "since"))
     rows[world] = 0.0

@@ -125,7 +125,7 @@ def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
         if strange[world] and not out.reasons[world]:
             names = ", ".join(term.name for term in model.terms if not term.potential)
             out.reasons[world] = f"forces that no potential is known of: {names}"
-    most = MOST if every else max(ITERATIONS, int(SHARE * sim.totals["pcg"].max()))
+    most = np.full(model.worlds, MOST) if every else np.maximum(ITERATIONS, (SHARE * sim.totals["pcg"]).astype(int))
     curvature, p = _search(probe, out, most)
     if single:
         _shake(probe, sim, out, curvature, p)
@@ -230,8 +230,9 @@ def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.einsum("bsc,bsc->b", x, y)
 
 
-def _search(probe: Tangent, out: Stability, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Look for a direction of negative curvature in the worlds without a reason; sets `stable` and `reasons`.
+def _search(probe: Tangent, out: Stability, most: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Look for a direction of negative curvature in the worlds without a reason, for `most` (worlds,) iterations; sets
+    `stable` and `reasons`.
 
     Returns (worlds,) p.H p and the directions p that it is judged by: the first negative one or the softest.
     """
@@ -245,7 +246,7 @@ def _search(probe: Tangent, out: Stability, most: int) -> tuple[np.ndarray, np.n
     p, rz = z.copy(), _dot(r, z)
     first, softest, curvature = rz.copy(), np.full(m.worlds, np.inf), np.zeros(m.worlds)
     best = np.zeros_like(p)
-    for count in range(1, most + 1):
+    for count in range(1, int(most.max()) + 1):
         Hp = probe.product(p, going)
         pHp, pDp = _dot(p, Hp), _dot(p, probe.diagonal * p)
         ratio = pHp / np.where(pDp > 0.0, pDp, 1.0)
@@ -266,12 +267,13 @@ def _search(probe: Tangent, out: Stability, most: int) -> tuple[np.ndarray, np.n
         done = going & (new <= REDUCTION**2 * first)
         out.stable[done] = True
         going = going & ~done
+        for world in np.flatnonzero(going & (count >= most)):
+            out.reasons[world] = f"not resolved in {most[world]} iterations; unstable='refuse' takes up to {MOST}"
+        going = going & (count < most)
         if not going.any():
             break
         p = z + np.where(going, new / np.where(going, rz, 1.0), 0.0)[:, None, None] * p
         rz = new
-    for world in np.flatnonzero(going):
-        out.reasons[world] = f"not resolved in {most} iterations; unstable='refuse' takes up to {MOST}"
     return curvature, best
 
 
@@ -302,12 +304,13 @@ def _mode(probe: Tangent, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
     def mass(v: np.ndarray) -> np.ndarray:
         return np.stack([masses[b] @ v[b] if chosen[b] else v[b] for b in range(m.worlds)]) * probe.free
 
-    before, basis, going = np.full(m.worlds, np.inf), [x], chosen.copy()
+    before, basis, going = np.full(m.worlds, np.finfo(float).max), [x], chosen.copy()
     H, M = [probe.product(x, going)], [mass(x)]
     for _ in range(MODE_ITERATIONS):
-        value = np.zeros(m.worlds)
-        new: list[list[np.ndarray]] = [[np.zeros_like(x) for _ in range(3)] for _ in range(2)]
-        for b in np.flatnonzero(chosen):
+        value = before.copy()
+        # a world that is done stays as it is, however long others take
+        new = [[of[0].copy() for of in (basis, H, M)], [np.zeros_like(x) for _ in range(3)]]
+        for b in np.flatnonzero(going):
             V, HV, MV = (np.stack([v[b].ravel() for v in of]) for of in (basis, H, M))
             size = np.sqrt(np.maximum(np.einsum("ij,ij->i", V, MV), 1e-300))
             V, HV, MV = V / size[:, None], HV / size[:, None], MV / size[:, None]
@@ -321,15 +324,13 @@ def _mode(probe: Tangent, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
                 for j, weights in enumerate((y, last)):
                     new[j][k][b] = (weights @ of).reshape(m.slots, 3)
         (x, Hx, Mx), (p, Hp, Mp) = new
-        going = chosen & (np.abs(value - before) > MODE_CHANGE * np.abs(value))
+        going = going & (np.abs(value - before) > MODE_CHANGE * np.abs(value))
         if not going.any():
             break
         before = value
         r = Hx - value[:, None, None] * Mx
-        w = probe.precondition(r, chosen)
-        basis, H, M = [x, w], [Hx, probe.product(w, chosen)], [Mx, mass(w)]
-        if (_norm(p)[chosen] > 0.0).all():
-            basis, H, M = [*basis, p], [*H, Hp], [*M, Mp]
+        w = probe.precondition(r, going)
+        basis, H, M = [x, w, p], [Hx, probe.product(w, going), Hp], [Mx, mass(w), Mp]
     largest = (np.linalg.norm(x, axis=2) * m.is_position_host).max(axis=1)
     return x / np.where(largest > 0.0, largest, 1.0)[:, None, None]
 
