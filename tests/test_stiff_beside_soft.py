@@ -62,6 +62,43 @@ def test_groups_are_materials_of_like_stiffness_in_what_is_joined():
     assert model.residual_parts.count == 2
 
 
+def series(kind, moduli):
+    """Three blocks in a row, the first clamped and loaded where it ends, so that the others go along as they are."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    first, middle, last = blocks = [
+        b.add_solid(wf.mesh.box((0.3, 0.1, 0.1), cells=(2, 1, 1), origin=(0.3 * k, 0, 0)), material=wf.SVK(E=E, nu=0.0))
+        for k, E in enumerate(moduli)
+    ]
+    b.clamp(first.nodes("x-"))
+    for left, right in ((first, middle), (middle, last)):
+        if kind == "joint":
+            b.add_joint("fixed", parent=left.surface("x+"), child=right.surface("x-"))
+        else:
+            b.weld(right.nodes("x-"), left)
+    b.add_traction(first.surface("x+"), (1e-4 * moduli[0], 0, 0))
+    return b, blocks
+
+
+def test_stiff_blocks_on_both_sides_of_a_soft_one_are_judged_apart():
+    """Fails with one group of both stiff blocks: the free end of 1e12 Pa has an error of 0.43, converged, floor 0."""
+    b, blocks = series("weld", (1e8, 1e6, 1e8))
+    model = b.finalize(device="cpu", dtype="float32")
+    assert model.residual_groups.count == 3
+    result = wf.solve_static(model, unstable="ignore")
+    exact = result.displacements(blocks[0])[0, :, 0].max()
+    assert exact == pytest.approx(0.3 * 1e-4, rel=1e-3)
+    assert np.abs(result.displacements(blocks[2])[0, :, 0] - exact).max() < 1e-4 * exact
+    b, blocks = series("weld", (1e12, 1e6, 1e12))
+    with pytest.raises(wf.ConvergenceError, match="float32 can't hold this case"):
+        wf.solve_static(b.finalize(device="cpu", dtype="float32"), unstable="ignore")
+
+
+def test_stiff_blocks_that_a_joint_ties_are_one_group():
+    counts = [series("joint", moduli)[0].finalize(device="cpu").residual_groups.count
+              for moduli in ((1e9, 1e9, 1e5), (1e9, 1e5, 1e9), (1e9, 1e9, 1e9), (1e5, 1e9, 1e5))]  # fmt: skip
+    assert counts == [2, 3, 1, 3]
+
+
 def test_classes_of_stiffness():
     given = np.array([1e9, 1.0, 29.0, 2e9, 1.0, 1e9])
     assert list(stiffness_classes(given, np.array([0, 0, 0, 0, 1, 1]))) == [1, 0, 0, 1, 0, 1]

@@ -1,4 +1,4 @@
-"""Groups of slots whose residuals are judged apart: what is joined, by materials of like stiffness."""
+"""Groups of slots whose residuals are judged apart: what is joined by materials of like stiffness."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
+
+from .assembly import components_of
 
 __all__ = ["SlotGroups", "slot_groups"]
 
@@ -40,10 +43,12 @@ def slenderness(model: Any) -> np.ndarray:
 
 
 def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Class of stiffness in its component, of each slot and of each element in the order of the model's blocks.
+    """Piece of like stiffness, the softest first, of each slot, and of each element in the order of the model's blocks.
 
-    A slot between materials is one of the stiffest there, which its forces come from; an element belongs with the
-    softest of its slots. Moduli are those that the model was built with.
+    A piece is what elements of one class of stiffness, and ties between their slots, connect: stiff bodies on both
+    sides of a soft one are two, since a residual of the loaded one's forces moves the other far. A slot between
+    materials is one of the stiffest there, which its forces come from; an element belongs with the softest of its
+    slots. Moduli are those that the model was built with.
     """
     parts = [host for block in model.blocks for host in block.parts]
     first = np.concatenate([host.conn[:, 0] + host.body.slot_offset for host in parts])
@@ -52,9 +57,25 @@ def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
     of_slot = np.zeros(model.slots, dtype=np.int64)
     connectivity = [block.connectivity for block in model.blocks]
     ends = np.cumsum([len(conn) for conn in connectivity])[:-1]
-    for conn, classes in zip(connectivity, np.split(of_element, ends)):
+    of_block = np.split(of_element, ends)
+    for conn, classes in zip(connectivity, of_block):
         np.maximum.at(of_slot, conn, classes[:, None])
-    return of_slot, np.concatenate([of_slot[conn].min(axis=1) for conn in connectivity])
+    sets = [np.where(of_slot[conn] == own[:, None], conn, -1) for conn, own in zip(connectivity, of_block)]
+    for tie in model.terms.ties():
+        sets += [tie[of_slot[tie] == one][None] for one in np.unique(of_slot[tie])]
+    piece = np.unique(of_slot * model.slots + connected_slots(sets, model.slots), return_inverse=True)[1].ravel()
+    softest = [conn[np.arange(len(conn)), of_slot[conn].argmin(axis=1)] for conn in connectivity]
+    return piece, piece[np.concatenate(softest)]
+
+
+def connected_slots(sets: list[np.ndarray], slots: int) -> np.ndarray:
+    """(slots,) number of what the rows of `sets`, (n, m) slots with -1 for none, connect."""
+    count = np.cumsum([0] + [len(rows) for rows in sets])
+    row = np.concatenate([np.repeat(first + np.arange(len(rows)), rows.shape[1]) for first, rows in zip(count, sets)])
+    slot = np.concatenate([rows.ravel() for rows in sets])
+    row, slot = row[slot >= 0] + slots, slot[slot >= 0]
+    n = slots + count[-1]
+    return components_of(sp.coo_matrix((np.ones(len(row)), (row, slot)), shape=(n, n)).tocsr())[:slots]
 
 
 @dataclass(frozen=True)
@@ -75,7 +96,7 @@ class SlotGroups:
 
 
 def slot_groups(model: Any, label: np.ndarray) -> SlotGroups:
-    """Groups of one `label` (slots,), each of whose elements has one, and of one class of stiffness."""
+    """Groups of one `label` (slots,), each of whose elements has one, and of one piece of like stiffness."""
     of_slot, of_element = like_stiffness(model)
     first = np.concatenate([block.connectivity[:, 0] for block in model.blocks])
     keys, of = np.unique(label * (of_slot.max() + 1) + of_slot, return_inverse=True)
