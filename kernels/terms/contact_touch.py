@@ -324,7 +324,8 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return f64(1.0)
 
     return _types.SimpleNamespace(
-        Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, allowance=allowance, recovered=recovered, rate_of=rate_of,
+        Touch=Touch, along=along, plane=plane, record_of=record_of, reach=reach, allowance=allowance,
+        recovered=recovered, rate_of=rate_of,
         depth_before=depth_before, touch=touch, in_plane=in_plane, coefficient=coefficient, put_explicit=put_explicit,
         hold=hold, pull=pull, friction_potential=friction_potential, friction_force=friction_force,
         point_stiffness=point_stiffness, acts=acts, shape_of=shape_of, lagrange=lagrange, monomial=monomial,
