@@ -65,11 +65,8 @@ class EnergyGrowth:
         rows = state.register("energy_growth", wp.float64, (len(GROWTH),))
         rows.zero_()
         step.growth, step.watched = rows, 1
-        self._rows, self._least, self._model = (
-            rows,
-            wp.zeros(model.worlds, dtype=wp.float64, device=model.device),
-            model,
-        )
+        self._model, self._rows = model, rows
+        self._least = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
         self._written, self._writes = 0, np.zeros(model.worlds, dtype=np.int64)
         self._least.assign(least_energy(model))
         step.growth_told = TOLD
