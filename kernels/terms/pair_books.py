@@ -48,6 +48,12 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
         rows[j, world, row] = rows[j, world, row] + value
 
     @wp.func
+    def add_work(rows: wp.array3d(dtype=f64), world: int, row: int, work: f64):
+        """What a stored overlap does that recovers, which the integrator's own formula lacks."""
+        add(rows, 3, world, row, work)
+        add(rows, 4, world, row, work)
+
+    @wp.func
     def forget(his: History, seats: Seats, world: int, point: int):
         """A point is in contact no longer."""
         his.spring[world, point] = vec3d()
@@ -120,9 +126,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
             f = t.seat[world, point]
             if share == f64(0.0) or (f < 0 and not live):
                 continue
-            stored = f64(0.0)
-            kept = vec3d()
-            base = vec3d()
+            stored, kept, base = f64(0.0), vec3d(), vec3d()
             if f < 0:  # beyond an edge of the surface
                 at.state[world, point] = IDLE
                 add(booked, 1, world, row, share * his.stored[world, point])
@@ -156,9 +160,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
             add(booked, 0, world, row, share * stored)
             add(booked, 1, world, row, share * (normal - spring[0]) * s.rise)
             add(booked, 2, world, row, share * rubbed)
-            work = share * normal * recovered(con, his, clock, world, c, point)
-            add(booked, 3, world, row, work)
-            add(booked, 4, world, row, work)
+            add_work(booked, world, row, share * normal * recovered(con, his, clock, world, c, point))
             place = jet(mas, t.C, t.D, world, f, t.spot[world, point])
             add(at.rows, 6, world, row, share * normal)
             tell_force(at, world, row, (mas.sign[c] * share) * force, place.x)

@@ -67,7 +67,7 @@ class EnergyGrowth:
         step.growth, step.watched = rows, 1
         self._model, self._rows = model, rows
         self._least = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
-        self._written, self._writes = 0, np.zeros(model.worlds, dtype=np.int64)
+        self._written, self._writes = model.terms.written, model.terms.writes
         self._least.assign(least_energy(model))
         step.growth_told = TOLD
         step.growth_limit = REFUSED if self.choice == "refuse" else np.inf
@@ -78,7 +78,7 @@ class EnergyGrowth:
         if not self.watched or self._written == self._model.terms.written:
             return
         writes = self._model.terms.writes
-        chosen, self._writes = writes > self._writes, writes.copy()
+        chosen, self._writes = writes > self._writes, writes
         self._written = self._model.terms.written
         rows = self._rows.numpy()
         rows[chosen] = 0.0

@@ -207,10 +207,7 @@ class Stepper:
         self._changes[chosen] = self.model.parameters.changes[chosen]
 
     def take_parameters(self) -> None:
-        """Follow constants of materials that were set since the last step: kept matrices, the energies of the state.
-
-        The ledger has the jump of those energies as the work of who set them, among that of fields.
-        """
+        """Follow parameters set since the last step; the ledger has the jump of energies as work of fields."""
         if self.growth:
             self.growth.follow()
         parameters = self.model.parameters

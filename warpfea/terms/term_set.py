@@ -83,7 +83,7 @@ class TermSet:
         self.dead = self.find(DeadLoads)
         self.side_topology: Any = None
         self.written = 0
-        self.writes: np.ndarray | None = None
+        self.writes: np.ndarray = np.zeros(1, dtype=np.int64)  # (worlds,) once a parameter was set
         self._check()
 
     def _check(self) -> None:
@@ -264,9 +264,7 @@ class TermSet:
             chosen = chosen_worlds("set_parameter", mask, self.model.worlds)
             found[0](values, chosen)
             self.written += 1
-            if self.writes is None:
-                self.writes = np.zeros(self.model.worlds, dtype=np.int64)
-            self.writes[chosen] += 1
+            self.writes = self.writes + chosen
             return
         if found:
             raise ModelError(f"set_parameter: {name!r} is a parameter of {len(found)} things of that name; rename one")
