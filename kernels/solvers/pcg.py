@@ -22,8 +22,7 @@ TRUSTED = 3
 """Iterations of Newton's method in which factors of the operator's own matrix are trusted to solve. Later ones are
 checked by the conjugate gradients, which also refine."""
 STRICT_CHECK, STRICT_GAIN = 10, 0.01
-"""A solve that tells an error ends when it gains less than this share of the energy while its iterations, from so many
-on, double."""
+"""A solve that tells an error ends when it gains less than this share of the energy in so many iterations."""
 LANES = 128
 """Partial sums per group of bodies; a fixed number, so that results don't depend on the number of worlds."""
 
@@ -48,7 +47,7 @@ def pcg_struct():
         energy: wp.array(dtype=wp.float64)  # that energy, sum of alpha r.z, and what it was when last looked at
         seen: wp.array(dtype=wp.float64)
         negative: wp.array(dtype=wp.int32)  # the solve met a direction without positive curvature
-        unsolved: wp.array(dtype=wp.int32)  # one that tells no error ended at max_iterations
+        unsolved: wp.array(dtype=wp.int32)  # the last solve ended at max_iterations
         exact: wp.array(dtype=wp.int32)  # the preconditioner is the inverse of the operator, up to rounding
         taken: wp.array(dtype=wp.int32)  # its z is the solution
         flip: wp.array(dtype=wp.int32)  # such a direction is taken as if its curvature were positive
@@ -261,13 +260,12 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             ctl.iterations[world] = count
             ctl.total[world] = ctl.total[world] + 1
             more = norm > ctl.target[world] and count < ctl.max_iterations and ctl.total[world] < ctl.max_work
-            doubled = count / STRICT_CHECK  # of soft directions with a poor preconditioner little comes at a time
-            if ctl.strict[world] != 0 and count % STRICT_CHECK == 0 and (doubled & (doubled - 1)) == 0:
+            if ctl.strict[world] != 0 and count % STRICT_CHECK == 0:
                 energy = ctl.energy[world]
                 more = more and energy - ctl.seen[world] > f64(STRICT_GAIN) * energy
                 ctl.seen[world] = energy
             cut = ctl.strict[world] != 0 and count >= ctl.max_iterations
-            if ctl.strict[world] == 0 and count >= ctl.max_iterations and norm > ctl.target[world]:
+            if count >= ctl.max_iterations and norm > ctl.target[world]:
                 ctl.unsolved[world] = 1
             if cut or not (pHp > f64(0.0) and rz >= f64(0.0)):
                 ctl.negative[world] = 1
