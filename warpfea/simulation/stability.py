@@ -237,7 +237,8 @@ def _search(probe: Tangent, out: Stability, most: np.ndarray) -> tuple[np.ndarra
     Returns (worlds,) p.H p and the directions p that it is judged by: the first negative one or the softest.
     """
     m = probe.model
-    kappa = probe.sim.solver.kappa(m.dtype) if m.constraints else 0.0
+    solver = probe.sim.solver
+    kappa = solver.kappa(m.dtype) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
     rounding = ROUNDING * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
     going = np.array([not reason for reason in out.reasons])
     random = np.random.default_rng(1).standard_normal((m.slots, 3))

@@ -135,7 +135,7 @@ class Workspace:
         self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative, self.newton.unsolved = self.pcg.negative, self.pcg.unsolved
-        unused = ("b", "q_a", "h_before", "any_refused", "summed", "ends", "growth", "least_energy")
+        unused: tuple[str, ...] = ("b", "q_a", "h_before", "any_refused", "summed", "ends", "growth", "least_energy")
         unused += () if midpoint else ("stage_time",)
         self.step = self.struct(step_struct(), B, skip=unused, stop=(2,))
         self.stage_time = self.step.stage_time if midpoint else self.step.new_time
