@@ -23,10 +23,12 @@ LABELS = [case.label for case in bench.cases()]
 COSTS = ("launches", "modules")
 BYTES = 1.03
 """Most that a scene may hold over what it did: a field more, the best iterate of a step."""
-GROUPS = ("slider_crank", "slider_crank worlds", "slider_crank bdf2", "slider_crank jacobi3x3", "slider_crank deflated",
-          "slider_crank direct", "slider_crank f32", "slider_crank two-level", "slider_crank outer")  # fmt: skip
+GROUPS = {"slider_crank": 1.16, "slider_crank worlds": 1.16, "slider_crank bdf2": 1.16, "slider_crank outer": 1.14,
+          "slider_crank jacobi3x3": 1.5, "slider_crank deflated": 1.5}  # fmt: skip
 """Stiff parts beside soft ones: residuals are judged by groups of like stiffness since."""
-DEARER = {"ball_on_plate": 1.04, "finger_beam_shell": 1.06} | dict.fromkeys(GROUPS, 1.05)
+DEARER = {"ball_on_plate": 1.04, "finger_beam_shell": 1.06} | dict.fromkeys(
+    [f"slider_crank {of}" for of in ("jacobi3x3", "direct", "deflated")], 1.05
+)
 """Of contact between bodies, whose tangent has the second derivative of the depth: 220 B a point, for which bodies that
 slide take less than half of the iterations."""
 NEWER = {"gears": 1}
@@ -68,14 +70,13 @@ def test_costs_no_more_than_before(tables, label):
 
 
 def test_all_scenes_take_fewer_iterations_than_before(tables):
-    """In all but `GROUPS`; none of them takes one and 6 % more Newton iterations, of those half as many more."""
+    """In all but `GROUPS`; none of them takes one and 6 % more Newton iterations, but what `GROUPS` says."""
     for name in ("newton", "pcg", "per_step"):
         new, old = (sum(row[name] or 0 for at, row in table.items() if at not in GROUPS) for table in tables)
         assert new <= old, (name, new, old)
     now, before = tables
     for label, row in now.items():
-        most = 1.5 if label in GROUPS else 1.06
-        assert row["newton"] <= most * before[label]["newton"] + 1, label
+        assert row["newton"] <= GROUPS.get(label, 1.06) * before[label]["newton"] + 1, label
 
 
 @pytest.mark.parametrize("label", ["cantilever", "slider_crank", "loads rate auto"])

@@ -1,4 +1,4 @@
-"""Speeds on one H200 beside those of 8934ce7, in turn on one machine: tests/results/trials_h200.json names the commands."""
+"""Speeds on one H200 beside those of 8934ce7, in turn on one machine, as tests/results/trials_h200.json says."""
 
 import json
 import pathlib
