@@ -68,8 +68,7 @@ def dead_points() -> tuple[wf.ModelBuilder, float]:
     push = speed * np.array([-pin[2], 0.0, pin[0]])
     b.set_initial(arm, velocity=lambda X: speed * np.column_stack([-X[:, 2], 0.0 * X[:, 1], X[:, 0]]))
     b.set_initial(
-        link,
-        velocity=lambda X: push + turn * np.column_stack([X[:, 2] - pin[2], 0.0 * X[:, 1], pin[0] - X[:, 0]]),
+        link, velocity=lambda X: push + turn * np.column_stack([X[:, 2] - pin[2], 0.0 * X[:, 1], pin[0] - X[:, 0]])
     )
     b.add_joint("revolute", parent=wf.GROUND, child=arm.start, axis=(0, -1, 0))
     b.add_joint("revolute", parent=arm.end, child=link.start, axis=(0, -1, 0))

@@ -105,6 +105,24 @@ def fitted_pressure(r: np.ndarray, pressure: np.ndarray, area: np.ndarray, radiu
     return math.sqrt(-top / slope), math.sqrt(top)
 
 
+def fit_errors(r: np.ndarray, pressure: np.ndarray, area: np.ndarray, radius: float, peak: float) -> Row:
+    """Fitted contact radius and peak pressure beside expected ones, and the scatter of the pressures, over the peak."""
+    a, p0 = fitted_pressure(r, pressure, area, radius)
+    inside = (r < 0.9 * radius) & (area > 0.0)
+    expected = p0 * np.sqrt(np.maximum(1.0 - (r[inside] / a) ** 2, 0.0))
+    scatter = float(np.sqrt(np.average((pressure[inside] - expected) ** 2, weights=area[inside])) / p0)
+    return {"points_inside": int(inside.sum()), "a": a, "p0": p0, "a_error": a / radius - 1.0,
+            "p0_error": p0 / peak - 1.0, "pressure_scatter": scatter}  # fmt: skip
+
+
+def solved(b: wf.ModelBuilder, load_steps: int, device: Any) -> tuple[wf.Simulation, Any, float]:
+    """The simulation at full load, its result and the seconds of the solution, without compilation."""
+    sim = begin_static(b.finalize(device=device), load_steps=load_steps)
+    began = clock.perf_counter()
+    found = run_static(sim, unstable="ignore")
+    return sim, found, clock.perf_counter() - began
+
+
 def hertz_case(
     nu: float, *, inner: int = 8, outer: int = 8, depth: float = 60.0, stiffness: float = 300.0, load_steps: int = 4,
     device: Any = "cpu",
@@ -112,27 +130,18 @@ def hertz_case(
     """Press the sphere in by A^2/R, and compare the fitted radius and peak pressure with Hertz's of the force."""
     path = ([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.0, -(A**2))])
     b, _, pad = block(nu=nu, inner=inner, outer=outer, depth=depth, half=False, path=path, mu=0.0, stiffness=stiffness)
-    model = b.finalize(device=device)
-    sim = begin_static(model, load_steps=load_steps)  # compiles, so that the time is that of the solution
-    began = clock.perf_counter()
-    found = run_static(sim, unstable="ignore")
-    seconds = clock.perf_counter() - began
+    sim, found, seconds = solved(b, load_steps, device)
     force = 4.0 * abs(float(found.contact_force(pad)[0, 2]))
     modulus = E / (1.0 - nu**2)
     radius = (0.75 * force / modulus) ** (1.0 / 3.0)
     peak = 1.5 * force / (math.pi * radius**2)
-    r, pressure, area = point_pressures(sim)
-    a, p0 = fitted_pressure(r, pressure, area, radius)
-    inside = (r < 0.9 * radius) & (area > 0.0)
-    expected = p0 * np.sqrt(1.0 - (r[inside] / a) ** 2)
-    scatter = np.sqrt(np.average((pressure[inside] - expected) ** 2, weights=area[inside])) / p0
     penetration = float(sim.contact_record(pad).penetration[0, -1])
     return {
-        "nu": nu, "unknowns": int(model.free_slots.sum()), "cells_per_radius": inner / WIDTH,
+        "nu": nu, "unknowns": int(sim.model.free_slots.sum()), "cells_per_radius": inner / WIDTH,
         "depth_over_a": depth * A / radius, "a_over_R": radius, "stiffness": stiffness, "force": force,
-        "force_over_hertz": force / (4.0 / 3.0 * modulus * A**3), "a": a, "p0": p0, "a_error": a / radius - 1.0,
-        "p0_error": p0 / peak - 1.0, "pressure_scatter": float(scatter), "penalty_share": penetration / A**2,
-        "load_steps": load_steps, "newton": int(found.newton[0]), "pcg": int(found.pcg[0]), "seconds": seconds,
+        "force_over_hertz": force / (4.0 / 3.0 * modulus * A**3), **fit_errors(*point_pressures(sim), radius, peak),
+        "penalty_share": penetration / A**2, "load_steps": load_steps, "newton": int(found.newton[0]),
+        "pcg": int(found.pcg[0]), "seconds": seconds,
     }  # fmt: skip
 
 
@@ -254,30 +263,13 @@ def _pressures(sim: wf.Simulation, across: tuple[int, ...]) -> tuple[np.ndarray,
     return np.linalg.norm(x[:, across], axis=1), pressure, area
 
 
-def _solve(
-    b: wf.ModelBuilder, pair: Any, load_steps: int, device: Any
-) -> tuple[wf.Simulation, Any, float]:  # fmt: skip
-    """The simulation at full load, its result and seconds of the solution."""
-    model = b.finalize(device=device)
-    sim = begin_static(model, load_steps=load_steps)  # compiles, so that the time is that of the solution
-    began = clock.perf_counter()
-    found = run_static(sim, unstable="ignore")
-    return sim, found, clock.perf_counter() - began
-
-
 def _row(
     sim: wf.Simulation, found: Any, pair: Any, across: tuple[int, ...], radius: float, peak: float
 ) -> dict[str, Any]:  # fmt: skip
     """Width and pressure beside Hertz's."""
-    r, pressure, area = _pressures(sim, across)
-    a, p0 = fitted_pressure(r, pressure, area, radius)
-    inside = (r < 0.9 * radius) & (area > 0.0)
-    expected = p0 * np.sqrt(np.maximum(1.0 - (r[inside] / a) ** 2, 0.0))
     return {
         "unknowns": int(sim.model.free_slots.sum()), "slave": pair.slave.body.name,
-        "points_inside": int(inside.sum()), "a": a, "p0": p0, "a_error": a / radius - 1.0,
-        "p0_error": p0 / peak - 1.0,
-        "pressure_scatter": float(np.sqrt(np.average((pressure[inside] - expected) ** 2, weights=area[inside])) / p0),
+        **fit_errors(*_pressures(sim, across), radius, peak),
         "penetration": float(sim.contact_record(pair).penetration[0, -1]), "newton": int(found.newton[0]),
         "pcg": int(found.pcg[0]),
     }  # fmt: skip
@@ -310,7 +302,7 @@ def balls_case(
             b.clamp(body.nodes(side), components=axis)
         bodies.append(body)
     pair = b.add_contact(bodies[0].surface("z+"), bodies[1].surface("z+"), stiffness=stiffness, radius=A, name="pair")
-    sim, found, seconds = _solve(b, pair, load_steps, device)
+    sim, found, seconds = solved(b, load_steps, device)
     force = 4.0 * abs(float(found.contact_force(pair)[0, 2]))
     modulus = 1.0 / sum((1.0 - nu**2) / e for e in MODULI)
     radius = (0.75 * force / modulus) ** (1.0 / 3.0)
@@ -359,7 +351,7 @@ def cylinders_case(
     reach = math.sqrt(A * thick / math.pi)
     pair = b.add_contact(bodies[0].surface("z+"), bodies[1].surface("z+"), stiffness=stiffness, radius=reach,
                          name="pair")  # fmt: skip
-    sim, found, seconds = _solve(b, pair, load_steps, device)
+    sim, found, seconds = solved(b, load_steps, device)
     force = 2.0 * abs(float(found.contact_force(pair)[0, 2])) / thick
     modulus = 1.0 / sum((1.0 - nu**2) / e for e in MODULI)
     radius = math.sqrt(4.0 * force / (math.pi * modulus))
