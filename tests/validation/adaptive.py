@@ -118,7 +118,7 @@ CASES: dict[str, Callable[[], tuple[wf.ModelBuilder, float]]] = {
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-5)
 PIECES = 8
 FINE = {"stiff": 2e-7, "impact": 2e-7, "dead_points": 4e-7, "free_flight": 2e-7, "contact": 2e-7, "soft_contact": 2e-7}
-"""Error that references are asked for; the run with four times it tells how good they are."""
+"""Error that references are asked for; the run with four times it gives their own error."""
 FINEST = {"backward_euler": 16384, "bdf2": 8192}
 """Most fixed steps."""
 LEFT_OUT = {

@@ -142,7 +142,7 @@ class Conserved:
             self.stretch = max(self.stretch, float(change.max()))
 
     def row(self) -> dict[str, Any]:
-        """What was found, with what the ledger put down to the integrator."""
+        """Largest errors, and the energy that the ledger assigns to the integrator."""
         e, size = self.sim.energies(), self.first[0]
         return {
             "energy": self.energy, "linear": self.linear, "angular": self.angular, "strain": self.strain,

@@ -7,7 +7,7 @@ rebound    an elastic ball on a plane: restitution and duration, and those of a 
 wall       a cube pressed to a wall: how far it moves in 10 s, after 10 s of settling.
 turntable  a cube on a plate that turns: how far it moves on it in ten turns; the paper's law walks.
 balls      two elastic balls with meshes that do not match: contact radius, peak pressure and approach beside Hertz.
-cylinders  the same of two cylinders in plane strain: width and pressure.
+cylinders  two cylinders in plane strain: width and pressure beside Hertz.
 stack      ten cubes on each other: how far they move in 10 s, also under a last one of a thousand times the mass.
 
 Each row has its iterations and time.
@@ -441,7 +441,7 @@ def _simulation(b: wf.ModelBuilder, dt: float, device: Any) -> wf.Simulation:
 
 
 def _cost(sim: wf.Simulation, began: float) -> dict[str, Any]:
-    """What the run took."""
+    """Steps, iterations, residual of the ledger and seconds of a run."""
     return {
         "steps": sim.steps, "newton": int(sim.totals["newton"][0]), "pcg": int(sim.totals["pcg"][0]),
         "ledger_residual": float(sim.energies()["ledger_residual"][0]), "seconds": clock.perf_counter() - began,

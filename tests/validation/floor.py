@@ -72,7 +72,7 @@ def strip(case: dict[str, Any]) -> wf.ModelBuilder:
 
 
 def positive(sim: wf.Simulation) -> bool:
-    """Whether the tangent is positive definite on the free components."""
+    """True where the tangent is positive definite on the free components."""
     free = sim.model.free_slots.ravel()
     K = sim.model.tangent_matrix(sim.state)[free][:, free].toarray()
     d = 1.0 / np.sqrt(np.abs(K.diagonal()))
@@ -86,7 +86,7 @@ def positive(sim: wf.Simulation) -> bool:
 def solved(
     case: dict[str, Any], device: Any, dtype: str, tol: float | None = None
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Displacements of the nodes at the end (nodes, 3), m, and what was told; of a reference whether it is stable."""
+    """Displacements of the nodes at the end (nodes, 3), m, and what was reported; of a reference whether it is stable."""
     model = strip(case).finalize(device=device, dtype=dtype)
     stable, floors = True, []
     if case["motion"]:
@@ -106,20 +106,20 @@ def solved(
 
 
 def tried(case: dict[str, Any], device: Any) -> dict[str, Any]:
-    """A row: what float32 told of a case, and its error."""
+    """A row: what float32 reported of a case, and its error."""
     row: dict[str, Any] = {**case, "stable": None, "outcome": "no reference", "floor": None, "error": None}
     try:
-        exact, told = solved(case, device, "float64", REFERENCE)
+        exact, report = solved(case, device, "float64", REFERENCE)
     except wf.ConvergenceError:
         return row
-    row["stable"] = told["stable"]
+    row["stable"] = report["stable"]
     try:
-        u, told = solved(case, device, "float32")
+        u, report = solved(case, device, "float32")
     except wf.ConvergenceError as error:
         known = "float32 can't hold this case" in str(error)
         return row | {"outcome": "refused" if known else str(error)[:200]}
     off = float(np.abs(u - exact).max() / np.abs(exact).max())
-    return row | told | {"stable": row["stable"], "outcome": "accepted", "error": off}
+    return row | report | {"stable": row["stable"], "outcome": "accepted", "error": off}
 
 
 def rows(run: Run) -> Iterator[Row]:

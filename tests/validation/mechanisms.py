@@ -33,7 +33,7 @@ def EVERY(X: np.ndarray) -> np.ndarray:
 
 
 def work(sim, seconds):
-    """What a run took."""
+    """Steps, iterations, ms and violation of a run."""
     n = sim.steps
     return {"steps": n, "ms_per_step": 1e3 * seconds / n, "newton_per_step": float(sim.totals["newton"][0]) / n,
             "pcg_per_step": float(sim.totals["pcg"][0]) / n,
@@ -240,7 +240,7 @@ def crossing(sim):
 def no_drift(run: Run) -> Iterator[Row]:
     """Violation over 1e5 steps of 1 ms of bdf2: a soft double pendulum of two 3243 elements swings in space.
 
-    `violation_*` are what the joints record at every step, over the model's size; `gap_*` is the same of the pinned
+    `violation_*` are what the joints record at every step, over the model's size; `gap_*` is that of the pinned
     ends from their positions alone, `crossing` of the hinge from deformation gradients, every 100 steps since resumed.
     First and last: of the first and the last tenth."""
     sim, joints = swing(run.device)
@@ -421,7 +421,7 @@ SOLVERS = [{}, {"penalty": 1.0}, {"penalty": 1e4}, {"max_newton": 1, "max_pcg": 
 
 
 def fall_of_a_pair(device, E, tie, second, integrator, options, steps=30, dt=1e-2):
-    """The row of a pair that is let go at rest; None as its error where the substeps can't be told."""
+    """The row of a pair that is let go at rest; None as its error where the substeps are unknown."""
     pair = Pair(device, tie, E=E, second=second)
     sim = wf.Simulation(pair.model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(**options))
     row = {"case": "fall", "joint": tie, "second": second, "integrator": integrator, "E": E, "dt": dt,

@@ -50,7 +50,7 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        raise UsageError(f"{message} ({self.prog} --help tells more)")
+        raise UsageError(f"{message} ({self.prog} --help explains)")
 
 
 def names() -> list[str]:
@@ -79,7 +79,7 @@ def parse(words: Sequence[str]) -> tuple[Table | None, argparse.Namespace]:
         top.add_argument("name", nargs="?", metavar="NAME", help="of a table: " + ", ".join(names()))
         options = top.parse_args(words)
         if not options.list:
-            raise UsageError(f"name a table: {', '.join(names())} ({prog} --help tells more)")
+            raise UsageError(f"name a table: {', '.join(names())} ({prog} --help explains)")
         return None, options
     table = find(words[0])
     lines = ["parts:", *(f"  {name:18}  {_first(_doc(part))}" for name, part in table.parts.items())]

@@ -18,7 +18,7 @@ Row = dict[str, Any]
 
 @dataclass
 class Run:
-    """What a table is run with.
+    """Options and rows of a run of a table.
 
     Attributes:
         device: that of --device, or of the table.
