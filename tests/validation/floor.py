@@ -86,7 +86,7 @@ def positive(sim: wf.Simulation) -> bool:
 def solved(
     case: dict[str, Any], device: Any, dtype: str, tol: float | None = None
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Displacements of the nodes at the end (nodes, 3), m, and what was reported; of a reference whether it is stable."""
+    """Displacements of the nodes at the end (nodes, 3), m, and the report; of a reference whether it is stable."""
     model = strip(case).finalize(device=device, dtype=dtype)
     stable, floors = True, []
     if case["motion"]:
