@@ -61,8 +61,8 @@ class NewtonPCG:
             also within a solve. A refused attempt is not halved either once the step's iterations of Newton's method,
             each counted as 20 of those, with contact as 100, have reached it (not with dt="auto").
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
-            serves; in statics of short chains of beams factors of the whole), "tiles" (those alone, without the motions), "banded" (Cholesky factors of the whole,
-            kept as well; on the CPU, for chains, strips and slender or small bodies), "deflated" (3x3 blocks of every
+            serves; in statics of short chains of beams factors of the whole), "tiles" (those alone, without the motions), "banded" (Cholesky
+            factors of the whole, kept as well; on the CPU, for chains, strips and slender or small bodies), "deflated" (3x3 blocks of every
             iterate, and the directions of constraints inverted), "block-jacobi" (the blocks alone), or "auto": on the
             CPU "banded" where the band is narrow or the model small, else "deflated" for many small bodies on joints,
             else "two-level".
@@ -109,9 +109,7 @@ class NewtonPCG:
             if getattr(self, name) != default:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} is not for linear = 'direct'")
         if self.preconditioner not in ("auto", *NAMES):
-            raise ModelError(
-                f"preconditioner {self.preconditioner!r} is unknown; there are auto, {', '.join(NAMES)}"
-            )
+            raise ModelError(f"preconditioner {self.preconditioner!r} is unknown; there are auto, {', '.join(NAMES)}")
         if self.preconditioner_dtype not in (None, "float32", "float64"):
             raise ModelError(
                 f"NewtonPCG: preconditioner_dtype = {self.preconditioner_dtype!r} is none of 'float32', 'float64', None"

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from ...builder.scene import find
-from ..accuracy.study import study
+from ..accuracy import StudyOptions, study
 from ..reports.parts import Rows, run_tables
 
 __all__ = ["METHODS", "SCENES", "orders", "rows", "run"]
@@ -40,8 +40,8 @@ def rows(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
     for name, (values, end, dt) in SCENES.items():
         steps = [dt / 2**k for k in range(2 if quick else HALVINGS)]
         found = study(
-            find(name), over={"method": METHODS, "dt": steps}, parameters=values, t_end=end, device=device, repeat=1,
-            split="none", finer={"method": "bdf2"}, progress=False,
+            find(name), over={"method": METHODS, "dt": steps}, parameters=values, t_end=end, device=device,
+            options=StudyOptions(repeat=1, split="none", finer={"method": "bdf2"}, progress=False),
         )  # fmt: skip
         own = found.references[0]
         _orders.extend(

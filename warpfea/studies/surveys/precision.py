@@ -12,8 +12,8 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
+from ..accuracy import StudyOptions, study
 from ..accuracy.problems import find_problem
-from ..accuracy.study import study
 from ..reports.parts import run_tables
 
 __all__ = ["FAMILIES", "rows", "run"]
@@ -30,8 +30,10 @@ def rows(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
     over = {"dtype": ["float64", "float32"], "dt": steps}
     for family in FAMILIES:
         found = study(
-            find_problem("small_body"), over=over, parameters={"family": family}, t_end=END, device=device, repeat=1,
-            split="none", finer={"method": "energy_momentum", "dt": steps[-1] / 2.0}, progress=False,
+            find_problem("small_body"), over=over, parameters={"family": family}, t_end=END, device=device,
+            options=StudyOptions(
+                repeat=1, split="none", finer={"method": "energy_momentum", "dt": steps[-1] / 2.0}, progress=False
+            ),
         )  # fmt: skip
         by = {(r.setting.dtype, r.setting.dt): r for r in found}
         least = min((by["float32", dt].error or float("inf") for dt in steps), default=None)
