@@ -265,27 +265,33 @@ _loaded = itertools.count()
 def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
     """Run a Python file and return its scenes by name; of those, imported ones only if it defines none itself.
 
+    A file of a package (a folder with __init__.py) may use relative imports, another one import what lies beside it.
+
     Raises:
         ModelError: no such file, an error in it (with its line), or no scene in it.
     """
     file = pathlib.Path(path)
     if not file.is_file():
         raise ModelError(f"{file}: no such file")
+    folder, packages = file.resolve().parent, []
+    while (folder / "__init__.py").is_file():
+        packages.insert(0, folder.name)
+        folder = folder.parent
     name = f"_warpfea_scenes_{next(_loaded)}_{re.sub(r'[^0-9a-zA-Z_]', '_', file.stem)}"
+    name = ".".join([*packages, name])
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
         raise ModelError(f"{file}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    folder = str(file.resolve().parent)
-    sys.path.insert(0, folder)
+    sys.path.insert(0, str(folder))
     try:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
         raise ModelError(f"{_place(error, file)}: {type(error).__name__}: {error}") from error
     finally:
-        sys.path.remove(folder)
+        sys.path.remove(str(folder))
     every = {item.name: item for item in vars(module).values() if isinstance(item, Scene)}
     own = {key: item for key, item in every.items() if item.function.__module__ == name}
     if not every:

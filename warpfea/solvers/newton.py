@@ -61,11 +61,11 @@ class NewtonPCG:
             also within a solve. A refused attempt is not halved either once the step's iterations of Newton's method,
             each counted as 20 of those, with contact as 100, have reached it (not with dt="auto").
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
-            serves; in statics of short chains of beams factors of the whole), "tiles" (those alone, without the motions), "banded" (Cholesky
-            factors of the whole, kept as well; on the CPU, for chains, strips and slender or small bodies), "deflated" (3x3 blocks of every
-            iterate, and the directions of constraints inverted), "block-jacobi" (the blocks alone), or "auto": on the
-            CPU "banded" where the band is narrow or the model small, else "deflated" for many small bodies on joints,
-            else "two-level".
+            serves; in statics of short chains of beams factors of the whole), "tiles" (those alone, without the
+            motions), "banded" (Cholesky factors of the whole, kept as well; on the CPU, for chains, strips and slender
+            or small bodies), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
+            "block-jacobi" (the blocks alone), or "auto": on the CPU "banded" where the band is narrow or the model
+            small, else "deflated" for many small bodies on joints, else "two-level".
         linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS where that is installed.
         preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
             model's. They are made in the model's precision; float32 halves what an application reads. Another precision

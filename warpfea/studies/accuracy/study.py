@@ -24,7 +24,6 @@ from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once
 from .motion import RESOLVED, ROUNDING, Motion, distances, known_motion
 from .options import StudyOptions, check_positive, names_moved
-from .problems import find_problem, problem_names
 from .report import Row, Study, with_orders, with_pareto
 from .settings import OPTIONS, Axes, Setting, make_axes, method_text, product
 from .split import split as parts_of_error
@@ -118,7 +117,7 @@ def study(
 def _scene(given: Any, dt: float | None, t_end: float | None) -> tuple[str, Scene[Any]]:
     """A scene, and how the command line names it."""
     if isinstance(given, str):
-        return given, find_problem(given) if given in problem_names() else locate(given)
+        return given, locate(given)
     if isinstance(given, Scene):
         return given.name, given
     if callable(given):

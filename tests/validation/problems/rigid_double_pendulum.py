@@ -7,10 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 import warpfea as wf
-
-from ...reports.mechanisms.cases import STEEL
-from ...reports.mechanisms.pendulum import LINKS, WIDTH, double_pendulum_links
-from ...reports.mechanisms.rigid import double_pendulum_motion, double_pendulum_places
+from warpfea.studies.reports.mechanisms.cases import STEEL
+from warpfea.studies.reports.mechanisms.pendulum import LINKS, WIDTH, double_pendulum_links
+from warpfea.studies.reports.mechanisms.rigid import double_pendulum_motion, double_pendulum_places
 
 
 def rigid_links(angle: float) -> wf.Reference:
