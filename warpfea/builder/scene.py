@@ -366,15 +366,7 @@ def _kind_name(kind: Any) -> str:
 def _parse(text: str, kind: Any) -> Any:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        if type(None) in arguments and text.lower() == "none":
-            return None
-        for choice in arguments:
-            try:
-                if choice is not type(None):
-                    return _parse(text, choice)
-            except ValueError:
-                continue
-        raise ValueError(f"{text!r} is not {_kind_name(kind)}")
+        return _parse_union(text, kind, arguments)
     if origin is typing.Literal:
         for value in arguments:
             if text == str(value):
@@ -382,28 +374,50 @@ def _parse(text: str, kind: Any) -> Any:
         raise ValueError(f"{text!r} is not {_kind_name(kind)}")
     if origin is tuple or kind is tuple:
         return _parse_tuple(text, kind, arguments or (float, Ellipsis))
-    if kind is bool:
-        if text.lower() not in _BOOL:
-            raise ValueError(f"{text!r} is not true or false")
-        return _BOOL[text.lower()]
-    if kind is int:
+    if kind not in _SCALARS:
+        raise ValueError(f"{text!r} can't be read as {_kind_name(kind)}")
+    return _SCALARS[kind](text)
+
+
+def _parse_bool(text: str) -> bool:
+    if text.lower() not in _BOOL:
+        raise ValueError(f"{text!r} is not true or false")
+    return _BOOL[text.lower()]
+
+
+def _parse_int(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a whole number") from None
+
+
+def _parse_float(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{text!r} is not a finite number")
+    return value
+
+
+_SCALARS: dict[Any, Callable[[str], Any]] = {
+    bool: _parse_bool, int: _parse_int, float: _parse_float, str: str, pathlib.Path: pathlib.Path,
+}  # fmt: skip
+"""Readers of values that are no union, literal or tuple."""
+
+
+def _parse_union(text: str, kind: Any, arguments: tuple[Any, ...]) -> Any:
+    if type(None) in arguments and text.lower() == "none":
+        return None
+    for choice in arguments:
         try:
-            return int(text)
+            if choice is not type(None):
+                return _parse(text, choice)
         except ValueError:
-            raise ValueError(f"{text!r} is not a whole number") from None
-    if kind is float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise ValueError(f"{text!r} is not a finite number")
-        return value
-    if kind is str:
-        return text
-    if kind is pathlib.Path:
-        return pathlib.Path(text)
-    raise ValueError(f"{text!r} can't be read as {_kind_name(kind)}")
+            continue
+    raise ValueError(f"{text!r} is not {_kind_name(kind)}")
 
 
 def _parse_tuple(text: str, kind: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
