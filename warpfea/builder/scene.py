@@ -273,7 +273,8 @@ def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
     file = pathlib.Path(path)
     if not file.is_file():
         raise ModelError(f"{file}: no such file")
-    folder, packages = file.resolve().parent, []
+    folder = file.resolve().parent
+    packages: list[str] = []
     while (folder / "__init__.py").is_file():
         packages.insert(0, folder.name)
         folder = folder.parent

@@ -20,7 +20,8 @@ from .report import MEASURES
 __all__ = ["StudyOptions", "check_positive", "names_moved"]
 
 SPLITS = ("best", "all", "none")
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, kw_only=True)
