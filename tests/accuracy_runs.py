@@ -1,5 +1,7 @@
 """A scene of a falling box, and studies of it."""
 
+import dataclasses
+
 import numpy as np
 import warp as wp
 
@@ -38,5 +40,10 @@ def falling(*, cells: int = 1, element: str = "T10", bad: bool = False, gravity:
 STEPS = [5e-3, 2.5e-3, 1.25e-3]
 
 
-def run(scene=falling, **options):
-    return wf.study(scene, **({"device": "cpu", "repeat": 1, "split": "none"} | options))
+FIELDS = {field.name for field in dataclasses.fields(wf.StudyOptions)}
+
+
+def run(scene=falling, **given):
+    given = {"device": "cpu", "repeat": 1, "split": "none"} | given
+    options = wf.StudyOptions(**{k: given.pop(k) for k in FIELDS & given.keys()})
+    return wf.study(scene, **given, options=options)

@@ -230,6 +230,6 @@ class Floor(Term):
         slip = np.linalg.norm((u - s.floor_anchor.numpy())[:, :, :2], axis=2) * s.floor_stuck.numpy()
         return {"floor_stored": 0.5 * (self.k * gap**2 + self.kt * slip**2).sum(axis=1)}
 
-    def sample(self, field, body, state):
+    def samples(self, field, body, state):
         first = body.slot_offset + body.node_slot
         return body.mesh.points[:, 2] + state.displacement.numpy()[:, first, 2].astype(float)

@@ -3,6 +3,7 @@
 import csv
 import itertools
 import math
+import pathlib
 import shlex
 
 import numpy as np
@@ -11,13 +12,14 @@ from accuracy_runs import STEPS, G, T, falling, run
 
 import warpfea as wf
 from warpfea.builder.reference import reference_of
+from warpfea.builder.scene import locate
 from warpfea.cli.parser import parse
 from warpfea.studies.accuracy import Row, Study
-from warpfea.studies.accuracy.problems import find_problem, problem_names
 from warpfea.studies.accuracy.report import with_orders
 from warpfea.studies.accuracy.settings import make_axes, product
 
 BOTH = ["backward_euler", "bdf2"]
+PROBLEMS = pathlib.Path(__file__).parent / "validation" / "problems"
 
 
 @pytest.fixture(scope="module")
@@ -244,9 +246,9 @@ def test_errors_of_rounding_have_no_order():
 # the problems
 
 
-@pytest.mark.parametrize("name", problem_names())
+@pytest.mark.parametrize("name", sorted(path.stem for path in PROBLEMS.glob("[!_]*.py")))
 def test_problems_are_described_and_their_motions_begin_where_the_probes_are(name):
-    scene = find_problem(name)
+    scene = locate(str(PROBLEMS / f"{name}.py"))
     assert scene.description.endswith(".")
     assert all(p.doc and not p.required for p in scene.parameters.values())
     assert scene.t_end / scene.dt == pytest.approx(round(scene.t_end / scene.dt), abs=1e-9)

@@ -241,6 +241,14 @@ def test_bad_options_are_named(options, named):
         run(**options)
 
 
+def test_a_moved_keyword_names_its_field():
+    with pytest.raises(wf.ModelError, match=r"^repeat is a field of StudyOptions: study\(..., options=wf\."):
+        wf.study(falling, repeat=3)
+    text = r"target, out are fields of StudyOptions: .*wf.StudyOptions\(target=0\.1, out='d'\)\)$"
+    with pytest.raises(wf.ModelError, match=text):
+        wf.study(falling, target=0.1, out="d")
+
+
 def test_a_scene_without_a_probe_is_refused():
     def empty():
         b = wf.ModelBuilder()

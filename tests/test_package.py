@@ -168,6 +168,60 @@ def test_kernels_are_short_and_say_what_they_do(path):
             assert node.end_lineno - node.lineno < 80, node.name
 
 
+COMPLEX = {
+    "elements/matrix.py:element_matrix": 21, "elements/matrix.py:element_rows": 22,
+    "solvers/levels_build.py:invert_tiles": 23, "solvers/newton.py:judge_floor": 24,
+    "solvers/searching.py:judge_trial": 47, "terms/pair_seek.py:offer": 22, "terms/pair_seek.py:seek": 32,
+    "terms/pairs.py:forces": 23,
+}  # fmt: skip
+"""Device code with more than 20 decisions. Only to be shortened."""
+LONG_CALLS = {
+    "solvers/vectors.py:floor_partial": 13, "terms/contact_touch.py:touch": 13, "terms/pair_blocks.py:add_masters": 13,
+    "terms/pair_seek.py:anchor": 14, "terms/pair_seek.py:sit": 18, "terms/pair_seek.py:admits": 13,
+    "terms/pair_seek.py:offer": 14, "terms/pair_seek.py:seek": 13,
+}  # fmt: skip
+"""Device code with more than 12 parameters. Only to be shortened."""
+MANY = {
+    "builder/builder.py:add_contact": 16, "simulation/simulation.py:__init__": 17,
+    "studies/accuracy/study.py:study": 13,
+}  # fmt: skip
+"""Functions of the host with more than 12 parameters, besides scenes; `study`: the scene, eleven keywords, options."""
+
+
+def functions(folder):
+    """Functions of a folder by "path:name"."""
+    for path in sorted(folder.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                yield f"{path.relative_to(folder).as_posix()}:{node.name}", node
+
+
+def decisions(node):
+    """1 + branches, loops and logical operations of a function, without nested definitions."""
+    count, todo = 1, list(ast.iter_child_nodes(node))
+    while todo:
+        one = todo.pop()
+        if not isinstance(one, (ast.FunctionDef, ast.ClassDef, ast.Lambda)):
+            count += isinstance(one, (ast.If, ast.For, ast.While, ast.IfExp))
+            count += len(one.values) - 1 if isinstance(one, ast.BoolOp) else 0
+            todo += ast.iter_child_nodes(one)
+    return count
+
+
+def parameters(node):
+    """Parameters of a function but self and cls."""
+    own = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    return len([a for a in own if a.arg not in ("self", "cls")])
+
+
+def test_functions_have_few_decisions_and_parameters():
+    """Decisions of the host's functions are ruff's C901."""
+    kernels = dict(functions(KERNELS))
+    assert {name: n for name, node in kernels.items() if (n := decisions(node)) > 20} == COMPLEX
+    assert {name: n for name, node in kernels.items() if (n := parameters(node)) > 12} == LONG_CALLS
+    assert {name: n for name, node in functions(ROOT / "warpfea") if (n := parameters(node)) > 12} == MANY
+
+
 def _of_folders(suffix):
     """Files of all folders of the project but its tests' data and results."""
     for folder in ("warpfea", "kernels", "scenes"):

@@ -124,9 +124,9 @@ def test_two_terms_keep_out_of_each_others_way():
 def test_a_sample_of_another_shape_is_refused():
     b = wf.ModelBuilder()
     box = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1000.0))
-    b.add_term(kind(sample=lambda self, name, body, state: np.zeros(3)))
+    b.add_term(kind(samples=lambda self, name, body, state: np.zeros(3)))
     sim = wf.Simulation(b.finalize(), dt=1e-3)
-    with pytest.raises(wf.ModelError, match=r"sample\('floor_gap'\) gave \(3,\)"):
+    with pytest.raises(wf.ModelError, match=r"samples\('floor_gap'\) gave \(3,\)"):
         sim.field("floor_gap", box)
 
 

@@ -160,7 +160,7 @@ def test_options_out_of_range_are_named(options, message):
 
 def test_an_unknown_preconditioner_lists_those_there_are():
     model = bar(300).finalize(device="cpu")
-    with pytest.raises(wf.ModelError, match="auto, two-level, banded, deflated, block-jacobi"):
+    with pytest.raises(wf.ModelError, match="auto, two-level, tiles, banded, deflated, block-jacobi"):
         wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(preconditioner="ilu"))
 
 

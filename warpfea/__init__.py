@@ -98,6 +98,7 @@ __all__ = [
     "StabilityWarning",
     "State",
     "StepReport",
+    "StudyOptions",
     "SurfaceSet",
     "TriMesh",
     "USDWriter",
@@ -112,12 +113,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """`study` when it is asked for: no scene, which imports this package, is to depend on the studies.
+    """`study` and its options, imported on use: no scene, which imports this package, is to depend on the studies.
 
     What type checkers see stands in `__init__.pyi`.
     """
-    if name == "study":
-        return _importlib.import_module(f"{__name__}.studies.accuracy").study
+    if name in ("study", "StudyOptions"):
+        return getattr(_importlib.import_module(f"{__name__}.studies.accuracy"), name)
     raise AttributeError(f"module 'warpfea' has no attribute {name!r}")
 
 

@@ -1,4 +1,4 @@
-"""Interface for type checkers: the names of `__init__.py`, and `study`, which is loaded when it is asked for."""
+"""Interface for type checkers: the names of `__init__.py`, and `study` with its options, which is imported on use."""
 # ruff: noqa: I001
 
 from . import mesh as mesh
@@ -48,4 +48,4 @@ from .simulation.observations import Observations as Observations
 from .simulation.simulation import Simulation as Simulation, StepReport as StepReport
 from .simulation.statics import solve_static as solve_static
 from .solvers import Jacobi as Jacobi, NewtonPCG as NewtonPCG
-from .studies.accuracy import study as study
+from .studies.accuracy import StudyOptions as StudyOptions, study as study

@@ -91,6 +91,40 @@ def _is_row(value: Any) -> bool:
         return False
 
 
+def _samples(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and values (n, *width) of a pair of both."""
+    try:
+        times, values = np.asarray(value[0], dtype=float), np.asarray(value[1], dtype=float)
+    except (TypeError, ValueError) as error:
+        text = f"{what} = {value!r}: times and values must be numbers, all values of one shape"
+        raise ModelError(text) from error
+    if values.shape != (len(times), *width):
+        raise ModelError(
+            f"{what}: values have shape {values.shape}, expected {(len(times), *width)} for {len(times)} times"
+        )
+    if len(times) < 1 or np.any(np.diff(times) <= 0.0):
+        raise ModelError(f"{what}: times must increase, got {times.tolist()}")
+    if len(times) == 1:
+        raise ModelError(f"{what}: a law over time needs at least two samples; give the value alone for a constant")
+    return times, values
+
+
+def _constant(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Time 0 (1,) and the value (1, *width)."""
+    try:
+        values = np.asarray(value, dtype=float)[None]
+    except (TypeError, ValueError) as error:
+        kinds = "number, vector, (times, values), wp.func or Control"
+        rows = value if isinstance(value, (tuple, list)) else []
+        pairs = len(rows) > 0 and all(isinstance(row, (tuple, list)) and len(row) == 2 for row in rows)
+        hint = "; write pairs as ([t for t, _ in pairs], [v for _, v in pairs])" if pairs else number_hint(value)
+        raise ModelError(f"{what} = {value!r} is not a {kinds}{hint}") from error
+    if values.shape != (1, *width):
+        hint = f"; write a vector such as (0, 0, {value!r})" if values.shape == (1,) else ""
+        raise ModelError(f"{what} has shape {values.shape[1:]}, expected {width or 'a number'}{hint}")
+    return np.zeros(1), values
+
+
 def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
     """The time law that a user has given.
 
@@ -116,34 +150,8 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
             f"{what}: {name} is a Python function, and no device runs it: sample it, (times, [f(t) for t in times]) "
             "with times = np.linspace(0, t_end, 201), or write a def with @wp.func above it"
         )
-    width = () if scalar else (3,)
-    if isinstance(value, (tuple, list)) and len(value) == 2 and _is_row(value[0]):
-        try:
-            times, values = np.asarray(value[0], dtype=float), np.asarray(value[1], dtype=float)
-        except (TypeError, ValueError) as error:
-            text = f"{what} = {value!r}: times and values must be numbers, all values of one shape"
-            raise ModelError(text) from error
-        if values.shape != (len(times), *width):
-            raise ModelError(
-                f"{what}: values have shape {values.shape}, expected {(len(times), *width)} for {len(times)} times"
-            )
-        if len(times) < 1 or np.any(np.diff(times) <= 0.0):
-            raise ModelError(f"{what}: times must increase, got {times.tolist()}")
-        if len(times) == 1:
-            raise ModelError(f"{what}: a law over time needs at least two samples; give the value alone for a constant")
-    else:
-        try:
-            values = np.asarray(value, dtype=float)[None]
-        except (TypeError, ValueError) as error:
-            kinds = "number, vector, (times, values), wp.func or Control"
-            rows = value if isinstance(value, (tuple, list)) else []
-            pairs = len(rows) > 0 and all(isinstance(row, (tuple, list)) and len(row) == 2 for row in rows)
-            hint = "; write pairs as ([t for t, _ in pairs], [v for _, v in pairs])" if pairs else number_hint(value)
-            raise ModelError(f"{what} = {value!r} is not a {kinds}{hint}") from error
-        times = np.zeros(1)
-        if values.shape != (1, *width):
-            hint = f"; write a vector such as (0, 0, {value!r})" if values.shape == (1,) else ""
-            raise ModelError(f"{what} has shape {values.shape[1:]}, expected {width or 'a number'}{hint}")
+    read = _samples if isinstance(value, (tuple, list)) and len(value) == 2 and _is_row(value[0]) else _constant
+    times, values = read(value, what, () if scalar else (3,))
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise ModelError(f"{what}: {value!r} holds a value that is not finite")
     return TimeLaw(times, _widen(values, scalar), None, scalar, name=what)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from warpfea.builder.scene import find
-from warpfea.studies.accuracy.study import study
+from warpfea.studies.accuracy import StudyOptions, study
 
 from .table import Row, Run, Table
 
@@ -39,7 +39,7 @@ def rows(run: Run) -> Iterator[Row]:
         steps = [dt / 2**k for k in range(2 if run.quick else HALVINGS)]
         found = study(
             find(name), over={"method": METHODS, "dt": steps}, parameters=values, t_end=end, device=run.device,
-            repeat=1, split="none", finer={"method": "bdf2"}, progress=False,
+            options=StudyOptions(repeat=1, split="none", finer={"method": "bdf2"}, progress=False),
         )  # fmt: skip
         own = found.references[0]
         _orders.extend(

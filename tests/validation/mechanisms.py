@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 import warpfea as wf
-from warpfea.studies.accuracy.problems.rigid_double_pendulum import INERTIA, LINKS, MASS, STEEL, double_pendulum_links
-from warpfea.studies.accuracy.rigid import STANDARD, double_pendulum_motion, double_pendulum_places
-from warpfea.studies.accuracy.rigid import slider_crank_kinematics as kinematics
 
+from .problems.rigid_double_pendulum import INERTIA, LINKS, MASS, STEEL, double_pendulum_links
+from .rigid import STANDARD, double_pendulum_motion, double_pendulum_places
+from .rigid import slider_crank_kinematics as kinematics
 from .table import Row, Run, Table
 
 __all__ = ["OUTER", "TABLE", "TIES", "double_pendulum", "fall_of_a_pair", "free_fall", "hanging_chain", "no_drift",

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from warpfea.studies.accuracy.problems import find_problem
-from warpfea.studies.accuracy.study import study
+from warpfea.studies.accuracy import StudyOptions, study
 
+from .problems.small_body import small_body
 from .table import Row, Run, Table
 
 __all__ = ["TABLE"]
@@ -28,8 +28,10 @@ def rows(run: Run) -> Iterator[Row]:
     over = {"dtype": ["float64", "float32"], "dt": steps}
     for family in FAMILIES:
         found = study(
-            find_problem("small_body"), over=over, parameters={"family": family}, t_end=END, device=run.device,
-            repeat=1, split="none", finer={"method": "energy_momentum", "dt": steps[-1] / 2.0}, progress=False,
+            small_body, over=over, parameters={"family": family}, t_end=END, device=run.device,
+            options=StudyOptions(
+                repeat=1, split="none", finer={"method": "energy_momentum", "dt": steps[-1] / 2.0}, progress=False
+            ),
         )  # fmt: skip
         by = {(r.setting.dtype, r.setting.dt): r for r in found}
         least = min((by["float32", dt].error or float("inf") for dt in steps), default=None)

@@ -29,7 +29,10 @@ __all__ = ["GROUND", "JOINTS", "Ground", "make_constraint", "make_joint", "pin_r
 JOINTS = ("spherical", "universal", "revolute", "cylindrical", "translational", "fixed", "distance")
 NEEDS_AXIS = ("universal", "revolute", "cylindrical", "translational")
 DRIVEN = ("revolute", "translational", "distance")
+PINNED = ("spherical", "universal", "revolute", "fixed")
 CONSTRAINTS = {"DP1": 4, "DP2": 4, "DIST": 2, "PIN": 2}
+Angle = tuple[Vector, Vector, Vector]
+"""Vectors (a, a2, b), see `_angle`."""
 
 
 def make_joint(
@@ -37,13 +40,7 @@ def make_joint(
 ) -> Joint:  # fmt: skip
     """Compose a joint. Raises ModelError naming the joint and what is wrong."""
     what = f"joint {name!r}"
-    if kind not in JOINTS:
-        raise ModelError(f"{what}: kind {kind!r} is unknown; there are {', '.join(JOINTS)}{did_you_mean(kind, JOINTS)}")
-    P, Q = attach(parent, f"{what}: parent", child=False), attach(child, f"{what}: child", child=True)
-    if P.body is None and Q.body is None:
-        raise ModelError(f"{what}: neither parent nor child is a body")
-    if P.same_as(Q):
-        raise ModelError(f"{what}: parent and child are the same place, {P.label}")
+    P, Q = _sides(what, kind, parent, child)
     if axis2 is not None and kind != "universal":
         raise ModelError(f"{what}: only universal joints have an axis2")
     law = None
@@ -61,42 +58,73 @@ def make_joint(
     n = None if axis is None else _unit(axis, f"{what}: axis")
     x_p, x_c = P.position(at, what), Q.position(at, what)
     gap = Vector(np.zeros(3), (x_c - x_p).parts)
-    rows: list[Row] = []
+    rows = pin_rows(gap) if kind in PINNED else []
     angle = travel = None
-    if kind in ("spherical", "universal", "revolute", "fixed"):
-        rows += pin_rows(gap)
-    if kind == "universal":
-        assert n is not None
-        m = _perpendicular(n) if axis2 is None else _unit(axis2, f"{what}: axis2")
-        if abs(n @ m) > 1e-6:
-            raise ModelError(f"{what}: axis2 = {axis2!r} must be perpendicular to the axis")
-        m = _orthogonal(m, n)
-        rows.append(_dp(P.direction(n, what), Q.direction(m, what)))
-    elif kind == "fixed":
+    if kind == "fixed":
         rows += _locked(P, Q, what)
-    elif kind in ("revolute", "cylindrical", "translational"):
+    elif kind == "universal":
         assert n is not None
-        u, w = _pair(n, P, Q)
-        if P.weakness(n) + Q.weakness(u) + Q.weakness(w) <= Q.weakness(n) + P.weakness(u) + P.weakness(w):
-            rows += [_dp(P.direction(n, what), Q.direction(d, what)) for d in (u, w)]
-        else:
-            rows += [_dp(P.direction(d, what), Q.direction(n, what)) for d in (u, w)]
-        if kind != "revolute":
-            rows += [Row(DOT, gap, P.direction(d, what)) for d in (u, w)]
-            travel = (gap, P.direction(n, what))
-        if kind == "translational":
-            a, b = min(((u, w), (w, u)), key=lambda d: P.weakness(d[0]) + Q.weakness(d[1]))
-            rows.append(_dp(P.direction(a, what), Q.direction(b, what)))
-        else:
-            angle = _angle(n, u, w, P, Q, what)
-    if law is not None and kind == "revolute":
-        if angle is None:
-            raise ModelError(f"{what}: {P.label} and {Q.label} do not tell the angle about the axis; give more nodes")
-        first, second, turned = angle
-        rows.append(Row(TURN, first, turned, 1.0, second, law, angular=True))
-    elif law is not None and travel is not None:
-        rows.append(Row(DOT, *travel, law=law))
+        rows.append(_cross(n, axis2, P, Q, what))
+    elif n is not None:
+        more, angle, travel = _guide(kind, n, gap, P, Q, what)
+        rows += more
+    if law is not None:
+        rows.append(_driven(kind, angle, travel, law, P, Q, what))
     return Joint(name, kind, rows, x_c, _between(P, Q), angle, travel)
+
+
+def _sides(what: str, kind: str, parent: Any, child: Any) -> tuple[Attachment, Attachment]:
+    """Parent and child of a joint. ModelError for an unknown kind, without a body, and for one place twice."""
+    if kind not in JOINTS:
+        raise ModelError(f"{what}: kind {kind!r} is unknown; there are {', '.join(JOINTS)}{did_you_mean(kind, JOINTS)}")
+    P, Q = attach(parent, f"{what}: parent", child=False), attach(child, f"{what}: child", child=True)
+    if P.body is None and Q.body is None:
+        raise ModelError(f"{what}: neither parent nor child is a body")
+    if P.same_as(Q):
+        raise ModelError(f"{what}: parent and child are the same place, {P.label}")
+    return P, Q
+
+
+def _cross(n: np.ndarray, axis2: Any, P: Attachment, Q: Attachment, what: str) -> Row:
+    """Perpendicular axes of a universal joint, n on the parent and axis2 on the child."""
+    m = _perpendicular(n) if axis2 is None else _unit(axis2, f"{what}: axis2")
+    if abs(n @ m) > 1e-6:
+        raise ModelError(f"{what}: axis2 = {axis2!r} must be perpendicular to the axis")
+    m = _orthogonal(m, n)
+    return _dp(P.direction(n, what), Q.direction(m, what))
+
+
+def _guide(
+    kind: str, n: np.ndarray, gap: Vector, P: Attachment, Q: Attachment, what: str
+) -> tuple[list[Row], Angle | None, tuple[Vector, Vector] | None]:
+    """Rows of a revolute, cylindrical or translational joint besides its pin, its angle and its travel."""
+    u, w = _pair(n, P, Q)
+    if P.weakness(n) + Q.weakness(u) + Q.weakness(w) <= Q.weakness(n) + P.weakness(u) + P.weakness(w):
+        rows = [_dp(P.direction(n, what), Q.direction(d, what)) for d in (u, w)]
+    else:
+        rows = [_dp(P.direction(d, what), Q.direction(n, what)) for d in (u, w)]
+    travel = None
+    if kind != "revolute":
+        rows += [Row(DOT, gap, P.direction(d, what)) for d in (u, w)]
+        travel = (gap, P.direction(n, what))
+    if kind != "translational":
+        return rows, _angle(n, u, w, P, Q, what), travel
+    a, b = min(((u, w), (w, u)), key=lambda d: P.weakness(d[0]) + Q.weakness(d[1]))
+    return [*rows, _dp(P.direction(a, what), Q.direction(b, what))], None, travel
+
+
+def _driven(
+    kind: str, angle: Angle | None, travel: tuple[Vector, Vector] | None, law: TimeLaw, P: Attachment, Q: Attachment,
+    what: str,
+) -> Row:  # fmt: skip
+    """Row of the prescribed angle of a revolute joint, or of the travel of a translational one."""
+    if kind != "revolute":
+        assert travel is not None
+        return Row(DOT, *travel, law=law)
+    if angle is None:
+        raise ModelError(f"{what}: {P.label} and {Q.label} do not tell the angle about the axis; give more nodes")
+    first, second, turned = angle
+    return Row(TURN, first, turned, 1.0, second, law, angular=True)
 
 
 def _between(P: Attachment, Q: Attachment) -> str:
@@ -160,9 +188,7 @@ def _pair(n: np.ndarray, P: Attachment, Q: Attachment) -> tuple[np.ndarray, np.n
     return u, np.cross(n, u)
 
 
-def _angle(
-    n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attachment, what: str
-) -> tuple[Vector, Vector, Vector] | None:
+def _angle(n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attachment, what: str) -> Angle | None:
     """Vectors (a, a2, b): the child has turned about n by the angle of b from a towards a2; None: not known."""
     options: list[Any] = []
     for first, second in ((u, w), (w, -u)):
@@ -247,6 +273,26 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
         ModelError: an unknown kind, a wrong number of points, or points that coincide where a direction is needed.
     """
     what = f"constraint {name!r} ({kind})"
+    places = _places(what, kind, points)
+    size = max(p.size for p in places)
+    x = [p.position(p.X, what) for p in places]
+    between = ", ".join(p.label for p in places)
+    if kind == "PIN":
+        return Joint(name, kind, _pin(what, x[0] - x[1], value, size), x[1], between)
+    law = None if value is None else time_law(value, f"{what}: value", scalar=True)
+    if kind == "DIST":
+        return Joint(name, kind, [_dist(what, x[0], x[1], law, size)], x[1], between)
+    a, b = x[1] - x[0], x[3] - x[2]
+    if kind == "DP2" and places[2].body is not places[0].body:
+        raise ModelError(f"{what}: its third point must be on the body of the first two; use DP1")
+    for label, v in (("P and Q", a), ("R and T", b)):
+        if np.linalg.norm(v.value) <= COINCIDENT * size:
+            raise ModelError(f"{what}: its points {label} coincide, so that it has no direction")
+    return Joint(name, kind, [Row(DOT, a, b, _scale(a, b), angular=True, **_right_side(law))], x[3], between)
+
+
+def _places(what: str, kind: str, points: Any) -> list[Attachment]:
+    """The points of a single constraint. ModelError for an unknown kind, another number, and where none is a body's."""
     if kind not in CONSTRAINTS:
         raise ModelError(
             f"{what}: the kind is unknown; there are {', '.join(CONSTRAINTS)}{did_you_mean(kind, CONSTRAINTS)}"
@@ -262,29 +308,18 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
     first, last = places[0], places[-1]
     if count == 4 and places[2].body is last.body is not first.body:
         places[2] = replace(places[2], child=True)  # DP1 acts on the last point's body with a couple
-    size = max(p.size for p in places)
     if all(p.body is None for p in places):
         raise ModelError(f"{what}: none of its points belongs to a body")
-    x = [p.position(p.X, what) for p in places]
-    between = ", ".join(p.label for p in places)
-    if kind == "PIN":
-        law = None if value is None else time_law(value, f"{what}: value")
-        gap = x[0] - x[1]
-        apart = float(np.linalg.norm(gap.value))
-        if law is None:
-            if apart > COINCIDENT * size:
-                raise ModelError(
-                    f"{what}: its points are {apart:.6g} m apart in the reference; value=(x, y, z) prescribes P - Q"
-                )
-            gap = Vector(np.zeros(3), gap.parts)
-        return Joint(name, kind, pin_rows(gap, law), x[1], between)
-    law = None if value is None else time_law(value, f"{what}: value", scalar=True)
-    if kind == "DIST":
-        return Joint(name, kind, [_dist(what, x[0], x[1], law, size)], x[1], between)
-    a, b = x[1] - x[0], x[3] - x[2]
-    if kind == "DP2" and places[2].body is not places[0].body:
-        raise ModelError(f"{what}: its third point must be on the body of the first two; use DP1")
-    for label, v in (("P and Q", a), ("R and T", b)):
-        if np.linalg.norm(v.value) <= COINCIDENT * size:
-            raise ModelError(f"{what}: its points {label} coincide, so that it has no direction")
-    return Joint(name, kind, [Row(DOT, a, b, _scale(a, b), angular=True, **_right_side(law))], x[3], between)
+    return places
+
+
+def _pin(what: str, gap: Vector, value: Any, size: float) -> list[Row]:
+    """Rows of P - Q = value, or of points that coincide. ModelError for such that are apart without a value."""
+    if value is not None:
+        return pin_rows(gap, time_law(value, f"{what}: value"))
+    apart = float(np.linalg.norm(gap.value))
+    if apart > COINCIDENT * size:
+        raise ModelError(
+            f"{what}: its points are {apart:.6g} m apart in the reference; value=(x, y, z) prescribes P - Q"
+        )
+    return pin_rows(Vector(np.zeros(3), gap.parts))

@@ -265,27 +265,34 @@ _loaded = itertools.count()
 def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
     """Run a Python file and return its scenes by name; of those, imported ones only if it defines none itself.
 
+    A file of a package (a folder with __init__.py) may use relative imports, another one import what lies beside it.
+
     Raises:
         ModelError: no such file, an error in it (with its line), or no scene in it.
     """
     file = pathlib.Path(path)
     if not file.is_file():
         raise ModelError(f"{file}: no such file")
+    folder = file.resolve().parent
+    packages: list[str] = []
+    while (folder / "__init__.py").is_file():
+        packages.insert(0, folder.name)
+        folder = folder.parent
     name = f"_warpfea_scenes_{next(_loaded)}_{re.sub(r'[^0-9a-zA-Z_]', '_', file.stem)}"
+    name = ".".join([*packages, name])
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
         raise ModelError(f"{file}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    folder = str(file.resolve().parent)
-    sys.path.insert(0, folder)
+    sys.path.insert(0, str(folder))
     try:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
         raise ModelError(f"{_place(error, file)}: {type(error).__name__}: {error}") from error
     finally:
-        sys.path.remove(folder)
+        sys.path.remove(str(folder))
     every = {item.name: item for item in vars(module).values() if isinstance(item, Scene)}
     own = {key: item for key, item in every.items() if item.function.__module__ == name}
     if not every:
@@ -360,15 +367,7 @@ def _kind_name(kind: Any) -> str:
 def _parse(text: str, kind: Any) -> Any:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        if type(None) in arguments and text.lower() == "none":
-            return None
-        for choice in arguments:
-            try:
-                if choice is not type(None):
-                    return _parse(text, choice)
-            except ValueError:
-                continue
-        raise ValueError(f"{text!r} is not {_kind_name(kind)}")
+        return _parse_union(text, kind, arguments)
     if origin is typing.Literal:
         for value in arguments:
             if text == str(value):
@@ -376,28 +375,50 @@ def _parse(text: str, kind: Any) -> Any:
         raise ValueError(f"{text!r} is not {_kind_name(kind)}")
     if origin is tuple or kind is tuple:
         return _parse_tuple(text, kind, arguments or (float, Ellipsis))
-    if kind is bool:
-        if text.lower() not in _BOOL:
-            raise ValueError(f"{text!r} is not true or false")
-        return _BOOL[text.lower()]
-    if kind is int:
+    if kind not in _SCALARS:
+        raise ValueError(f"{text!r} can't be read as {_kind_name(kind)}")
+    return _SCALARS[kind](text)
+
+
+def _parse_bool(text: str) -> bool:
+    if text.lower() not in _BOOL:
+        raise ValueError(f"{text!r} is not true or false")
+    return _BOOL[text.lower()]
+
+
+def _parse_int(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a whole number") from None
+
+
+def _parse_float(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{text!r} is not a finite number")
+    return value
+
+
+_SCALARS: dict[Any, Callable[[str], Any]] = {
+    bool: _parse_bool, int: _parse_int, float: _parse_float, str: str, pathlib.Path: pathlib.Path,
+}  # fmt: skip
+"""Readers of values that are no union, literal or tuple."""
+
+
+def _parse_union(text: str, kind: Any, arguments: tuple[Any, ...]) -> Any:
+    if type(None) in arguments and text.lower() == "none":
+        return None
+    for choice in arguments:
         try:
-            return int(text)
+            if choice is not type(None):
+                return _parse(text, choice)
         except ValueError:
-            raise ValueError(f"{text!r} is not a whole number") from None
-    if kind is float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise ValueError(f"{text!r} is not a finite number")
-        return value
-    if kind is str:
-        return text
-    if kind is pathlib.Path:
-        return pathlib.Path(text)
-    raise ValueError(f"{text!r} can't be read as {_kind_name(kind)}")
+            continue
+    raise ValueError(f"{text!r} is not {_kind_name(kind)}")
 
 
 def _parse_tuple(text: str, kind: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:

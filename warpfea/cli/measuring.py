@@ -215,11 +215,10 @@ def with_scene(words: Sequence[str]) -> list[str]:
         UsageError: NAME is neither a study, a scene nor a file; in words of our own.
     """
     from ..builder.scene import names
-    from ..studies.accuracy.problems import problem_names
 
     if len(words) < 2 or words[0] != "study" or words[1].startswith("-") or words[1] in (*STUDIES, SCENE):
         return list(words)
-    scenes = [*names(), *problem_names()]
+    scenes = names()
     if not pathlib.Path(words[1]).suffix and words[1] not in scenes:
         raise UsageError(
             f"study {words[1]!r} is neither a study ({', '.join(STUDIES)}) nor a scene ({', '.join(scenes)}) nor a "

@@ -15,7 +15,6 @@ from ..model.model import Model
 from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
-from ..studies.accuracy.problems import find_problem, problem_names
 from .arguments import existing
 from .part import OPTIONS, part_scene
 
@@ -101,9 +100,7 @@ def load(file: str) -> dict[str, Scene[Any]]:
 
 
 def find_scene(what: str) -> Scene[Any]:
-    """The scene NAME, of studies too, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
-    if what in problem_names():
-        return find_problem(what)
+    """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
     file, _ = split_name(what)
     if file is None:
         _check_suffix(what)

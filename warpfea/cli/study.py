@@ -6,12 +6,16 @@ import argparse
 import contextlib
 import importlib
 
+from ..studies.accuracy.options import StudyOptions
 from ..studies.accuracy.settings import parse_over
 from ..studies.accuracy.study import study as measure
 from . import DONE, NOT_CONVERGED
 from .source import find_scene, progress
 
 __all__ = ["accuracy", "study"]
+
+SAME = ("reference", "mesh", "measure", "target", "split", "repeat", "limit", "out", "name", "what", "words")
+"""Fields of StudyOptions that are options of the command line."""
 
 
 def study(options: argparse.Namespace) -> int:
@@ -42,19 +46,7 @@ def accuracy(options: argparse.Namespace) -> int:
         dtype=options.dtype,
         device=options.device,
         probes=options.probe,
-        reference=options.reference,
-        finer=finer,
-        mesh=options.mesh,
-        measure=options.measure,
-        target=options.target,
-        split=options.split,
-        repeat=options.repeat,
-        limit=options.limit,
-        out=options.out,
-        name=options.name,
-        progress=progress(options),
-        what=options.what,
-        words=options.words,
+        options=StudyOptions(finer=finer, progress=progress(options), **{k: getattr(options, k) for k in SAME}),
     )
     if not options.quiet:
         print(result.table(), flush=True)

@@ -28,6 +28,8 @@ _LINES = {2: "line", 3: "line3"}
 _REFUSED = {"INCLUDE", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"}
 
 Block = tuple[str, dict[str, str], list[str]]
+Members = dict[str, list[Ints]]
+"""Sets by name, as ids of nodes or elements."""
 
 
 def read_inp(file: Path) -> RawMesh:
@@ -61,12 +63,31 @@ def read_inp(file: Path) -> RawMesh:
     node_ids = _Ids(nodes[:, 0].astype(np.int64), "node")
 
     raw = RawMesh(nodes[:, 1:], [])
-    members: dict[str, list[Ints]] = {}  # element sets, as element ids
-    node_members: dict[str, list[Ints]] = {}
+    node_members: Members = {}
     for block, rows in node_rows:
         if "NSET" in block[1]:
             node_members.setdefault(block[1]["NSET"], []).append(rows[:, 0].astype(np.int64))
+    element_ids, members = _read_elements(raw, blocks, node_ids)
+    ids = _Ids(np.concatenate(element_ids) if element_ids else np.empty(0, dtype=np.int64), "element")
+    starts = np.cumsum([0] + [len(e) for e in element_ids])
+
+    for keyword, sets, option in (("NSET", node_members, "NSET"), ("ELSET", members, "ELSET")):
+        for name, options, lines in ((b[1].get(option, ""), b[1], b[2]) for b in blocks if b[0] == keyword):
+            sets.setdefault(name, []).extend(_set_lines(lines, options, sets, f"*{keyword}, {name}"))
+    raw.node_groups = {k: node_ids.index(np.concatenate(v), f"node set {k!r}") for k, v in node_members.items() if v}
+    for name, parts in members.items():
+        where = ids.index(np.concatenate(parts), f"element set {name!r}") if parts else np.empty(0, dtype=np.int64)
+        owner = np.searchsorted(starts, where, side="right") - 1
+        for k in np.unique(owner):
+            raw.groups.append((name, int(k), where[owner == k] - starts[k]))
+    _read_surfaces(raw, blocks, members, ids, starts)
+    return raw
+
+
+def _read_elements(raw: RawMesh, blocks: list[Block], node_ids: _Ids) -> tuple[list[Ints], Members]:
+    """Add the *ELEMENT blocks to the mesh; ids of the elements of each, and the sets that they name."""
     element_ids: list[Ints] = []
+    members: Members = {}
     for keyword, options, lines in blocks:
         if keyword != "ELEMENT":
             continue
@@ -84,19 +105,11 @@ def read_inp(file: Path) -> RawMesh:
         element_ids.append(rows[:, 0])
         if "ELSET" in options:
             members.setdefault(options["ELSET"], []).append(rows[:, 0])
-    ids = _Ids(np.concatenate(element_ids) if element_ids else np.empty(0, dtype=np.int64), "element")
-    starts = np.cumsum([0] + [len(e) for e in element_ids])
+    return element_ids, members
 
-    for keyword, sets, option in (("NSET", node_members, "NSET"), ("ELSET", members, "ELSET")):
-        for name, options, lines in ((b[1].get(option, ""), b[1], b[2]) for b in blocks if b[0] == keyword):
-            sets.setdefault(name, []).extend(_set_lines(lines, options, sets, f"*{keyword}, {name}"))
-    raw.node_groups = {k: node_ids.index(np.concatenate(v), f"node set {k!r}") for k, v in node_members.items() if v}
-    for name, parts in members.items():
-        where = ids.index(np.concatenate(parts), f"element set {name!r}") if parts else np.empty(0, dtype=np.int64)
-        owner = np.searchsorted(starts, where, side="right") - 1
-        for k in np.unique(owner):
-            raw.groups.append((name, int(k), where[owner == k] - starts[k]))
 
+def _read_surfaces(raw: RawMesh, blocks: list[Block], members: Members, ids: _Ids, starts: Ints) -> None:
+    """Add the *SURFACE blocks of type ELEMENT to the mesh; `starts`: first element of each of its blocks."""
     labels = _face_labels([kind for kind, _ in raw.blocks])
     for keyword, options, lines in blocks:
         if keyword != "SURFACE" or options.get("TYPE", "ELEMENT").upper() != "ELEMENT":
@@ -118,7 +131,6 @@ def read_inp(file: Path) -> RawMesh:
         raw.faces[options.get("NAME", "surface")] = (
             np.concatenate(rows_of) if rows_of else np.empty((0, 3), dtype=np.int64)
         )
-    return raw
 
 
 def _blocks(text: str) -> Iterator[Block]:

@@ -204,19 +204,7 @@ def _read_gmsh(file: Path) -> RawMesh:
         (int(d), abs(int(t))): name.decode(errors="replace")
         for d, t, name in re.findall(rb'^\s*(\d)\s+(-?\d+)\s+"(.*)"', names, re.MULTILINE)
     }
-    from meshio.gmsh import _gmsh22, _gmsh41
-
-    with open(file, "rb") as stream:
-        stream.seek(start)
-        try:
-            mesh = (_gmsh41 if new else _gmsh22).read_buffer(stream, is_ascii, size)
-        except IndexError as error:
-            number = re.search(r"index (\d+) is out of bounds for axis 0 with size", str(error))
-            if number is None:
-                raise
-            raise MeshError(f"an element refers to node {int(number[1]) + 1}, which $Nodes does not define") from None
-        except KeyError as error:
-            raise MeshError(f"unknown Gmsh element type {error}") from None
+    mesh = _gmsh_body(file, start, new, is_ascii, size)
     physical = mesh.cell_data.get("gmsh:physical")
     entity = mesh.cell_data.get("gmsh:geometrical")
     tags_of = _entity_groups(entities, is_ascii, size) if new and entities else {}
@@ -235,6 +223,23 @@ def _read_gmsh(file: Path) -> RawMesh:
         for tag, numbers in of_group.items():
             raw.groups.append((named.get((dim, tag), f"physical_{dim}_{tag}"), k, numbers))
     return raw
+
+
+def _gmsh_body(file: Path, start: int, new: bool, is_ascii: bool, size: int) -> Any:
+    """meshio's mesh of a Gmsh file of format 4.1, or 2.2 unless `new`, read from the byte `start` on."""
+    from meshio.gmsh import _gmsh22, _gmsh41
+
+    with open(file, "rb") as stream:
+        stream.seek(start)
+        try:
+            return (_gmsh41 if new else _gmsh22).read_buffer(stream, is_ascii, size)
+        except IndexError as error:
+            number = re.search(r"index (\d+) is out of bounds for axis 0 with size", str(error))
+            if number is None:
+                raise
+            raise MeshError(f"an element refers to node {int(number[1]) + 1}, which $Nodes does not define") from None
+        except KeyError as error:
+            raise MeshError(f"unknown Gmsh element type {error}") from None
 
 
 def _section(data: bytes, name: bytes) -> bytes:

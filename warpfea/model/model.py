@@ -279,7 +279,7 @@ class Model:
             ],
             "contacts": [fact for term in (self.terms.contact, self.terms.pairs) if term for fact in term.facts()],
             "features": [k for k, on in features.items() if on],
-            "left_out": [k for k, on in features.items() if not on] + list(self.terms.later),
+            "left_out": [k for k, on in features.items() if not on],
             "blocks": [
                 {
                     "element": b.key.family,

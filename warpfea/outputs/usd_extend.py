@@ -72,11 +72,7 @@ def read_earlier(
         if old != new:
             raise _refused(target, f"its {what} is {old!r}, of this run {new!r}")
     meshes = [[UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in worlds] for worlds in paths]
-    for body, worlds in zip(surface.bodies, meshes, strict=True):
-        for mesh in worlds:
-            faces = np.asarray(mesh.GetFaceVertexIndicesAttr().Get() if mesh else ()).reshape(-1)
-            if not np.array_equal(faces, np.asarray(body.skin.triangles).ravel()):
-                raise _refused(target, f"body {body.name!r} is not in it, or has another mesh")
+    _check_faces(target, surface, meshes)
     codes = list(map(float, meshes[0][0].GetPointsAttr().GetTimeSamples()))
     if not codes:
         raise _refused(target, "it has no frames")
@@ -91,15 +87,30 @@ def read_earlier(
     offsets = np.array([_offset(stage, meshes[0][world]) for world in range(surface.worlds)])
     box = _box(meshes, codes, offsets)
     if abs(time - now) <= slack:
-        size = float(np.linalg.norm(box[1] - box[0]))
-        for body, worlds in zip(surface.bodies, meshes, strict=True):
-            points = surface.points_of(sim, body)
-            for world, mesh in enumerate(worlds):
-                drawn = np.asarray(mesh.GetPointsAttr().Get(codes[-1]), dtype=float) + _center(mesh, codes[-1])
-                if np.abs(drawn - points[world]).max() > SAME * size:
-                    raise _refused(target, f"its last frame shows body {body.name!r} elsewhere than the checkpoint")
+        _check_frame(target, sim, surface, meshes, codes[-1], SAME * float(np.linalg.norm(box[1] - box[0])))
     ranges = {name: (float(field["range"][0]), float(field["range"][1])) for name, field in about["fields"].items()}
     return Earlier(codes, time, ranges, box, offsets, paths)
+
+
+def _check_faces(target: pathlib.Path, surface: Surface, meshes: list[list[Any]]) -> None:
+    """OutputError where the meshes of the stage are not those that are drawn."""
+    for body, worlds in zip(surface.bodies, meshes, strict=True):
+        for mesh in worlds:
+            faces = np.asarray(mesh.GetFaceVertexIndicesAttr().Get() if mesh else ()).reshape(-1)
+            if not np.array_equal(faces, np.asarray(body.skin.triangles).ravel()):
+                raise _refused(target, f"body {body.name!r} is not in it, or has another mesh")
+
+
+def _check_frame(
+    target: pathlib.Path, sim: Any, surface: Surface, meshes: list[list[Any]], code: float, bound: float
+) -> None:
+    """OutputError where a point of the frame at a time code is further than `bound`, m, from the simulation's."""
+    for body, worlds in zip(surface.bodies, meshes, strict=True):
+        points = surface.points_of(sim, body)
+        for world, mesh in enumerate(worlds):
+            drawn = np.asarray(mesh.GetPointsAttr().Get(code), dtype=float) + _center(mesh, code)
+            if np.abs(drawn - points[world]).max() > bound:
+                raise _refused(target, f"its last frame shows body {body.name!r} elsewhere than the checkpoint")
 
 
 def _refused(target: pathlib.Path, reason: str) -> OutputError:

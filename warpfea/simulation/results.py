@@ -113,8 +113,6 @@ class Results:
             return np.linalg.norm(moved, axis=2)
         if name != "von_mises":
             values = self.model.terms.samples(name, body, self.state)
-            if values is None:
-                values = np.repeat(self.field(name, body), body.family.node_samples.shape[1], axis=1)
             return np.stack([drawn.node_weights @ row for row in values])
         stress = self._stress(name, body)  # the tensor is interpolated: a bent section shows its neutral axis
         return von_mises(np.stack([drawn.node_weights @ row for row in stress]))
@@ -130,7 +128,7 @@ class Results:
         if name == "displacement":
             return np.linalg.norm(self.displacements(body), axis=2)
         if name != "von_mises":
-            return self.model.terms.sample(name, body, self.state)
+            return self.model.terms.at_nodes(name, body, self.state)
         samples = von_mises(self._stress(name, body))
         return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
 

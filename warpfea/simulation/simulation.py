@@ -142,7 +142,7 @@ class Simulation(Digests):
             return Stepper(
                 model, state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
-                adapt=adapt, quiet=quiet, ends=t_end is not None, growth=self.energy_growth,
+                adapt=adapt, loops={"quiet": quiet, "ends": t_end is not None}, growth=self.energy_growth,
                 on_compile=on_compile or bar,
             )  # fmt: skip
 

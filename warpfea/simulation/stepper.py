@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +42,8 @@ CANDIDATES = (0, 1, 2)
 class Stepper:
     """The launches of a step of all worlds, and the graph that replays them.
 
-    The host writes `work.step.dt` and reads `work.report`; everything between stays on the device.
+    The host writes `work.step.dt` and reads `work.report`; everything between stays on the device. `loops`: options of
+    Loops, quiet and ends.
     """
 
     def __init__(
@@ -56,8 +58,7 @@ class Stepper:
         constraint_tol: float = 0.0,
         inversion: str = "refuse",
         adapt: Adapt | None = None,
-        quiet: bool = False,
-        ends: bool = False,
+        loops: Mapping[str, bool] | None = None,
         growth: EnergyGrowth | None = None,
         on_compile: OnCompile | None = None,
     ) -> None:
@@ -119,7 +120,7 @@ class Stepper:
         self.growth = growth
         if growth:
             growth.bind(self.work.step, model, state)
-        self.loops = Loops(model, self.work, self.launch, quiet=quiet, ends=ends)
+        self.loops = Loops(model, self.work, self.launch, **(loops or {"quiet": False, "ends": False}))
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
         self.backup = state.like() if solver.max_halvings > 0 or self.adaptive else None

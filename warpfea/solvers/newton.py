@@ -61,11 +61,11 @@ class NewtonPCG:
             also within a solve. A refused attempt is not halved either once the step's iterations of Newton's method,
             each counted as 20 of those, with contact as 100, have reached it (not with dt="auto").
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
-            serves; in statics of short chains of beams factors of the whole), "banded" (Cholesky factors of the whole,
-            kept as well; on the CPU, for chains, strips and slender or small bodies), "deflated" (3x3 blocks of every
-            iterate, and the directions of constraints inverted), "block-jacobi" (the blocks alone), or "auto": on the
-            CPU "banded" where the band is narrow or the model small, else "deflated" for many small bodies on joints,
-            else "two-level".
+            serves; in statics of short chains of beams factors of the whole), "tiles" (those alone, without the
+            motions), "banded" (Cholesky factors of the whole, kept as well; on the CPU, for chains, strips and slender
+            or small bodies), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
+            "block-jacobi" (the blocks alone), or "auto": on the CPU "banded" where the band is narrow or the model
+            small, else "deflated" for many small bodies on joints, else "two-level".
         linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS where that is installed.
         preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
             model's. They are made in the model's precision; float32 halves what an application reads. Another precision
@@ -98,10 +98,23 @@ class NewtonPCG:
     max_outer: int = 100
 
     def __post_init__(self) -> None:
-        if self.tol is not None and not (is_number(self.tol) and 0.0 < self.tol < 1.0):
-            raise ModelError(f"NewtonPCG: tol = {self.tol!r} must lie between 0 and 1")
+        for name in ("tol", "forcing"):
+            value = getattr(self, name)
+            if value is not None and not (is_number(value) and 0.0 < value < 1.0):
+                raise ModelError(f"NewtonPCG: {name} = {value!r} must lie between 0 and 1")
         if not (is_number(self.force_tol) and self.force_tol >= 0.0):
             raise ModelError(f"NewtonPCG: force_tol = {self.force_tol!r} must be zero or positive, N")
+        if self.penalty is not None and not (is_number(self.penalty) and self.penalty > 0.0):
+            raise ModelError(f"NewtonPCG: penalty = {self.penalty!r} must be positive")
+        self._check_choices()
+        for name in ("max_newton", "max_pcg", "max_outer", "max_work"):
+            if not (is_count(getattr(self, name)) and getattr(self, name) >= 1):
+                raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be a whole number, at least 1")
+        if not (is_count(self.max_halvings) and 0 <= self.max_halvings <= 20):
+            raise ModelError(f"NewtonPCG: max_halvings = {self.max_halvings!r} must be a whole number from 0 to 20")
+
+    def _check_choices(self) -> None:
+        """ModelError for a name that is none of an option's, and for options that a direct solver does not have."""
         if self.linear not in ("pcg", "direct"):
             raise ModelError(f"NewtonPCG: linear = {self.linear!r} is neither 'pcg' nor 'direct'")
         idle = {"preconditioner": "auto", "preconditioner_dtype": None, "forcing": None}
@@ -109,27 +122,15 @@ class NewtonPCG:
             if getattr(self, name) != default:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} is not for linear = 'direct'")
         if self.preconditioner not in ("auto", *NAMES):
-            raise ModelError(
-                f"preconditioner {self.preconditioner!r} is unknown; there are auto, two-level, banded, deflated, "
-                "block-jacobi"
-            )
+            raise ModelError(f"preconditioner {self.preconditioner!r} is unknown; there are auto, {', '.join(NAMES)}")
         if self.preconditioner_dtype not in (None, "float32", "float64"):
             raise ModelError(
                 f"NewtonPCG: preconditioner_dtype = {self.preconditioner_dtype!r} is none of 'float32', 'float64', None"
             )
-        if self.forcing is not None and not (is_number(self.forcing) and 0.0 < self.forcing < 1.0):
-            raise ModelError(f"NewtonPCG: forcing = {self.forcing!r} must lie between 0 and 1")
         if self.operator not in ("auto", "elements", "matrix"):
             raise ModelError(f"NewtonPCG: operator = {self.operator!r} is none of 'auto', 'elements', 'matrix'")
-        for name in ("max_newton", "max_pcg", "max_outer", "max_work"):
-            if not (is_count(getattr(self, name)) and getattr(self, name) >= 1):
-                raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} must be a whole number, at least 1")
         if self.multipliers not in ("newton", "outer"):
             raise ModelError(f"NewtonPCG: multipliers = {self.multipliers!r} is neither 'newton' nor 'outer'")
-        if self.penalty is not None and not (is_number(self.penalty) and self.penalty > 0.0):
-            raise ModelError(f"NewtonPCG: penalty = {self.penalty!r} must be positive")
-        if not (is_count(self.max_halvings) and 0 <= self.max_halvings <= 20):
-            raise ModelError(f"NewtonPCG: max_halvings = {self.max_halvings!r} must be a whole number from 0 to 20")
 
     def most_newton(self, contact: bool) -> int:
         """Iterations of Newton's method in a step, with or without contact, that use up `max_work`."""

@@ -220,6 +220,25 @@ class ConstraintTables:
 
         Blocks sum w w' D^-1 over the slots; rows share vectors (a pin's three rows are of one), so blocks are few.
         """
+        weights, rows_of_vector, sides = self._vectors()
+        near, block_start, block_slot, block_weight = _shared_blocks(weights)
+        out: list[dict[int, list[tuple[tuple[int, int], int]]]] = []
+        for own in sides:
+            columns: dict[int, list[tuple[tuple[int, int], int]]] = {}
+            for side, u in own:
+                for v, block in near[u]:
+                    for other, other_side in rows_of_vector[v]:
+                        columns.setdefault(other, []).append(((side, other_side), block))
+            out.append(columns)
+        self.block_count = len(block_start) - 1
+        m = self.model
+        self.data.block_start = m.array("constraints", np.asarray(block_start), wp.int32)
+        self.data.block_slot = m.array("constraints", np.asarray(block_slot or [0]), wp.int32)
+        self.data.block_weight = m.array("constraints", np.asarray(block_weight or [0.0]), wp.float64)
+        return out
+
+    def _vectors(self) -> tuple[list[dict[int, float]], list[list[tuple[int, int]]], list[list[tuple[int, int]]]]:
+        """Weights of each vector by free slot; its (row, side); and of each row its (side, vector)."""
         free = np.any(self.model.free_host > 0.0, axis=1)
         number: dict[Vector, int] = {}
         weights: list[dict[int, float]] = []
@@ -242,39 +261,7 @@ class ConstraintTables:
                 own.append((side, number[vector]))
                 rows_of_vector[own[-1][1]].append((k, side))
             sides.append(own)
-        of_slot: dict[int, list[int]] = {}
-        for v, merged in enumerate(weights):
-            for s in merged:
-                of_slot.setdefault(s, []).append(v)
-        blocks: dict[tuple[int, int], int] = {}
-        near: list[list[tuple[int, int]]] = []
-        block_start, block_slot, block_weight = [0], [], []
-        for u, merged in enumerate(weights):
-            own_blocks = []
-            for v in sorted({v for s in merged for v in of_slot[s]}):
-                key = (min(u, v), max(u, v))
-                if key not in blocks:
-                    common = [(s, x * weights[v][s]) for s, x in merged.items() if s in weights[v]]
-                    blocks[key] = len(block_start) - 1
-                    block_slot += [s for s, _ in common]
-                    block_weight += [x for _, x in common]
-                    block_start.append(len(block_slot))
-                own_blocks.append((v, blocks[key]))
-            near.append(own_blocks)
-        out: list[dict[int, list[tuple[tuple[int, int], int]]]] = []
-        for own in sides:
-            columns: dict[int, list[tuple[tuple[int, int], int]]] = {}
-            for side, u in own:
-                for v, block in near[u]:
-                    for other, other_side in rows_of_vector[v]:
-                        columns.setdefault(other, []).append(((side, other_side), block))
-            out.append(columns)
-        self.block_count = len(block_start) - 1
-        m = self.model
-        self.data.block_start = m.array("constraints", np.asarray(block_start), wp.int32)
-        self.data.block_slot = m.array("constraints", np.asarray(block_slot or [0]), wp.int32)
-        self.data.block_weight = m.array("constraints", np.asarray(block_weight or [0.0]), wp.float64)
-        return out
+        return weights, rows_of_vector, sides
 
     def _colour_clusters(self, row: np.ndarray, column: np.ndarray) -> None:
         """Greedy colouring of coupled clusters; `colour_sizes` counts those of each colour."""
@@ -403,3 +390,29 @@ class ConstraintTables:
         data.term_b = array("matrix pattern", np.concatenate(term_b)[order], wp.int32)
         data.weight = array("matrix pattern", np.concatenate(weight)[order], wp.float64)
         return data, len(entry)
+
+
+def _shared_blocks(
+    weights: list[dict[int, float]],
+) -> tuple[list[list[tuple[int, int]]], list[int], list[int], list[float]]:
+    """For each vector those that it shares slots with and the block of both; start, slots and weights of the blocks."""
+    of_slot: dict[int, list[int]] = {}
+    for v, merged in enumerate(weights):
+        for s in merged:
+            of_slot.setdefault(s, []).append(v)
+    blocks: dict[tuple[int, int], int] = {}
+    near: list[list[tuple[int, int]]] = []
+    start, slots, products = [0], [], []
+    for u, merged in enumerate(weights):
+        own = []
+        for v in sorted({v for s in merged for v in of_slot[s]}):
+            key = (min(u, v), max(u, v))
+            if key not in blocks:
+                common = [(s, x * weights[v][s]) for s, x in merged.items() if s in weights[v]]
+                blocks[key] = len(start) - 1
+                slots += [s for s, _ in common]
+                products += [x for _, x in common]
+                start.append(len(slots))
+            own.append((v, blocks[key]))
+        near.append(own)
+    return near, start, slots, products

@@ -105,7 +105,7 @@ class FieldSpec:
     Attributes:
         title, units: of legends.
         join: what becomes of the samples of two terms that have this very field; None: it is one term's alone.
-        at_node: what becomes of the samples of a node, where terms override `samples` alone; None: they have `sample`.
+        at_node: value of a node from those of its samples; None: `samples` gives one value per node.
     """
 
     title: str
@@ -389,10 +389,7 @@ class Term:
         it checks, and the mask (worlds,) of the worlds to set; the others stay."""
         return {}
 
-    def sample(self, field: str, body: Any, state: State) -> np.ndarray:
-        """(worlds, nodes of the body's mesh) values of one of `fields` without `at_node`."""
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        """(worlds, nodes x samples of a node) values of one of `fields`, on sections and faces; of one without
+        `at_node` (worlds, nodes of the body's mesh)."""
         raise NotImplementedError
-
-    def samples(self, field: str, body: Any, state: State) -> np.ndarray | None:
-        """(worlds, nodes x samples of a node) values for drawing, on sections and faces; None: those of `sample`."""
-        return None

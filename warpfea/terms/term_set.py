@@ -40,8 +40,6 @@ __all__ = ["KINDS", "TermSet", "all_parts"]
 
 KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Pairs, Constraints)
 """The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
-LATER: tuple[str, ...] = ()
-"""Features of later versions, which `info` lists as left out."""
 STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end", "summed_time",
          "energy_growth")  # fmt: skip
@@ -107,11 +105,6 @@ class TermSet:
     def added(self) -> list[Term]:
         """Terms that do not come with warpfea."""
         return [term for term in self.all if type(term) not in KINDS]
-
-    @property
-    def later(self) -> tuple[str, ...]:
-        """Features of later versions."""
-        return LATER
 
     def __iter__(self) -> Iterator[Term]:
         return iter(self.all)
@@ -223,25 +216,28 @@ class TermSet:
         """Fields that users may ask for beside those of the elements."""
         return {name: spec for term in self.all for name, spec in term.fields.items()}
 
-    def samples(self, name: str, body: Any, state: State) -> np.ndarray | None:
-        """(worlds, nodes x samples) values of a field; None of a term that has values of nodes alone."""
-        owners = [term for term in self.all if name in term.fields]
-        found = [term.samples(name, body, state) for term in owners]
-        join = self.fields[name].join
-        return functools.reduce(join, found) if join else found[0]  # type: ignore[arg-type]
+    def samples(self, name: str, body: Any, state: State) -> np.ndarray:
+        """(worlds, nodes x samples) values of a field, at every sample those of its node where a term has no others.
 
-    def sample(self, name: str, body: Any, state: State) -> np.ndarray:
-        """(worlds, nodes) values of a field. ModelError where a term gives another shape."""
-        spec, shape = self.fields[name], (self.model.worlds, len(body.mesh.points))
-        if spec.at_node:
-            values = self.samples(name, body, state)
-            assert values is not None
-            return np.asarray(spec.at_node.reduce(values.reshape(*shape, -1), axis=2))
-        term = next(term for term in self.all if name in term.fields)
-        out = np.asarray(term.sample(name, body, state))
-        if out.shape != shape:
-            raise ModelError(f"term {term.name!r}: sample({name!r}) gave {out.shape}; expected {shape}")
-        return out
+        Raises:
+            ModelError: a term gives another shape.
+        """
+        spec, count = self.fields[name], body.family.node_samples.shape[1]
+        found = []
+        for term in (term for term in self.all if name in term.fields):
+            values = np.asarray(term.samples(name, body, state))
+            expected = (self.model.worlds, len(body.mesh.points) * (count if spec.at_node else 1))
+            if values.shape != expected:
+                raise ModelError(f"term {term.name!r}: samples({name!r}) gave {values.shape}; expected {expected}")
+            found.append(values if spec.at_node else np.repeat(values, count, axis=1))
+        return functools.reduce(spec.join, found) if spec.join else found[0]
+
+    def at_nodes(self, name: str, body: Any, state: State) -> np.ndarray:
+        """(worlds, nodes) values of a field."""
+        values = self.samples(name, body, state)
+        values = values.reshape(len(values), len(body.mesh.points), -1)
+        reduce = self.fields[name].at_node
+        return np.asarray(reduce.reduce(values, axis=2) if reduce else values[:, :, 0])
 
     # what users set and ask for
 

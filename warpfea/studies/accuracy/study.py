@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 import pathlib
-import re
 import statistics
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ...base.checks import is_number
 from ...base.console import quiet_warp
 from ...base.devices import find_device
 from ...base.errors import ModelError
@@ -21,25 +19,25 @@ from ...builder.reference import Reference, read_reference, reference_of
 from ...builder.scene import Scene, locate
 from ...builder.scene import scene as as_scene
 from ..files import prepare
-from .finer import check_finer, finer_motion, finer_setting
+from .finer import finer_motion, finer_setting
 from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once
 from .motion import RESOLVED, ROUNDING, Motion, distances, known_motion
-from .problems import find_problem, problem_names
-from .report import MEASURES, Row, Study, with_orders, with_pareto
+from .options import StudyOptions, check_positive, names_moved
+from .report import Row, Study, with_orders, with_pareto
 from .settings import OPTIONS, Axes, Setting, make_axes, method_text, product
 from .split import split as parts_of_error
 from .store import Store, code_version
 
 __all__ = ["study"]
 
-SPLITS = ("best", "all", "none")
 CHECKED = (0.9, 1.1)
 """Times the step of the answer, with which it is run again."""
 RUN = "run"
 """As `reference`: a finer run, also where the scene knows its motion."""
 
 
+@names_moved
 def study(
     scene: Scene[Any] | Callable[..., ModelBuilder] | str,
     *,
@@ -54,19 +52,7 @@ def study(
     dtype: str = "float64",
     device: str | None = None,
     probes: Sequence[str] | None = None,
-    reference: Reference | Mapping[str, Any] | str | pathlib.Path | None = None,
-    finer: Mapping[str, Any] | None = None,
-    mesh: Sequence[str] | None = None,
-    measure: str = "l2",
-    target: float | None = None,
-    split: str = "best",
-    repeat: int = 3,
-    limit: float | None = None,
-    out: str | pathlib.Path | None = None,
-    name: str | None = None,
-    progress: bool | None = None,
-    what: str | None = None,
-    words: Sequence[str] | None = None,
+    options: StudyOptions | None = None,
 ) -> Study:
     """Run a scene with every combination of settings, and tell error and run time of each.
 
@@ -79,21 +65,7 @@ def study(
         parameters: of the scene, for all runs.
         dt, t_end, solver, tol, dtype, device: of runs where they are not swept; by default the scene's.
         probes: whose error counts; by default all, or those that the reference has.
-        reference: a wf.Reference, a dict from probes to functions of time or samples, a file (.csv, .json), or "run"
-            for a finer run. By default what the scene gives, else a finer run.
-        finer: options and parameters of the finer run, in place of the chosen ones.
-        mesh: parameters that refine the mesh; by default cells, elements, across.
-        measure: the error that counts: "l2", "end", "energy" or "field".
-        target: error that the cheapest setting is wanted for: in time and, where the mesh is not swept, by the estimate
-            of `split` for its cells.
-        split: parts of the error: of the "best" row (the answer to the target, else that with most digits of efficacy),
-            of "all" rows, or "none".
-        repeat: runs of each setting for the times; those longer than 2 s are not repeated.
-        limit: s, after which a run is given up.
-        out: folder for NAME.json, .csv, .png, and NAME.points.jsonl, from which an interrupted study goes on.
-        name: of the files; by default that of the scene.
-        progress: show a bar; by default when stderr is a terminal.
-        what, words: how the command line names the scene, and its words, for the files.
+        options: reference, target, repeat, files and all else, see StudyOptions.
 
     Returns:
         A Study: a sequence of rows, with `table()`, `answer` and `write(folder)`.
@@ -104,28 +76,20 @@ def study(
         OutputError: the folder can't be written.
         KeyboardInterrupt: after Ctrl-C; finished runs are kept in `out`.
     """
+    options = options or StudyOptions()
     named, found = _scene(scene, dt, t_end)
-    what, name = what or named, name or found.name
-    if not re.fullmatch(r"[\w.-]+", name):
-        raise ModelError(f"study: name {name!r} is to be part of names of files: letters, digits, _ - and .")
+    options = replace(options, what=options.what or named, name=options.name or found.name)
     sweep = dict(over or {})
     for option, many in (("methods", methods), ("error", error)):
         if many is not None:
             if option in sweep:
                 raise ModelError(f"study: {option} is given twice")
             sweep[option] = many
-    _check_choice("measure", measure, MEASURES)
-    _check_choice("split", split, SPLITS)
-    if not (isinstance(repeat, int) and repeat >= 1):
-        raise ModelError(f"study: repeat = {repeat!r} must be a positive whole number")
-    for option, value in (("target", target), ("limit", limit), ("dt", dt), ("t_end", t_end), ("tol", tol)):
-        if value is not None and not (is_number(value) and value > 0.0):
-            raise ModelError(f"study: {option} = {value!r} must be a positive finite number")
-    axes = make_axes(found, sweep, mesh)
+    check_positive(dt=dt, t_end=t_end, tol=tol)
+    axes = make_axes(found, sweep, options.mesh)
     values = dict(parameters or {})
     _check_names("parameter", values, found.parameters)
-    _check_names("finer", finer or {}, [*OPTIONS, *found.parameters])
-    check_finer(finer or {})
+    _check_names("finer", options.finer or {}, [*OPTIONS, *found.parameters])
     swept = {axis: many[0] for axis, many in axes.over.items() if axis not in OPTIONS}
     base = Setting(
         method=method_text(found.integrator),
@@ -140,36 +104,20 @@ def study(
     )
     make_axes(found, {option: [base.get(option)] for option in ("solver", "dtype")}, None)
     settings = product(base, axes)
-    if measure == "field" and found.field is None:
+    if options.measure == "field" and found.field is None:
         raise ModelError(f"study: scene {found.name!r} has no field whose error could count: @wf.scene(field=...)")
-    known = _reference(reference, found, base, probes)
+    known = _reference(options.reference, found, base, probes)
     with quiet_warp():
         _check_probes(found, settings[0], probes)
-        folder = None if out is None else prepare(out)
-        store = Store(folder and folder / f"{name}.points.jsonl", lambda dev: code_version(found, dev))
-        work = _Work(found, axes, store, repeat, limit, progress, known, probes, dict(finer or {}), measure, base)
-        try:
-            rows, references, motions = work.rows(settings)
-            rows = work.judged(rows, motions, split, target)
-            answer = _answer(rows, target)
-            checks = [] if answer is None else work.checks(answer, motions)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(store.told()) from None
-    command = None if answer is None else answer.setting.command(what, found)
-    told = {
-        "t_end": base.t_end, "repeat": repeat, "limit": limit, "split": split, "parameters": base.values, "dt": base.dt,
-        "tol": base.tol, "solver": solver, "dtype": dtype, "integrator": base.method, "probes": probes,
-    }  # fmt: skip
-    result = Study(name, what, rows, axes, measure, target, references, told, answer, command, checks)
-    if folder is not None:
-        result.write(folder, words or ["study", what])
-    return result
+        folder = None if options.out is None else prepare(options.out)
+        store = Store(folder and folder / f"{options.name}.points.jsonl", lambda dev: code_version(found, dev))
+        return _Work(found, axes, store, options, known, probes, base).result(settings, folder)
 
 
 def _scene(given: Any, dt: float | None, t_end: float | None) -> tuple[str, Scene[Any]]:
     """A scene, and how the command line names it."""
     if isinstance(given, str):
-        return given, find_problem(given) if given in problem_names() else locate(given)
+        return given, locate(given)
     if isinstance(given, Scene):
         return given.name, given
     if callable(given):
@@ -177,13 +125,6 @@ def _scene(given: Any, dt: float | None, t_end: float | None) -> tuple[str, Scen
             raise ModelError(f"study of the function {given.__name__!r}: give dt and t_end, or decorate it as a scene")
         return given.__name__, as_scene(dt=dt, t_end=t_end)(given)
     raise ModelError(f"study: expected a scene, a function or a name, got {given!r}")
-
-
-def _check_choice(name: str, value: Any, known: Sequence[str]) -> None:
-    if value not in known:
-        raise ModelError(
-            f"study: {name} {value!r} is unknown; there are {', '.join(known)}{did_you_mean(value, known)}"
-        )
 
 
 def _check_names(what: str, given: Mapping[str, Any], known: Any) -> None:
@@ -240,18 +181,38 @@ class _Work:
         scene: Scene[Any],
         axes: Axes,
         store: Store,
-        repeat: int,
-        limit: float | None,
-        progress: bool | None,
+        options: StudyOptions,
         known: Callable[[Setting], Reference | None],
         chosen: Sequence[str] | None,
-        finer: dict[str, Any],
-        measured: str,
         base: Setting,
     ) -> None:
-        self.scene, self.axes, self.store, self.repeat, self.limit = scene, axes, store, repeat, limit
-        self.known, self.chosen, self.finer, self.measured, self.base = known, chosen, finer, measured, base
-        self.show = sys.stderr.isatty() if progress is None else progress
+        self.scene, self.axes, self.store, self.options = scene, axes, store, options
+        self.known, self.chosen, self.base = known, chosen, base
+        self.show = sys.stderr.isatty() if options.progress is None else options.progress
+
+    def result(self, settings: Sequence[Setting], folder: pathlib.Path | None) -> Study:
+        """The study of all settings, written into the folder if there is one."""
+        options, base = self.options, self.base
+        assert options.name is not None
+        assert options.what is not None
+        try:
+            rows, references, motions = self.rows(settings)
+            rows = self.judged(rows, motions)
+            answer = _answer(rows, options.target)
+            checks = [] if answer is None else self.checks(answer, motions)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(self.store.told()) from None
+        command = None if answer is None else answer.setting.command(options.what, self.scene)
+        told = {
+            "t_end": base.t_end, "repeat": options.repeat, "limit": options.limit, "split": options.split,
+            "parameters": base.values, "dt": base.dt, "tol": base.tol, "solver": base.solver, "dtype": base.dtype,
+            "integrator": base.method, "probes": self.chosen,
+        }  # fmt: skip
+        found = Study(options.name, options.what, rows, self.axes, options.measure, options.target, references, told,
+                      answer, command, checks)  # fmt: skip
+        if folder is not None:
+            found.write(folder, options.words or ["study", options.what])
+        return found
 
     def run(self, setting: Setting) -> Outcome:
         """The outcome of a setting beside those of the sweep."""
@@ -283,10 +244,10 @@ class _Work:
             for name, group in groups.items():
                 known = self.known(group[0])
                 if known is None:
-                    best = finer_setting(group, self.axes, self.finer, self.base.dt or self.scene.dt)
+                    best = finer_setting(group, self.axes, self.options.finer or {}, self.base.dt or self.scene.dt)
                     motions[name] = finer_motion(best, self.axes, self.chosen, self.run)
                 for setting in group:
-                    outcomes[id(setting)] = self.point(setting, self.repeat, self.limit)
+                    outcomes[id(setting)] = self.point(setting, self.options.repeat, self.options.limit)
                 done = [o for s in group if (o := outcomes[id(s)]).status == DONE]
                 if known is not None and done:
                     motions[name] = known_motion(known, self.chosen, done[0], self.base.t_end)
@@ -321,21 +282,22 @@ class _Work:
         away["energy"] = n["drift"] / n["exchanged"] if n["exchanged"] > 0.0 else None
         if n["exchanged"] > 0.0:
             away["ledger"] = {name: change / n["exchanged"] for name, change in n["ledger"].items()}
-        error, own = away[self.measured], motion.own.get(self.measured, 0.0)
+        measure = self.options.measure
+        error, own = away[measure], motion.own.get(measure, 0.0)
         if error is None:
-            needs = "a field=, and a reference that has one" if self.measured == "field" else "energy that is exchanged"
-            raise ModelError(f"study: no error by {self.measured!r} of scene {self.scene.name!r}: it needs {needs}")
+            needs = "a field=, and a reference that has one" if measure == "field" else "energy that is exchanged"
+            raise ModelError(f"study: no error by {measure!r} of scene {self.scene.name!r}: it needs {needs}")
         digits = -math.log10(error * row.seconds) if error > 0.0 and row.seconds else None
         return replace(
             row, error=error, own_error=own, resolved=error >= max(RESOLVED * own, ROUNDING), efficacy=digits, **away
         )  # fmt: skip
 
-    def judged(self, rows: list[Row], motions: dict[str, Motion], which: str, target: float | None) -> list[Row]:
+    def judged(self, rows: list[Row], motions: dict[str, Motion]) -> list[Row]:
         """The rows with parts of the error, and with that of the mesh where the cheapest one hangs on it."""
         while True:
-            answer = _answer(rows, target)
-            rows = self.split(rows, motions, which, answer)
-            answer = _answer(rows, target)
+            answer = _answer(rows, self.options.target)
+            rows = self.split(rows, motions, answer)
+            answer = _answer(rows, self.options.target)
             if answer is None or answer.split is None or answer.mesh_error is not None or not self._in_time(answer):
                 return rows
             space, values = answer.split["space"], answer.setting.values
@@ -347,13 +309,14 @@ class _Work:
     def _in_time(self, row: Row) -> bool:
         """Whether the error of a row leaves out that of the mesh, and an estimate of it can be added."""
         swept = any(name in self.axes.over for name in self.axes.mesh)
-        return self.measured in ("l2", "end") and not swept and self.known(row.setting) is None
+        return self.options.measure in ("l2", "end") and not swept and self.known(row.setting) is None
 
-    def split(self, rows: list[Row], motions: dict[str, Motion], which: str, answer: Row | None) -> list[Row]:
+    def split(self, rows: list[Row], motions: dict[str, Motion], answer: Row | None) -> list[Row]:
         """The rows with parts of the error where asked for."""
         from tqdm import tqdm
 
         done = [r for r in rows if r.status == DONE and r.error is not None]
+        which = self.options.split
         if which == "none" or not done or (answer is None and any(r.split is not None for r in rows)):
             return rows
         best = answer or max(done, key=lambda r: -math.inf if r.efficacy is None else r.efficacy)

@@ -167,7 +167,7 @@ def step(sim: wf.Simulation, steps: int, count: Count | None = None) -> Count:
     return count
 
 
-def off(value: Any, reference: Any) -> float:
-    """Largest difference over the largest value of the reference."""
+def off(value: Any, reference: Any, scale: float | None = None) -> float:
+    """Largest difference over `scale`, by default the largest value of the reference."""
     value, reference = np.asarray(value, dtype=float), np.asarray(reference, dtype=float)
-    return float(np.abs(value - reference).max() / np.abs(reference).max())
+    return float(np.abs(value - reference).max() / (np.abs(reference).max() if scale is None else scale))

@@ -9,6 +9,7 @@ import numpy as np
 import warpfea as wf
 from warpfea.simulation.statics import StaticResult
 
+from ..build import off
 from ..case import Setting
 
 __all__ = ["Effort", "X", "Y", "Z", "finalize", "off", "put", "solve"]
@@ -94,9 +95,3 @@ def put(state: Any, values: np.ndarray, name: str = "displacement") -> None:
     """Set an array of a state in all worlds, values (slots, 3)."""
     array = getattr(state, name)
     array.assign(np.broadcast_to(values, (*array.shape, 3)).astype(array.numpy().dtype))
-
-
-def off(value: Any, expected: Any, scale: float | None = None) -> float:
-    """Largest difference over `scale`, by default the largest expected value."""
-    value, expected = np.asarray(value, dtype=float), np.asarray(expected, dtype=float)
-    return float(np.abs(value - expected).max() / (np.abs(expected).max() if scale is None else scale))

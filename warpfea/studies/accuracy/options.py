@@ -1,0 +1,100 @@
+"""Options of `wf.study` besides what is run."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import pathlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ParamSpec, TypeVar
+
+from ...base.checks import is_number
+from ...base.errors import ModelError
+from ...base.names import did_you_mean
+from ...builder.reference import Reference
+from .finer import check_finer
+from .report import MEASURES
+
+__all__ = ["StudyOptions", "check_positive", "names_moved"]
+
+SPLITS = ("best", "all", "none")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """Errors, times and files of a study.
+
+    Attributes:
+        reference: a wf.Reference, a dict from probes to functions of time or samples, a file (.csv, .json), or "run"
+            for a finer run. By default what the scene gives, else a finer run.
+        finer: options and parameters of the finer run, in place of the chosen ones.
+        mesh: parameters that refine the mesh; by default cells, elements, across.
+        measure: the error that counts: "l2", "end", "energy" or "field".
+        target: error that the cheapest setting is wanted for: in time and, where the mesh is not swept, by the estimate
+            of `split` for its cells.
+        split: parts of the error: of the "best" row (the answer to the target, else that with most digits of efficacy),
+            of "all" rows, or "none".
+        repeat: runs of each setting for the times; those longer than 2 s are not repeated.
+        limit: s, after which a run is given up.
+        out: folder for NAME.json, .csv, .png, and NAME.points.jsonl, from which an interrupted study goes on.
+        name: of the files; by default that of the scene.
+        progress: show a bar; by default when stderr is a terminal.
+        what, words: the scene as the command line names it, and the words of that line, for the files.
+
+    Raises:
+        ModelError: a value out of range.
+    """
+
+    reference: Reference | Mapping[str, Any] | str | pathlib.Path | None = None
+    finer: Mapping[str, Any] | None = None
+    mesh: Sequence[str] | None = None
+    measure: str = "l2"
+    target: float | None = None
+    split: str = "best"
+    repeat: int = 3
+    limit: float | None = None
+    out: str | pathlib.Path | None = None
+    name: str | None = None
+    progress: bool | None = None
+    what: str | None = None
+    words: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.name is not None and not re.fullmatch(r"[\w.-]+", self.name):
+            raise ModelError(f"study: name {self.name!r} is to be part of names of files: letters, digits, _ - and .")
+        for option, known in (("measure", MEASURES), ("split", SPLITS)):
+            value = getattr(self, option)
+            if value not in known:
+                hint = did_you_mean(value, known)
+                raise ModelError(f"study: {option} {value!r} is unknown; there are {', '.join(known)}{hint}")
+        if not (isinstance(self.repeat, int) and self.repeat >= 1):
+            raise ModelError(f"study: repeat = {self.repeat!r} must be a positive whole number")
+        check_positive(target=self.target, limit=self.limit)
+        check_finer(self.finer or {})
+
+
+def check_positive(**values: float | None) -> None:
+    """ModelError for options that are neither None nor positive finite numbers."""
+    for option, value in values.items():
+        if value is not None and not (is_number(value) and value > 0.0):
+            raise ModelError(f"study: {option} = {value!r} must be a positive finite number")
+
+
+def names_moved(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, with a ModelError for keywords that are fields of StudyOptions."""
+    fields = {field.name for field in dataclasses.fields(StudyOptions)}
+
+    @functools.wraps(function)
+    def call(*args: P.args, **given: P.kwargs) -> R:
+        moved = [name for name in given if name in fields]
+        if moved:
+            many = f"{', '.join(moved)} {'is a field' if len(moved) == 1 else 'are fields'}"
+            write = ", ".join(f"{name}={given[name]!r}" for name in moved)
+            raise ModelError(f"{many} of StudyOptions: study(..., options=wf.StudyOptions({write}))")
+        return function(*args, **given)
+
+    return call
