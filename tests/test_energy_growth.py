@@ -1,4 +1,4 @@
-"""Energy that integrator and residuals add: warned of above 1 % of the largest energy and the work, refused above 10 %."""
+"""Energy that integrator and residuals add: warned of above 1 % of the largest, refused above 10 %."""
 
 import warnings
 

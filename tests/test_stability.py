@@ -279,7 +279,7 @@ def test_only_slender_models_in_single_precision_are_judged_in_double(slender, t
 
 
 def plate(factor, imperfection, dtype):
-    """A plate of 8 x 8 shells, simply supported, under so many times Bryan's load, and a half wave of imperfection, m."""
+    """A plate of 8 x 8 shells, simply supported, under so many times Bryan's load, with an imperfection, m."""
     side, thick, nu = 1.0, 0.01, 0.3
     critical = 4.0 * np.pi**2 * E * thick**3 / 12.0 / (1.0 - nu**2) / side**2
     mesh = wf.mesh.grid((side, side), cells=(8, 8))

@@ -31,8 +31,8 @@ REPORT = (
 SAME_TIME = 1e-6
 """Part of a step within which two times are one."""
 GROWTH = ("share", "largest", "turnover", "added", "since", "steps", "next")
-"""Columns of the watch over the energy that integrator and residuals add: its share of the energy, the largest energy that was
-stored, J, the sum of |work| and of what viscosity took, J, what was added, J, when the share first exceeded
+"""Columns of the watch over the energy that integrator and residuals add: its share of the energy, the largest energy
+that was stored, J, the sum of |work| and of what viscosity took, J, what was added, J, when the share first exceeded
 `growth_told`, s, substeps since loads set in, and the turnover, J, at which they count as setting in again."""
 
 
