@@ -9,6 +9,8 @@ from validation.conservation import RATE, Conserved, tumble
 import warpfea as wf
 from warpfea.model.assembly import geometry, gradients
 from warpfea.simulation import integrators
+from warpfea.studies.stress.case import Setting
+from warpfea.studies.stress.cases import rotation
 
 TIGHT = wf.NewtonPCG(tol=1e-12)
 OMEGA = np.array([1.0, 2.0, 10.0])
@@ -64,6 +66,19 @@ def test_a_free_bar_gains_no_energy_and_keeps_its_momenta(E, turn, steps):
     e = {name: values[0] for name, values in sim.energies().items()}
     assert e["integrator"] == pytest.approx(start - last, rel=1e-4, abs=1e-10 * start)
     assert abs(e["ledger_residual"]) < 1e-10 * start
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("scheme", ["energy_momentum", LOSSY])
+def test_the_body_of_the_stress_rows_keeps_its_momenta_at_a_tight_tolerance(scheme, device):
+    """Rows `turning` of `warpfea stress` keep angular momentum to 1e-6 at the default tolerance, 1e-8."""
+    model = rotation._turning(Setting(device, "float64"), "free", 1e9)
+    sim = wf.Simulation(model, dt=0.2 / SPEED, integrator=scheme, solver=wf.NewtonPCG(tol=1e-12))
+    watch = Conserved(sim)
+    for _ in range(100):
+        sim.step()
+    (_, p, L), (now_p, now_L) = watch.first, watch._momenta(sim)  # p is 0: both over L, as in the rows
+    assert max(np.linalg.norm(now_p - p), np.linalg.norm(now_L - L)) < 1e-10 * np.linalg.norm(L)
 
 
 @pytest.mark.slow

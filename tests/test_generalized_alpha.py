@@ -168,8 +168,9 @@ def test_order_of_a_mode_where_steps_change(mode, rho, change, dtype):
     assert found[1] < 2.2 * equal[0]
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize("change", ["0.4/1.6", "random"])
-def test_order_of_a_pendulum_where_steps_change(change):
+def test_order_of_a_pendulum_where_steps_change(change, device):
     """A soft link that falls and turns on its hinge by 0.6 rad: its tip against the limit of equal steps.
 
     Fails on 8934ce7: a ratio of 2.0 with 0.4/1.6.
@@ -177,7 +178,7 @@ def test_order_of_a_pendulum_where_steps_change(change):
 
     def tip(kind, count, dtype="float64"):
         b, bodies, anchor = links(1)
-        model = b.finalize(device="cpu", dtype=dtype)
+        model = b.finalize(device=device, dtype=dtype)
         steps = steps_of(kind, count, 0.12)
         tol = {"float64": 1e-10, "float32": 1e-6}[dtype]
         sim = wf.Simulation(

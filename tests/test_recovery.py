@@ -184,14 +184,14 @@ def test_a_refusal_by_rounding_is_not_halved():
         wf.solve_static(b.finalize(device="cpu", dtype="float32"), load_steps=3)
 
 
-def thin(element, dtype):
+def thin(element, dtype, device="cpu"):
     """A steel bar of slenderness 500 that its tip load bends by a twentieth of its length."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     mesh = wf.mesh.box((1, 2e-3, 2e-3), cells=(20, 1, 1), element=element)
     bar = b.add_solid(mesh, material=wf.SVK(E=2e11, nu=0.3), element=element)
     b.clamp(bar.nodes("x-"), slots="all" if element == "T10" else "position+gradient-y+gradient-z")
     b.add_traction(bar.surface("x+"), (0, 0, -1e4))
-    return b.finalize(device="cpu", dtype=dtype)
+    return b.finalize(device=device, dtype=dtype)
 
 
 @pytest.mark.parametrize("element", ["T10", "H3843"])
@@ -260,13 +260,14 @@ def test_trusses_snap_through_in_few_iterations(kind, rise, side, steps, most):
     assert found.newton[0] <= most
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize("most", [1, 200])
 @pytest.mark.parametrize("preconditioner", ["block-jacobi", "two-level", "banded"])
-def test_work_ends_within_a_solve(preconditioner, most):
+def test_work_ends_within_a_solve(preconditioner, most, device):
     """Fails on 8934ce7: with max_work = 1 block-jacobi takes 20000 iterations, two-level 2263, with 7 a band 9."""
     most = 7 if preconditioner == "banded" and most == 200 else most
     sim = begin_static(
-        thin("T10", "float64"),
+        thin("T10", "float64", device),
         load_steps=1,
         solver=wf.NewtonPCG(max_work=most, max_pcg=20000, preconditioner=preconditioner),
     )

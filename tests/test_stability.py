@@ -258,3 +258,46 @@ def test_a_change_by_rounding_the_state_is_not_told(monkeypatch):
     found = wf.solve_static(model)
     assert found.report.stable.tolist() == [None]
     assert found.stability.reasons == ["within the rounding of float32"]
+
+
+@pytest.mark.parametrize(("slender", "twins"), [(False, 0), (True, 1)])
+def test_only_slender_models_in_single_precision_are_judged_in_double(slender, twins, monkeypatch):
+    """Where float32 itself has curvatures far above rounding there is no twin in float64: fails on 51a4e5d."""
+    made, twin = [], stability._twin
+    monkeypatch.setattr(stability, "_twin", lambda sim: made.append(sim) or twin(sim))
+    if slender:
+        model, _ = column(0.9, "float32")
+    else:
+        b = wf.ModelBuilder(gravity=(0, 0, 0))
+        cube = b.add_solid(wf.mesh.box((1, 1, 1), cells=(2, 2, 2)), material=wf.SVK(E=1e6, nu=0.3), name="cube")
+        b.clamp(cube.nodes("z-"))
+        b.add_traction(cube.surface("z+"), (0, 0, -1e3))
+        model = b.finalize(device="cpu", dtype="float32")
+    found = solve(model)
+    assert found.report.stable.tolist() == [True]
+    assert len(made) == twins
+
+
+def plate(factor, imperfection, dtype):
+    """A plate of 8 x 8 shells, simply supported, under so many times Bryan's load, with an imperfection, m."""
+    side, thick, nu = 1.0, 0.01, 0.3
+    critical = 4.0 * np.pi**2 * E * thick**3 / 12.0 / (1.0 - nu**2) / side**2
+    mesh = wf.mesh.grid((side, side), cells=(8, 8))
+    points = np.column_stack([mesh.points, np.zeros((len(mesh.points), 3 - mesh.points.shape[1]))])
+    points[:, 2] += imperfection * np.sin(np.pi * points[:, 0] / side) * np.sin(np.pi * points[:, 1] / side)
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = b.add_shell(dataclasses.replace(mesh, points=points), thickness=thick, material=wf.SVK(E=E, nu=nu))
+    for edge, components in (("x-", "xz"), ("x+", "z"), ("y-", "yz"), ("y+", "z")):
+        b.clamp(body.edge(edge), components=components, slots="position")
+    b.add_traction(body.surface("x+"), (-factor * critical / thick, 0.0, 0.0))
+    found = wf.solve_static(b.finalize(device="cpu", dtype=dtype))
+    assert found.report.stable.tolist() == [True]
+    return np.abs(found.displacements(body)[0, :, 2]).max()
+
+
+@pytest.mark.parametrize("imperfection", [1e-5, 1e-3])
+def test_an_imperfect_plate_buckles_in_single_precision_too(imperfection):
+    """On 8934ce7 float32 may stay straight: 3.0e-6 m in place of 0.0172 m, accepted."""
+    exact = plate(1.5, imperfection, "float64")
+    assert exact > 0.015
+    assert plate(1.5, imperfection, "float32") == pytest.approx(exact, rel=2e-3)

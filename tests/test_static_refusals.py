@@ -48,7 +48,7 @@ def test_a_load_that_it_can_carry_is_not():
     b.clamp(body.nodes("x-"))
     b.add_traction(body.surface("x+"), (0, 0, 1e4))
     solver = wf.NewtonPCG(max_work=3, max_halvings=0, preconditioner="block-jacobi")
-    with pytest.raises(wf.ConvergenceError, match=r"slivers") as caught:
+    with pytest.raises(wf.ConvergenceError, match=r"raise max_work = 3 of NewtonPCG, or look for slivers") as caught:
         wf.solve_static(b.finalize(device="cpu"), load_steps=1, solver=solver)
     assert "times its E" not in str(caught.value)
 
@@ -84,3 +84,18 @@ def test_newton_iterations_count_as_work():
     assert 100 <= spent <= 100 + 4 * 50
     assert wf.NewtonPCG().most_newton(True) == 2000
     assert wf.NewtonPCG().most_newton(False) == 10_000
+
+
+def test_the_last_report_outlives_a_refusal_that_was_caught():
+    """Fails on 51a4e5d: `sim.last` is None."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    body = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(4, 1, 1)), material=RUBBER, name="bar")
+    b.clamp(body.nodes("x-"))
+    solver = wf.NewtonPCG(max_work=3, max_halvings=0, preconditioner="block-jacobi")
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, solver=solver)
+    for _ in range(2):  # refused again, not passed over as known to have failed
+        with pytest.raises(wf.ConvergenceError, match="raise max_work = 3 of NewtonPCG"):
+            sim.step()
+        assert sim.last.status.tolist() == [1]
+        assert not sim.last.converged[0]
+    assert sim.steps == 0

@@ -13,7 +13,7 @@ import warp as wp
 
 from ..common.types import kernel_module, precision
 from .control import control_struct
-from .pcg import TIGHTER, pcg_struct
+from .pcg import forcing_functions, pcg_struct
 
 __all__ = ["BICGSTAB_ROWS", "bicgstab_kernels", "bicgstab_struct"]
 
@@ -59,6 +59,8 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Newton, Control, Recursion = control_struct(), pcg_struct(), bicgstab_struct()
+    forcing = forcing_functions(gated)
+    forced, least_norm = forcing.forced, forcing.least_norm
     module = kernel_module(f"bicgstab_{dtype}{'_gated' if gated else ''}")
 
     @wp.func
@@ -82,21 +84,11 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         bi.best[world] = norm
         bi.mark[world] = norm
         bi.since[world] = 0
-        goal = newton.forcing[world] * newton.solve_norm[world]
-        least = f64(0.1) * newton.solve_accept[world]
-        if wp.static(gated):
-            goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
-            least = f64(TIGHTER) * least
-            if newton.classical == 0:
-                goal = f64(TIGHTER) * goal
-                least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
-        ctl.target[world] = wp.max(goal, least)
-        if newton.fixed_forcing != 0:
-            ctl.target[world] = newton.forcing[world] * norm
+        ctl.target[world] = forced(newton, world, norm)
         if newton.strict[world] != 0:
             ctl.target[world] = f64(STRICT) * norm
         elif newton.relative[world] > f64(FAR) and newton.fixed_forcing == 0:
-            ctl.target[world] = wp.max(f64(CLOSE) * norm, least)
+            ctl.target[world] = wp.max(f64(CLOSE) * norm, least_norm(newton, world))
         if norm > ctl.target[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
             ctl.active[world] = wp.where(newton.relative[world] > f64(FAR), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)

@@ -12,7 +12,7 @@ from ..common.lanes import lane_functions
 from ..common.types import kernel_module, precision
 from .control import control_struct
 
-__all__ = ["LANES", "groups_struct", "pcg_kernels", "pcg_struct"]
+__all__ = ["LANES", "forcing_functions", "groups_struct", "pcg_kernels", "pcg_struct"]
 
 TIGHTER = 0.4
 """Factor on the tolerance of solves with constraints. Of 0.03, 0.18, 0.4 and 1 it saves the third Newton iteration at
@@ -77,6 +77,40 @@ def groups_struct(dtype: str):
 
 
 @functools.cache
+def forcing_functions(gated: bool) -> _types.SimpleNamespace:
+    """Norms at which solves end, by Eisenstat and Walker (1996); `gated`: with constraints, see Traits."""
+    f64 = wp.float64
+    Newton = control_struct()
+
+    @wp.func
+    def least_norm(newton: Newton, world: int) -> f64:
+        """A part of the accepted residual, below which Newton's method needs none."""
+        least = f64(0.1) * newton.solve_accept[world]
+        if wp.static(gated):
+            # the same solve finds the constraint forces: what is left of r across constraints is their error
+            least = f64(TIGHTER) * least
+            if newton.classical == 0:
+                # a loose tolerance of the forces must not leave constraints violated
+                least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
+        return least
+
+    @wp.func
+    def forced(newton: Newton, world: int, norm: f64) -> f64:
+        """The forcing term times the residual, |r| = norm at the start, but no less than `least_norm`."""
+        if newton.fixed_forcing != 0:
+            return newton.forcing[world] * norm
+        goal = newton.forcing[world] * newton.solve_norm[world]
+        if wp.static(gated):
+            # where the forces balance already, what is left of the constraints may still call for a step
+            goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
+            if newton.classical == 0:
+                goal = f64(TIGHTER) * goal
+        return wp.max(goal, least_norm(newton, world))
+
+    return _types.SimpleNamespace(least_norm=least_norm, forced=forced)
+
+
+@functools.cache
 def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     """Kernels of the linear solver in one precision; `gated`: with constraints, see Traits."""
     p = precision(dtype)
@@ -85,7 +119,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     Newton = control_struct()
     Control = pcg_struct()
     Groups = groups_struct(dtype)
-    row_sum = lane_functions(dtype).row_sum
+    row_sum, forced = lane_functions(dtype).row_sum, forcing_functions(gated).forced
     module = kernel_module(f"pcg_{dtype}{'_gated' if gated else ''}")
 
     @wp.kernel(module=module)
@@ -166,20 +200,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             ctl.unsolved[world] = 0
         ctl.energy[world] = f64(0.0)
         ctl.seen[world] = f64(0.0)
-        goal = newton.forcing[world] * newton.solve_norm[world]
-        least = f64(0.1) * newton.solve_accept[world]
-        if wp.static(gated):
-            # where the forces balance already, what is left of the constraints may still call for a step
-            goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
-            # the same solve finds the constraint forces: what is left of r across constraints is their error
-            least = f64(TIGHTER) * least
-            if newton.classical == 0:
-                goal = f64(TIGHTER) * goal
-                # a loose tolerance of the forces must not leave constraints violated
-                least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
-        ctl.target[world] = wp.max(goal, least)
-        if newton.fixed_forcing != 0:
-            ctl.target[world] = newton.forcing[world] * norm
+        ctl.target[world] = forced(newton, world, norm)
         if ctl.strict[world] != 0:
             # a residual of rough roundings hides the smooth error: its norm is no guide to when that is found
             ctl.target[world] = f64(0.0)

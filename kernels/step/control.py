@@ -31,8 +31,8 @@ REPORT = (
 SAME_TIME = 1e-6
 """Part of a step within which two times are one."""
 GROWTH = ("share", "largest", "turnover", "added", "since", "steps", "next")
-"""Columns of the watch over the energy that the integrator adds: its share of the energy, the largest energy that was
-stored, J, the sum of |work| and of what viscosity took, J, what was added, J, when the share first exceeded
+"""Columns of the watch over the energy that integrator and residuals add: its share of the energy, the largest energy
+that was stored, J, the sum of |work| and of what viscosity took, J, what was added, J, when the share first exceeded
 `growth_told`, s, substeps since loads set in, and the turnover, J, at which they count as setting in again."""
 
 
@@ -99,7 +99,8 @@ def step_struct():
         total_J: wp.array(dtype=wp.float64)
         ledger_time: wp.array(dtype=wp.float64)  # s, what the ledger was last brought up to
         growth: wp.array2d(dtype=wp.float64)  # [world, GROWTH], in the state; where it is watched
-        watched: wp.int32  # the energy that the integrator adds is
+        watched: wp.int32  # the energy that integrator and residuals add is
+        counted: wp.float64  # 1: what residuals add is, 0: that is not, as a drive balances it
         growth_told: wp.float64  # part of the energy from which on the time is kept
         growth_limit: wp.float64  # beyond which no further step is taken
         least_energy: wp.array(dtype=wp.float64)  # [world] J, below which energies are rounding

@@ -76,7 +76,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
 
     @wp.func
     def watch(step: Step, world: int, before: f64, energy: f64, turnover: f64, added: f64):
-        """Net energy that the integrator has added, over the largest that was stored plus the sum of |work|.
+        """Net energy that the integrator and residuals have added, over the largest stored plus the sum of |work|.
 
         Net, for schemes of order 2 exchange energy with the motion to and fro; and not in the first steps from rest,
         nor in those after work that exceeds all energy so far.
@@ -218,8 +218,9 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         ledger[world, 9] = ledger[world, 9] + sums[6, world]
         if step.watched != 0:
             turnover += wp.abs(loads) + wp.abs(sums[4, world]) + wp.abs(fields) + wp.abs(viscous)
-            # where damping is stiff, `viscous` has too much by what `numerical` has too little
-            added = -(numerical + viscous)
+            # where damping is stiff, `viscous` has too much by what `numerical` has too little; `balance` is the work
+            # of residuals that were accepted, which adds up where a tolerance or rounding leaves them large
+            added = step.counted * balance - (numerical + viscous)
             watch(step, world, energy - (change_K + change_W + stored), energy, turnover, added)
 
     return _types.SimpleNamespace(ledger_rows=ledger_rows, ledger_update=ledger_update)

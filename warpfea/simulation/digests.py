@@ -55,6 +55,7 @@ class Digests(Records):
     max_violation: Any = Fresh()
     min_J: Any = Fresh()
     _stepped: Any = Fresh()
+    _failed: np.ndarray
     _history: Any = Fresh()
     on_failure: str | None
     record: bool
@@ -70,7 +71,7 @@ class Digests(Records):
             self.totals |= {name: np.zeros(B, int) for name in ("substeps", "rejected")}
         self.max_residual = self.max_floor = self.max_violation = 0.0
         self.min_J = math.inf
-        self._stepped = np.zeros(B, dtype=bool)
+        self._stepped, self._failed = (np.zeros(B, dtype=bool) for _ in range(2))
         self._history = []
 
     def _catch_up(self) -> None:
@@ -121,9 +122,9 @@ class Digests(Records):
 
     def _digest(self, rows: np.ndarray) -> None:
         """Take in the numbers of a step (worlds, columns); raise where a world has failed and that is asked for."""
-        before = self.last.status if self.last is not None else np.zeros(len(rows), int)
         last = self.last = self._report_of(rows)
-        fresh = (last.status == STATUS["failed"]) & (before != STATUS["failed"])
+        failed = last.status == STATUS["failed"]
+        fresh, self._failed = failed & ~self._failed, failed
         self.steps += 1
         good = last.status == STATUS["running"]
         self._stepped |= good
@@ -172,5 +173,5 @@ class Digests(Records):
         status = self.state.status.numpy()
         status[status == STATUS["failed"]] = STATUS["running"]
         self.state.status.assign(status)
-        self.last = None
+        self._failed[:] = False
         return error

@@ -1,7 +1,10 @@
-"""Energy that the integrator adds: watched on the device (kernels/step/ledger.py), told and refused here.
+"""Energy that integrator and residuals add: watched on the device (kernels/step/ledger.py), told and refused here.
 
-The measure is net: what the ledger's `integrator` and `viscous` have fallen by since the watch began, over the largest
-kinetic + strain + contact energy since plus the sum of |work| and of what viscosity took. Schemes of order 2 exchange
+The measure is net: what the ledger's `integrator` and `viscous` have fallen by since the watch began and its
+`ledger_residual` has risen by, over the largest kinetic + strain + contact energy since plus the sum of |work| and of
+what viscosity took. Residuals of a loose tolerance, or at the rounding of float32, do work that adds up; not so where
+something is driven, which takes as much as they give: of a slider crank in float32 they give 15 J and take it again in
+each turn, and its drive has that much less and more. Schemes of order 2 exchange
 energy with the motion to and fro, by O(h^2) of it, and that does not add up; an instability does. Where damping is
 stiff, `viscous` has too much by what `integrator` has too little: their sum is what counts. The first steps of a motion
 that sets in from rest are left out.
@@ -18,6 +21,7 @@ import warp as wp
 from ..base.errors import ModelWarning
 from ..kernels.step.control import GROWTH
 from ..model.assembly import element_volumes
+from .jumps import drives
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -65,6 +69,7 @@ class EnergyGrowth:
         rows = state.register("energy_growth", wp.float64, (len(GROWTH),))
         rows.zero_()
         step.growth, step.watched = rows, 1
+        step.counted = float(not drives(model))
         self._model, self._rows = model, rows
         self._least = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
         self._written, self._writes = model.terms.written, model.terms.writes
@@ -95,8 +100,8 @@ class EnergyGrowth:
         refused = f"; steps are refused above {REFUSED:.0%}" if self.choice == "refuse" else ""
         where = f" in world {world}" if sim.model.worlds > 1 else ""
         warnings.warn(
-            f"{sim.integrator.label} adds energy: from t = {since:.6g} s on more than {TOLD:.0%} of the largest, by "
-            f"now {worst:.1%}{where}{refused}; {remedy(sim)}",
+            f"{source(sim, world)} adds energy: from t = {since:.6g} s on more than {TOLD:.0%} of the largest, by "
+            f"now {worst:.1%}{where}{refused}; {remedy(sim, world)}",
             ModelWarning,
             stacklevel=4,
         )
@@ -113,8 +118,25 @@ def least_energy(model: Model) -> np.ndarray:
     return out
 
 
-def remedy(sim: Any) -> str:
-    """Schemes to write in place of the integrator."""
+def by_residuals(sim: Any, world: int) -> bool:
+    """True where residuals that were accepted have added more than half of the energy; of a scheme that is unstable by
+    itself it is the scheme."""
+    if drives(sim.model) or sim.integrator.name == "generalized_alpha":
+        return False
+    share, largest, turnover = sim.state.energy_growth.numpy()[world, :3]
+    added = share * (largest + turnover)
+    return float(sim.energies()["ledger_residual"][world]) > 0.5 * added
+
+
+def source(sim: Any, world: int) -> str:
+    """Name of what adds the energy: the integrator, or residuals."""
+    return "the work of accepted residuals" if by_residuals(sim, world) else sim.integrator.label
+
+
+def remedy(sim: Any, world: int) -> str:
+    """Schemes to write in place of the integrator, or a tolerance."""
+    if by_residuals(sim, world):
+        return "take a smaller tol" + (", or dtype='float64'" if sim.model.dtype == "float32" else "")
     others = [f"{other!r}" for other in CALMER.get(sim.integrator.name, ())]
     return f"take integrator={', '.join(others)} or a smaller dt" if others else "take a smaller dt"
 
@@ -136,9 +158,10 @@ def growth_error(sim: Any, world: int) -> str:
     """The message of a step that is refused since the integrator has added too much; the world's watch begins again."""
     rows = sim.state.energy_growth.numpy()
     share, since = (float(rows[world, GROWTH.index(name)]) for name in ("share", "since"))
+    name, cure = source(sim, world), remedy(sim, world)
     rows[world] = 0.0
     sim.state.energy_growth.assign(rows)
     return (
-        f"{sim.integrator.label} has added {share:.1%} to the largest energy, more than {TOLD:.0%} from t = "
-        f"{since:.6g} s on; {remedy(sim)}; energy_growth='warn' lets it pass"
+        f"{name} has added {share:.1%} to the largest energy, more than {TOLD:.0%} from t = "
+        f"{since:.6g} s on; {cure}; energy_growth='warn' lets it pass"
     )

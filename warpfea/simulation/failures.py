@@ -120,13 +120,17 @@ def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
         limit = f"max_work = {sim.solver.max_work}"
         if near and dtype == "float32":
             return f"float32 can't hold this case: the residual is within rounding, and {spent} ({limit})", finer
-        slivers = f"; look for slivers and extreme contrasts of stiffness, or raise {limit}"
+        slivers = f"; raise {limit} of NewtonPCG, or look for slivers and extreme contrasts of stiffness"
         return spent, "" if overload_text(sim.model) else slivers
     if code == FAIL_INVERTED:
         return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
     bent = sim.integrator.static and int(work.newton.bent.numpy()[world])
     if code in UNSTABLE and near and (dtype == "float32" or not bent):
         return f"{dtype} can't hold this case: what is left of the residual is within rounding", finer
+    if code in UNSTABLE and bent and dtype == "float32":
+        return f"{REASONS[code]}: forces in float32 have a direction without stiffness", (
+            f"{finer}, which says whether the equilibrium is unstable, or more load steps"
+        )
     if code in UNSTABLE and bent:
         return f"{REASONS[code]}: the equilibrium is unstable there (it buckles or snaps through)", (
             "; find what follows by a motion with damping, or prescribe displacements in place of loads"

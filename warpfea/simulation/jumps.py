@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ..laws import TimeLaw
     from ..model.model import Model
 
-__all__ = ["jumping_drives"]
+__all__ = ["drives", "jumping_drives"]
 
 RATIO = 10.0
 """A drive that jumps moves so many times farther than in an equal time before."""
@@ -25,15 +25,15 @@ def jumping_drives(sim: Any, world: int) -> str:
 
     A travel counts from the size of an element on, m, an angle from `ANGLE` on.
     """
-    drives = _drives(sim.model)
-    if not drives:
+    driven = drives(sim.model)
+    if not driven:
         return ""
     step = sim.stepper.work.step
     end, h = float(step.new_time.numpy()[world]), float(step.h.numpy()[world])
     late, start, early = (sim.stepper.law_values(end - k * h)[world] for k in range(3))
     least = _element_size(sim.model)
     told = []
-    for name, angular, entries in drives:
+    for name, angular, entries in driven:
         moved, before = (
             max(float(np.linalg.norm((b[number] - a[number]) * mask)) for number, mask in entries)
             for a, b in ((start, late), (early, start))
@@ -46,7 +46,7 @@ def jumping_drives(sim: Any, world: int) -> str:
     return f"; a drive jumps within {span}: {', '.join(told[:4])}{', ...' if len(told) > 4 else ''}; give it a ramp"
 
 
-def _drives(model: Model) -> list[tuple[str, bool, list[tuple[int, np.ndarray]]]]:
+def drives(model: Model) -> list[tuple[str, bool, list[tuple[int, np.ndarray]]]]:
     """Name of each drive, whether it turns, and the numbers of its laws with the components that they prescribe."""
     number = {id(law): k for k, law in enumerate(model.terms.laws.laws)}
     out: list[tuple[str, bool, list[tuple[int, np.ndarray]]]] = []

@@ -8,7 +8,8 @@ less than that share of the random force (Kuczynski and Wozniakowski 1992 bound 
 the solves themselves don't do: a load may not excite the mode at all.
 
 The mode is that of least w = p.H p / p.M p, by locally optimal conjugate gradients (Knyazev 2001), from the direction
-that was found. A float32 state takes a float64 tangent, that of a twin of the model.
+that was found. A float32 state takes a float64 tangent, that of a twin of the model, where
+curvatures in float32 are not far above rounding.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ ITERATIONS, SHARE, MOST = 500, 0.3, 20_000
 """After which it is given up: so many, or this share of the solve's own where that is more; where it must be known."""
 ROUNDING = 64.0
 """Roundings of p.D p (D: diagonal of H) below which p.H p has no sign."""
+CLEAR = 1024.0
+"""The same in float32, above which it needs no tangent in float64."""
 NOISE = 4.0
 """Changes of p.H p by rounding the state once more, below which it has no sign in float32."""
 MODE_ITERATIONS, MODE_CHANGE = 60, 1e-4
@@ -118,6 +121,8 @@ def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
         out.reasons[:] = [text or "the float32 model is large; unstable='refuse' judges it" for text in out.reasons]
     if all(out.reasons):
         return out
+    if single and not sim.stepper.newton.direct and _clear(sim, out):
+        return out
     # an inverse of H itself is no preconditioner where H is indefinite
     probe = Tangent(_twin(sim) if single or sim.stepper.newton.direct else sim)
     strange = probe.unlike()
@@ -133,6 +138,23 @@ def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
     if unstable.any():
         out.mode[unstable] = _mode(probe, unstable, p)[unstable]
     return out
+
+
+def _clear(sim: Simulation, out: Stability) -> bool:
+    """Judge by the float32 tangent where all its curvatures are far above rounding; False where float64 is needed.
+
+    H in float32 is off by some roundings of p.D p: what is stable by CLEAR of them in each direction of the search is
+    stable. Neither unstable worlds nor forces without a potential are judged by it.
+    """
+    if any(not term.potential for term in sim.model.terms):
+        return False
+    found = Stability(out.stable.copy(), list(out.reasons), out.mode, out.iterations.copy())
+    most = np.full(sim.model.worlds, ITERATIONS)
+    _search(Tangent(sim), found, most, CLEAR)
+    if any(s is not True and not reason for s, reason in zip(found.stable, out.reasons)):
+        return False
+    out.stable[:], out.iterations[:] = found.stable, found.iterations
+    return True
 
 
 def _rubbing(sim: Simulation) -> list[tuple[int, str]]:
@@ -230,16 +252,18 @@ def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.einsum("bsc,bsc->b", x, y)
 
 
-def _search(probe: Tangent, out: Stability, most: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _search(
+    probe: Tangent, out: Stability, most: np.ndarray, roundings: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Look for a direction of negative curvature in the worlds without a reason, for `most` (worlds,) iterations; sets
-    `stable` and `reasons`.
+    `stable` and `reasons`. Curvatures of fewer `roundings`, by default ROUNDING, have no sign.
 
     Returns (worlds,) p.H p and the directions p that it is judged by: the first negative one or the softest.
     """
     m = probe.model
     solver = probe.sim.solver
     kappa = solver.kappa(m.dtype) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
-    rounding = ROUNDING * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
+    rounding = (roundings or ROUNDING) * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
     going = np.array([not reason for reason in out.reasons])
     random = np.random.default_rng(1).standard_normal((m.slots, 3))
     r = np.where(going[:, None, None], random * probe.free, 0.0)  # the same in all worlds
