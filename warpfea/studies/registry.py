@@ -44,17 +44,6 @@ class Entry:
 
 _ENTRIES = (
     Entry(
-        name="ancf-tets",
-        module="ancf_tets.command",
-        summary="error against run time of T4, T10, ENMC, FN, FN18 and the brick H3843",
-        about="Paper T's comparison repeated: the elements on a rigid pendulum and on a soft bar with large "
-        "deflection, static and in motion. Error against unknowns and run time, as a table, JSON, CSV and a plot.",
-        options=("device", "sizes", "repeat", "quick"),
-        out="FOLDER",
-        example="--device cpu --out results",
-        results=("ancf_tets.json", "ancf_tets.csv", "ancf_tets.png"),
-    ),
-    Entry(
         name="ancf",
         module="reports.ancf",
         summary="ANCF beams, shells and solids against closed forms and other programs",
@@ -243,15 +232,6 @@ _ENTRIES = (
         options=("before", "bench", "repeat"),
         example="--before ../before --bench '--cpu --limit 5' --repeat 5 --out tests/results/versions_cpu.json",
         results=("versions_cpu.json", "versions_h200.json", "hard_steps_cpu.json", "hard_steps_h200.json"),
-    ),
-    Entry(
-        name="peer-meshes",
-        module="bench.peer_meshes",
-        summary="make the unstructured meshes of `warpfea bench --peer` with Gmsh",
-        about="Writes bar_*.npz into --out, by default tests/data of the checkout; needs gmsh.",
-        out="FOLDER",
-        example="--out tests/data",
-        takes="seconds",
     ),
 )
 STUDIES: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
