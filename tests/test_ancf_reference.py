@@ -1,6 +1,6 @@
 """The ANCF elements against references made without warpfea: the committed numbers, and some of them live.
 
-`warpfea study ancf` makes tests/results/ancf_reference.json; what it takes minutes to compute is read from there.
+`python -m tests.validation ancf` makes tests/results/ancf_reference.json; what takes minutes is read there.
 """
 
 import itertools
@@ -9,9 +9,10 @@ import pathlib
 
 import numpy as np
 import pytest
+from validation import ancf as report
+from validation.table import Run
 
 import warpfea as wf
-from warpfea.studies.reports import ancf as report
 
 HERE = pathlib.Path(__file__).resolve().parent
 
@@ -19,7 +20,7 @@ HERE = pathlib.Path(__file__).resolve().parent
 @pytest.fixture(scope="module")
 def parts():
     content = json.loads((HERE / "results" / "ancf_reference.json").read_text())
-    assert set(content["parts"]) == set(report.PARTS)
+    assert set(content["parts"]) == set(report.TABLE.parts)
     for part in content["parts"].values():
         assert {"command", "commit", "machine", "versions", "rows"} <= set(part)
         assert part["rows"]
@@ -129,20 +130,20 @@ def test_manufactured_sines_of_beams_and_plates(parts):
 
 
 def test_beam_equals_chrono_live():
-    check_chrono(report.static_beam("cpu", quick=True))
+    check_chrono(list(report.static_beam(Run(quick=True))))
 
 
 def test_princeton_live():
-    (row,) = report.princeton("cpu", quick=True)
+    (row,) = report.princeton(Run(quick=True))
     assert row["tip_error_over_L"] < 1e-3
     assert row["twist"] == pytest.approx(row["twist_reference"], rel=0.005)
 
 
 def test_frequencies_live():
-    for r in report.frequencies("cpu", quick=True):
+    for r in report.frequencies(Run(quick=True)):
         if r["integration"] == "tied":
             assert max(r["from_theory"]) < 0.01
-    assert np.isfinite([r["omega"] for r in report.frequencies("cpu", quick=True)]).all()
+    assert np.isfinite([r["omega"] for r in report.frequencies(Run(quick=True))]).all()
 
 
 @pytest.mark.parametrize("thickness", [0.05, 1e-3])

@@ -141,7 +141,7 @@ def test_growth_shows_failures(bench, monkeypatch, limits, tol, words):
         assert all(outcome.startswith(words) for outcome in row["outcome"])
         assert (row["pcg"], row["growth"]) == ([None, None], None)
     assert content["worst"] == {"beam": {"growth": None, "failures": 12}}
-    assert "failed" in text
+    assert "failures" in text
 
 
 def test_cpu_steps_with_three_solvers(bench, monkeypatch):

@@ -1,11 +1,10 @@
-"""tests/results/conservation_cpu.json, made by `warpfea study conservation`: what energy_momentum keeps, and README."""
+"""tests/results/conservation_cpu.json, by `python -m tests.validation conservation`, and README."""
 
 import json
 import pathlib
 
 import pytest
-
-from warpfea.studies.reports.conservation import CASES, FREE, MECHANISMS, STEPS
+from validation.conservation import CASES, FREE, MECHANISMS, STEPS
 
 HERE = pathlib.Path(__file__).resolve().parent
 BOUND = {"svk": 1e-9, "mooney_rivlin": 1e-8, "neo_hookean": 1e-8}

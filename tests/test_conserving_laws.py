@@ -5,11 +5,10 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
+from validation.conservation import LAWS
 from warpfea.kernels.common.types import kernel_module, precision
 from warpfea.kernels.elements import materials
 from warpfea.kernels.elements.conserving import conserving_law
-
-from warpfea.studies.reports.conservation import LAWS
 
 
 @functools.cache

@@ -1,12 +1,10 @@
-"""The committed result of `warpfea study contact`, and a coarse run: Hertz, Mindlin, an elastic ball's rebound."""
+"""The result of `python -m tests.validation contact`, and a coarse run: Hertz, Mindlin, an elastic ball's rebound."""
 
 import json
 import pathlib
 
 import pytest
-
-from warpfea.studies.reports.contact.ball import rebound_case
-from warpfea.studies.reports.contact.block import hertz_case
+from validation.contact import hertz_case, rebound_case
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "contact_hertz_cpu.json"
 MOST_NEWTON = 50

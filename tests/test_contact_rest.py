@@ -1,11 +1,10 @@
-"""The committed result of `warpfea study contact` on a wall and a turntable, and short runs: friction holds bodies."""
+"""The result of `python -m tests.validation contact` on a wall and a turntable, short runs: friction holds bodies."""
 
 import json
 import pathlib
 
 import pytest
-
-from warpfea.studies.reports.contact.rest import turntable_case, wall_case
+from validation.contact import turntable_case, wall_case
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "contact_rest_cpu.json"
 

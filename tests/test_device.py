@@ -5,9 +5,9 @@ import pathlib
 
 import numpy as np
 import pytest
+from validation import devices as report
 
 import warpfea as wf
-from warpfea.studies.reports import devices as report
 
 HERE = pathlib.Path(__file__).resolve().parent
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 import warp as wp
+from validation.conservation import RATE, Conserved, tumble
 
 import warpfea as wf
 from warpfea.model.assembly import geometry, gradients
 from warpfea.simulation import integrators
-from warpfea.studies.reports.conservation import RATE, Conserved, tumble
 
 TIGHT = wf.NewtonPCG(tol=1e-12)
 OMEGA = np.array([1.0, 2.0, 10.0])

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import warp as wp
+from validation.conservation import CASES, DT, MECHANISMS, RATE, Conserved, mechanism, tumble
+from validation.mechanisms import swing
 
 import warpfea as wf
 from warpfea.solvers.assembled import Assembled
-from warpfea.studies.reports.conservation import CASES, DT, MECHANISMS, RATE, Conserved, mechanism, tumble
-from warpfea.studies.reports.mechanisms import swing
 
 TIGHT = wf.NewtonPCG(tol=1e-12)
 QUICK = (("T10", "svk"), ("T4", "neo_hookean"), ("3243 tied", "svk"))

@@ -1,13 +1,12 @@
 """What `StepReport.floor` tells of float32, beside the true error; tests/results/floor_cpu.json, made by
-`warpfea study floor`."""
+`python -m tests.validation floor`."""
 
 import json
 import pathlib
 
 import numpy as np
 import pytest
-
-from warpfea.studies.reports.floor import CASES, SEED, draw, tried
+from validation.floor import CASES, SEED, draw, tried
 
 FILE = pathlib.Path(__file__).resolve().parent / "results" / "floor_cpu.json"
 GIVEN = tuple(draw(np.random.default_rng(0)))
@@ -26,7 +25,7 @@ def assert_honest(row):
 
 @pytest.fixture(scope="module")
 def rows():
-    assert FILE.exists(), f"{FILE} is missing: warpfea study floor --out {FILE}"
+    assert FILE.exists(), f"{FILE} is missing: python -m tests.validation floor --out {FILE}"
     content = json.loads(FILE.read_text())
     assert len(content["commit"]) >= 40
     assert content["settings"]["seed"] == SEED

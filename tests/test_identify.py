@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 import pytest
 
-from warpfea.studies.reports.identify import NOISE, TRUTH, identify, record
+from warpfea.studies.identify import NOISE, TRUTH, identify, record
 
 FOLDER = pathlib.Path(__file__).resolve().parent / "results"
 

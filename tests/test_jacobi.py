@@ -281,7 +281,7 @@ def test_command_line_says_so(tmp_path, capfd):
 
 
 def test_the_committed_table():
-    """tests/results/jacobi_cpu.json, made by `warpfea study jacobi`: what helps, and what it does not do."""
+    """tests/results/jacobi_cpu.json, made at 51a4e5d: what helps, and what it does not do."""
     content = json.loads(RESULT.read_text())
     assert content["machine"]["device"].startswith("cpu")
     assert len(content["commit"]) >= 40

@@ -1,4 +1,4 @@
-"""The committed tables of `warpfea study joints`: cost with m joints on both devices, stability of extreme cases."""
+"""The tables of `python -m tests.validation joints`: cost with m joints on both devices, stability of extreme cases."""
 
 import json
 import pathlib

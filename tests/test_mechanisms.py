@@ -1,6 +1,7 @@
 """Joints against mechanisms computed without warpfea: the committed numbers, and small versions of them live.
 
-`warpfea study mechanisms` makes tests/results/mechanisms.json; what it takes minutes to compute is read from there.
+`python -m tests.validation mechanisms` makes tests/results/mechanisms.json; what takes minutes is read from there, and
+the part flexible_slider_crank, made at 51a4e5d and no longer kept.
 """
 
 import itertools
@@ -8,17 +9,19 @@ import json
 import pathlib
 
 import pytest
+from validation import mechanisms as report
+from validation.table import Run
 
 import warpfea as wf
-from warpfea.studies.reports import mechanisms as report
 
+QUICK = Run(quick=True)
 HERE = pathlib.Path(__file__).resolve().parent
 
 
 @pytest.fixture(scope="module")
 def parts():
     content = json.loads((HERE / "results" / "mechanisms.json").read_text())
-    assert set(content["parts"]) == set(report.PARTS)
+    assert set(content["parts"]) == {*report.TABLE.parts, "flexible_slider_crank"}
     for part in content["parts"].values():
         assert {"command", "commit", "machine", "versions", "rows"} <= set(part)
         assert "--quick" not in part["command"]
@@ -177,27 +180,22 @@ def test_angular_momentum_of_a_tied_pair_is_that_of_one_body(parts):
 
 
 def test_rigid_slider_crank_live():
-    check_rigid(report.rigid_slider_crank("cpu", quick=True))
-
-
-def test_flexible_slider_crank_live():
-    (row,) = report.flexible_slider_crank("cpu", quick=True)  # a quarter of the first turn
-    assert row["peak"] > 1.5e-3
-    assert row["from_model"] < 0.02
+    check_rigid(report.rigid_slider_crank(QUICK))
 
 
 def test_double_pendulum_live():
-    (row,) = report.double_pendulum("cpu", quick=True)
+    (row,) = report.double_pendulum(QUICK)
     assert max(row["elbow_error"], row["tip_error"]) < 1e-4
 
 
 def test_hanging_chain_live():
-    check_chain(report.hanging_chain("cpu", quick=True))
+    check_chain(report.hanging_chain(QUICK))
 
 
 def test_no_drift_live_and_resumed(tmp_path):
     """1000 steps; and the same again from a checkpoint after 500: bit for bit, with all that was recorded."""
-    path = tmp_path / "half.npz"
+    again_quick = Run(quick=True, out=tmp_path / "mechanisms.json")
+    path = again_quick.checkpoint("no_drift")
     whole, joints = report.swing("cpu")
     whole.run(0.5, outputs=[wf.Checkpoint(path)], progress=False)
     whole.run(1.0, progress=False)
@@ -213,7 +211,7 @@ def test_no_drift_live_and_resumed(tmp_path):
         for column in ("time", "force", "moment", "violation"):
             assert getattr(first, column).tobytes() == getattr(second, column).tobytes()
     assert again.probe("tip").position.tobytes() == whole.probe("tip").position.tobytes()
-    (row,) = report.no_drift("cpu", quick=True, checkpoint=path)  # the report goes on from a checkpoint, too
+    (row,) = report.no_drift(again_quick)  # the table goes on from a checkpoint, too
     assert row["resumed_at"] == 500
     assert not path.exists()
     check_drift(row, 1000)
@@ -222,7 +220,7 @@ def test_no_drift_live_and_resumed(tmp_path):
 
 @pytest.mark.slow
 def test_free_fall_live():
-    rows = report.free_fall("cpu", quick=True)
+    rows = list(report.free_fall(QUICK))
     assert len(rows) > 50
     check_fall(rows)
 

@@ -238,7 +238,7 @@ def test_cuda_tests_collect_without_meshio_and_usd(tmp_path):
         assert f"tests/{name}::" in out.stdout
     # and what they simulate is made without them
     code = (
-        "from warpfea.studies.reports import devices\n"
+        "from tests.validation import devices\n"
         "from warpfea.builder.scene import find\n"
         "for make in (*devices.CASES.values(), find('cantilever')): make()\n"
     )

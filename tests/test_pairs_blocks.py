@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 from scipy.optimize import linprog
+from validation.contact import stack_case
 
 import warpfea as wf
-from warpfea.studies.reports.contact.stack import stack_case
 
 R, THICK, BLOCKS, DEPTH, G = 1.0, 0.15, 9, 0.3, 9.81
 

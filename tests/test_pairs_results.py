@@ -1,4 +1,4 @@
-"""The committed result of `warpfea study contact` on pairs: balls and cylinders beside Hertz, a stack that rests."""
+"""The result of `python -m tests.validation contact` on pairs: balls and cylinders beside Hertz, a stack that rests."""
 
 import json
 import pathlib

@@ -4,9 +4,9 @@ import json
 import pathlib
 
 import pytest
+from validation.spinning import BODIES, MODULI, RADII, STEPS, TURNS, spin_energies, spinning_body
 
 import warpfea as wf
-from warpfea.studies.surveys.spinning import BODIES, MODULI, RADII, STEPS, TURNS, spin_energies, spinning_body
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "spinning_cpu.json"
 DEFAULT = wf.GeneralizedAlpha().rho_inf

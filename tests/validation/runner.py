@@ -22,7 +22,7 @@ from warpfea.base.names import did_you_mean
 from warpfea.base.provenance import origin
 from warpfea.base.writer import check_target
 
-from .table import Row, Run, Table
+from .table import Part, Row, Run, Table
 
 __all__ = ["find", "main", "names", "parse", "run"]
 
@@ -82,7 +82,7 @@ def parse(words: Sequence[str]) -> tuple[Table | None, argparse.Namespace]:
             raise UsageError(f"name a table: {', '.join(names())} ({prog} --help tells more)")
         return None, options
     table = find(words[0])
-    lines = ["parts:", *(f"  {name:18}  {_first(part.__doc__)}" for name, part in table.parts.items())]
+    lines = ["parts:", *(f"  {name:18}  {_first(_doc(part))}" for name, part in table.parts.items())]
     if table.options:
         lines += ["", "options of --set:", *(f"  {name} = {value}" for name, value in table.options.items())]
     lines += ["", f"takes {table.takes} on two cores", "", "commands of the files in tests/results:"]
@@ -134,8 +134,9 @@ def run(table: Table, given: Run, only: Sequence[str] | None = None, words: Sequ
         table.check(given)
     kept = given.out is not None and only and given.out.exists()
     content: dict[str, Any] = json.loads(given.out.read_text()) if given.out is not None and kept else {}
-    about = {"schema": SCHEMA} if table.apart else _origin(words, given, table)
-    content |= {"parts": {}, **about, **content} if table.apart else about
+    content |= {"schema": SCHEMA} | ({} if table.apart else _origin(words, given, table))
+    if table.apart:
+        content.setdefault("parts", {})
     given.made |= {
         name: content["parts"][name]["rows"] if table.apart else content[name]
         for name in table.parts
@@ -149,7 +150,7 @@ def run(table: Table, given: Run, only: Sequence[str] | None = None, words: Sequ
             seconds = clock.perf_counter() - began
             print(f"{name}: {seconds:.0f} s", flush=True)
             if table.apart:
-                part = {"about": table.parts[name].__doc__, "rows": given.made[name], "wall_s": seconds}
+                part = {"about": _doc(table.parts[name]), "rows": given.made[name], "wall_s": seconds}
                 content["parts"][name] = part | _origin(words, given, table)
             else:
                 content[name] = given.made[name]
@@ -183,6 +184,11 @@ def _origin(words: Sequence[str], given: Run, table: Table) -> dict[str, Any]:
     command = shlex.join(["python", "-m", "tests.validation", *words])
     settings = {**table.settings, **given.options} | ({"quick": True} if given.quick else {})
     return origin([], given.device) | {"command": command} | ({"settings": settings} if settings else {})
+
+
+def _doc(part: Part) -> str | None:
+    """Docstring of a part, also of one given as a `functools.partial`."""
+    return getattr(part, "func", part).__doc__
 
 
 def _first(text: str | None) -> str:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import fnmatch
 import pathlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from warpfea.base.errors import UsageError
 
-__all__ = ["DATA", "Part", "Row", "Run", "Table"]
+__all__ = ["Part", "Row", "Run", "Table", "cases"]
 
 Row = dict[str, Any]
 """Numbers and texts that JSON can hold, by name."""
-DATA = pathlib.Path(__file__).resolve().parents[1] / "data"
-"""Reference results and meshes, made without warpfea."""
 
 
 @dataclass
@@ -49,6 +47,17 @@ class Run:
 
 Part = Callable[[Run], "Iterable[Row] | Mapping[str, Any]"]
 """Function that gives rows, one by one or all at once, or a single object; its docstring is its help."""
+
+
+def cases(about: str, case: Callable[..., Row], rows: Iterable[Mapping[str, Any]]) -> Part:
+    """A part of one row for each set of arguments of a function, which takes the device as well."""
+
+    def part(run: Run) -> Iterator[Row]:
+        for arguments in rows:
+            yield case(**arguments, device=run.device)
+
+    part.__doc__ = about
+    return part
 
 
 @dataclass(frozen=True)

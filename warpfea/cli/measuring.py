@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import pathlib
-import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -77,8 +76,8 @@ def add_bench(commands: Any) -> None:
         "  warpfea bench --linear pcg --linear direct --device cpu --out bench.json\n"
         "  warpfea bench --peer --large --out peer.json\n  warpfea bench --peer --rows 'beam-*,bar-3x2x1'\n"
         "  warpfea bench --worlds --rows 'finger-*,pendulum-auto-64' --dtype float32\n\n"
-        "how to read it:\n  residual is relative, tip error is of the tip over its travel, against a much tighter solve "
-        "of the same steps.\n  set-up is the model, compile what a simulation takes before its first step.\n\n"
+        "how to read it:\n  residual is relative, tip error is of the tip over its travel, against a much tighter "
+        "solve of the same steps.\n  set-up is the model, compile what a simulation takes before its first step.\n\n"
         "The measurements behind the tables of tests/results: python -m tests.validation --list, in a checkout.",
     )
     kind = to.add_mutually_exclusive_group()
@@ -116,61 +115,61 @@ def add_bench(commands: Any) -> None:
     group = to.add_argument_group("with --peer or --worlds")
     group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
     group.add_argument("--large", action="store_true", help="--peer: a bar of 4 million unknowns too, ten steps")
-    group.add_argument("--meshes", metavar="FOLDER", help="--peer: unstructured meshes (default: tests/data of the checkout)")
+    group.add_argument(
+        "--meshes", metavar="FOLDER", help="--peer: unstructured meshes (default: tests/data of the checkout)"
+    )
     to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")
     add_general(to, "no bars; the table is what it is for")
     to.set_defaults(command=_bench)
 
 
-STUDY_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
-    "device": ("--device", {"help": "cpu, cuda:0, ..."}),
-    "only": ("--only", {"action": "append", "metavar": "PART", "help": "parts; the others stay in --out as they are"}),
-    "quick": ("--quick", {"action": "store_true", "help": "a trial: few and small rows, no result"}),
-    "steps": ("--steps", {"type": count, "metavar": "N", "help": "steps of each run"}),
-    "worlds": ("--worlds", {"type": count, "metavar": "N", "help": "candidates at a time (default 64)"}),
-    "joints": ("--joints", {"type": counts, "metavar": "N,N,...", "help": "joints per chain (default 10,100,1000)"}),
-    "sizes": ("--sizes", {"type": counts, "metavar": "N,N,...", "help": "unknowns (default 100,300,1000,3000,10000)"}),
-    "before": ("--before", {"metavar": "FOLDER", "help": "checkout of the other version"}),
-    "bench": ("--bench", {"default": "--cpu", "metavar": "WORDS", "help": "options of warpfea bench (default --cpu)"}),
-    "repeat": (
-        "--repeat",
-        {"type": count, "default": 3, "metavar": "N", "help": "runs; the median counts (default 3)"},
+STUDIES: dict[str, tuple[str, tuple[str, ...], str]] = {
+    "identify": (
+        "stiffness and damping from a recorded, noisy motion, over many worlds",
+        ("--device", "--worlds", "--quick", "--out"),
+        "A finger of rubber is let go under gravity; scipy's differential evolution finds E and eta from the noisy "
+        "record of its tip, a generation of candidates at a time, each a world of one model. An example of parameters "
+        "per world, written for reading. Minutes on two cores.",
+    ),
+    "ancf-tets": (
+        "error against run time of T4, T10, ENMC, FN, FN18 and the brick H3843",
+        ("--device", "--sizes", "--repeat", "--quick", "--out"),
+        "Paper T's comparison repeated: the elements on a rigid pendulum and on a soft bar with large deflection, "
+        "static and in motion. Error against unknowns and run time, as a table, JSON, CSV and a plot in the folder.",
+    ),
+    "peer-meshes": (
+        "make the unstructured meshes of `warpfea bench --peer` with Gmsh",
+        ("--out",),
+        "Writes bar_*.npz into the folder of --out, by default tests/data of the checkout; needs gmsh.",
     ),
 }
-"""Options of studies: name in the registry -> flag, and how it is read."""
+"""Studies besides those of scenes: name -> help, options, description; `run` of cli/study.py does them."""
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "--device": {"help": "cpu, cuda:0, ..."},
+    "--quick": {"action": "store_true", "help": "a trial: few and small rows, no result"},
+    "--worlds": {"type": count, "metavar": "N", "help": "candidates at a time (default 64)"},
+    "--sizes": {"type": counts, "metavar": "N,N,...", "help": "unknowns (default 100,300,1000,3000,10000)"},
+    "--repeat": {"type": count, "default": 3, "metavar": "N", "help": "runs; the median counts (default 3)"},
+    "--out": {"metavar": "PATH", "help": "JSON with command, machine, settings and rows, or the folder of files"},
+}
 
 
 def add_study(commands: Any) -> None:
-    """`warpfea study`: a command of its own for each study of the registry."""
-    from ..studies.registry import STUDIES
-
+    """`warpfea study`: that of scenes, and `STUDIES`."""
     to = commands.add_parser(
         "study",
-        help="error against run time of a scene; the measurements behind the tables",
-        description="Measure error against run time of a scene or a file of your own (warpfea study SCENE --help), or "
-        "repeat a measurement: its rows are printed, and written with --out. The committed results lie in "
-        "tests/results.",
+        help="error against run time of a scene",
+        description="Measure error against run time of a scene or a file of your own (warpfea study SCENE --help).",
         epilog="examples:\n  warpfea study cantilever --over dt=1e-2,5e-3 --methods backward_euler,bdf2 --target 1e-2\n"
-        "  warpfea study my_scene.py --help\n  warpfea study ancf-tets --quick\n  warpfea study joints --help\n"
-        "  warpfea study mechanisms --only free_fall --out mechanisms.json",
+        "  warpfea study my_scene.py --help\n  warpfea study identify --quick\n\n"
+        "The measurements behind the files of tests/results: python -m tests.validation --list, in a checkout.",
     )
     names = to.add_subparsers(title="studies", metavar="STUDY", dest="study", required=True, parser_class=Parser)
     add_accuracy(names)
-    for entry in STUDIES.values():
-        lines = ["parts:", *_columns(entry.parts), ""] if entry.parts else []
-        lines += [f"takes {entry.takes} on two cores", "", "example:"]
-        lines.append(f"  warpfea study {entry.name} {entry.example}".rstrip())
-        if entry.results:
-            lines += ["", f"results, in tests/results: {', '.join(entry.results)}"]
-        about = textwrap.fill(entry.about, 100)
-        one = names.add_parser(entry.name, help=entry.summary, description=about, epilog="\n".join(lines))
-        for name in entry.options:
-            flag, how = STUDY_OPTIONS[name]
-            choices = {"choices": [part for part, _ in entry.parts]} if name == "only" else {}
-            one.add_argument(flag, **how, **choices)
-        if entry.out:
-            what = "JSON with command, machine, settings and rows" if entry.out == "FILE" else "where files are written"
-            one.add_argument("--out", metavar=entry.out, help=what)
+    for name, (text, options, about) in STUDIES.items():
+        one = names.add_parser(name, help=text, description=about, epilog=f"example:\n  warpfea study {name}")
+        for flag in options:
+            one.add_argument(flag, **_OPTIONS[flag])
         add_general(one, "no bars, no table")
         one.set_defaults(command=call("study", "study"))
 
@@ -206,7 +205,6 @@ def with_scene(words: Sequence[str]) -> list[str]:
     """
     from ..builder.scene import names
     from ..studies.accuracy.problems import problem_names
-    from ..studies.registry import STUDIES
 
     if len(words) < 2 or words[0] != "study" or words[1].startswith("-") or words[1] in (*STUDIES, SCENE):
         return list(words)
@@ -217,12 +215,6 @@ def with_scene(words: Sequence[str]) -> list[str]:
             f"file{did_you_mean(words[1], [*STUDIES, *scenes])}"
         )
     return [words[0], SCENE, *words[1:]]
-
-
-def _columns(rows: Sequence[tuple[str, str]]) -> list[str]:
-    """Names and what they mean, a line each."""
-    width = max(len(name) for name, _ in rows)
-    return [f"  {name:{width}}  {text}" for name, text in rows]
 
 
 def add_profile(commands: Any, add_model: Callable[[argparse.ArgumentParser], None]) -> None:

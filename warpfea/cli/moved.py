@@ -8,23 +8,20 @@ from ..base.errors import UsageError
 
 __all__ = ["MOVED", "refuse_moved"]
 
-MOVED = {
-    ("bench", "--growth"): "growth",
-    ("bench", "--product"): "product",
-    ("bench", "--cpu"): "cpu",
-    ("bench", "--scenes"): "scene_costs",
-    ("bench", "--contact"): "contact_cost",
-    ("bench", "--price"): "price",
-    ("bench", "--pairs"): "pair_cost",
-    ("study", "ancf-tets"): "ancf_tets",
-    ("study", "peer-meshes"): "peer_meshes",
-}
+STUDIES = (
+    "adaptive", "ancf", "ancf-tets", "conservation", "contact", "contact-integrators", "devices", "floor", "joints",
+    "mechanisms", "peer-meshes", "precision", "spinning",
+)  # fmt: skip
+KINDS = {"growth": "growth", "product": "product", "cpu": "cpu", "scenes": "scene_costs", "contact": "contact_cost",
+         "price": "price", "pairs": "pair_cost"}  # fmt: skip
+MOVED = {("study", name): name.replace("-", "_") for name in STUDIES}
+MOVED |= {("bench", f"--{kind}"): table for kind, table in KINDS.items()}
 """Command and word -> table."""
 
 
 def refuse_moved(words: Sequence[str]) -> None:
     """Refuse a command that has become a table, and name the table. UsageError."""
-    for word in words[1:]:
+    for word in words[1:2] if words[:1] == ["study"] else words[1:]:
         table = MOVED.get((words[0], word))
         if table is not None:
             raise UsageError(

@@ -1,13 +1,13 @@
-"""`warpfea study`: the studies of the registry, and those of scenes."""
+"""`warpfea study`: those of scenes, and those of `measuring.STUDIES`."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 
 from ..studies.accuracy.settings import parse_over
 from ..studies.accuracy.study import study as measure
-from ..studies.registry import STUDIES
 from . import DONE, NOT_CONVERGED
 from .source import find_scene, progress
 
@@ -17,7 +17,10 @@ __all__ = ["accuracy", "study"]
 def study(options: argparse.Namespace) -> int:
     """Do `warpfea study STUDY`."""
     with contextlib.redirect_stdout(None) if options.quiet else contextlib.nullcontext():
-        STUDIES[options.study].run(options)
+        module = {"ancf-tets": "ancf_tets.command", "peer-meshes": "bench.peer_meshes"}.get(
+            options.study, options.study
+        )
+        importlib.import_module(f"warpfea.studies.{module}").run(options)
     return DONE
 
 

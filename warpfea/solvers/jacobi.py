@@ -14,7 +14,7 @@ kernels/solvers/reuse.py. Accelerations:
   position-based dynamics", for eigenvalues of B H between LARGEST / max(4, iterations^2 / 4) and LARGEST.
 - "none": p = 0.5 z.
 
-Measured (warpfea/studies/reports/jacobi.py): "secants" needs the fewest iterations on solids and joints, with a lead
+Measured (tests/results/jacobi_cpu.json): "secants" needs the fewest iterations on solids and joints, with a lead
 that grows with their number; "anderson" is about as good up to 8, and better by a factor of two on a slender
 beam; "chebyshev" serves stiff bodies at about 8 iterations as well, stalls at eigenvalues outside its interval, and
 fails with joints. Tried and dropped: Anderson of type II in the D^-1 norm (like type I), B r in full or by half in

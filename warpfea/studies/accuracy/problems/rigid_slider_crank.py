@@ -8,9 +8,9 @@ import numpy as np
 
 import warpfea as wf
 
-from ...reports.mechanisms.cases import X, Y, Z
-from ...reports.mechanisms.rigid import STANDARD, integrate, slider_crank_kinematics, slider_crank_velocities
+from ..rigid import STANDARD, integrate, slider_crank_kinematics, slider_crank_velocities
 
+X, Y, Z = np.eye(3)
 CRANK, ROD, SIDE, DENSITY = (STANDARD[name] for name in ("crank", "rod", "side", "density"))
 SLIDER_MASS, SLIDER_SIDE = STANDARD["slider_mass"], 0.02
 

@@ -1,7 +1,6 @@
 """Reference models of planar rigid mechanisms, made without warpfea: numpy and scipy only, SI units, angles in rad.
 
-slider-crank and four-bar in closed form; two rigid links under gravity. `warpfea study mechanism-models` prints the
-checks that the docstrings quote.
+A slider-crank in closed form; two rigid links under gravity. The checks that the docstrings quote were made at 51a4e5d.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ __all__ = [
     "double_pendulum_motion",
     "double_pendulum_places",
     "double_pendulum_terms",
-    "four_bar_kinematics",
     "integrate",
     "slider_crank_kinematics",
     "slider_crank_velocities",
@@ -26,7 +24,7 @@ __all__ = [
 
 STANDARD: dict[str, Any] = {"crank": 0.15, "rod": 0.30, "speed": 150.0, "E": 2.0e11, "density": 7870.0, "side": 0.008,
             "slider_mass": 0.0755}  # fmt: skip
-"""The slider-crank of Chu and Pan (1975) and of Simeon (1996), arguments of `floating_frame_slider_crank`."""
+"""The slider-crank of Chu and Pan (1975) and of Simeon (1996); SI units."""
 
 
 def slider_crank_kinematics(angle: Any, crank: float, rod: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -68,39 +66,6 @@ def slider_crank_velocities(
     pin = crank * speed * np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
     turn = -pin[..., 1] / (rod * np.cos(psi))
     return pin, pin[..., 0] - rod * np.sin(psi) * turn, turn
-
-
-def four_bar_kinematics(
-    angle: Any, crank: float, coupler: float, rocker: float, ground: float, branch: int = 1
-) -> tuple[np.ndarray, np.ndarray]:
-    """Joints of a planar four-bar whose ground pivots are the origin (crank) and (ground, 0) (rocker).
-
-    The rocker pin is where the circle of radius coupler about the crank pin meets the circle of radius rocker about the
-    rocker's pivot: with d from crank pin to rocker pivot, along = (d^2 + coupler^2 - rocker^2) / (2 d) on that line and
-    sqrt(coupler^2 - along^2) across it.
-
-    Args:
-        angle: of the crank from the x axis, any shape.
-        crank, coupler, rocker, ground: lengths, m.
-        branch: 1, rocker pin to the left of the direction from crank pin to rocker pivot; -1, to the right. One
-            assembly of a Grashof crank-rocker keeps its branch for the whole turn; a linkage that passes a stretched
-            position (a parallelogram at angle 0) may change it there.
-
-    Returns:
-        Crank pin and rocker pin, (..., 2) each; the rocker pin is nan where the linkage does not close.
-    """
-    if branch not in (1, -1):
-        raise ValueError(f"branch = {branch!r} must be 1 or -1")
-    angle = np.asarray(angle, dtype=float)
-    pin = crank * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    line = np.array([ground, 0.0]) - pin
-    d = np.linalg.norm(line, axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        line = line / d[..., None]
-        along = (d**2 + coupler**2 - rocker**2) / (2.0 * d)
-        across = branch * np.sqrt(coupler**2 - along**2)
-        left = np.stack([-line[..., 1], line[..., 0]], axis=-1)
-        return pin, pin + along[..., None] * line + across[..., None] * left
 
 
 def double_pendulum_terms(masses: Any, lengths: Any, centers: Any, inertias: Any, gravity: float) -> tuple:

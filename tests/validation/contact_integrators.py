@@ -1,24 +1,22 @@
-"""`warpfea study contact-integrators`: the contact scenes, shortened, with every integrator.
+"""the contact scenes, shortened, with every integrator.
 
 rows    error of the probes against a finer run, over their travel, and changes of terms of the energy ledger over the
         run, over the most energy that was exchanged: `integrator` (positive: the scheme dissipates), `contact_loss`
         (restitution and damping of contacts) and `friction`.
 orders  in the step, of each curve, by least squares over its resolved rows.
-
-tests/results/contact_integrators_cpu.json is the committed result.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from ...builder.scene import find
-from ..accuracy.study import study
-from ..reports.parts import Rows, run_tables
+from warpfea.builder.scene import find
+from warpfea.studies.accuracy.study import study
 
-__all__ = ["METHODS", "SCENES", "orders", "rows", "run"]
+from .table import Row, Run, Table
+
+__all__ = ["TABLE"]
 
 METHODS = ("backward_euler", "bdf2", "energy_momentum", "generalized_alpha(rho_inf=0.8)")
 SCENES: dict[str, tuple[dict[str, Any], float, float]] = {
@@ -31,17 +29,17 @@ SCENES: dict[str, tuple[dict[str, Any], float, float]] = {
 """Name -> parameters, end and largest step, s."""
 HALVINGS = 3
 TERMS = ("integrator", "contact_loss", "friction", "viscous", "ledger_residual")
-_orders: Rows = []
+_orders: list[Row] = []
 
 
-def rows(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
+def rows(run: Run) -> Iterator[Row]:
     """A row per scene, integrator and step."""
     _orders.clear()
     for name, (values, end, dt) in SCENES.items():
-        steps = [dt / 2**k for k in range(2 if quick else HALVINGS)]
+        steps = [dt / 2**k for k in range(2 if run.quick else HALVINGS)]
         found = study(
-            find(name), over={"method": METHODS, "dt": steps}, parameters=values, t_end=end, device=device, repeat=1,
-            split="none", finer={"method": "bdf2"}, progress=False,
+            find(name), over={"method": METHODS, "dt": steps}, parameters=values, t_end=end, device=run.device,
+            repeat=1, split="none", finer={"method": "bdf2"}, progress=False,
         )  # fmt: skip
         own = found.references[0]
         _orders.extend(
@@ -56,14 +54,14 @@ def rows(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
             }  # fmt: skip
 
 
-def orders() -> Rows:
+def orders(run: Run) -> list[Row]:
     """Of each scene and integrator that `rows` ran."""
     return list(_orders)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Do `warpfea study contact-integrators`."""
-    options.device = options.device or "cpu"
-    settings = {name: {"parameters": values, "t_end": end, "dt": dt} for name, (values, end, dt) in SCENES.items()}
-    tables = {"rows": lambda: rows(options.device, options.quick), "orders": orders}
-    run_tables(options, tables, settings)
+TABLE = Table(
+    about=__doc__,
+    parts={"rows": rows, "orders": orders},
+    results={"contact_integrators_cpu.json": "contact_integrators --out tests/results/contact_integrators_cpu.json"},
+    settings={name: {"parameters": values, "t_end": end, "dt": dt} for name, (values, end, dt) in SCENES.items()},
+)

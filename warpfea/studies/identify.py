@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import time as clock
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -23,9 +22,12 @@ from scipy.optimize import differential_evolution
 
 import warpfea as wf
 
-from .parts import check_out, run_tables
+from ..base.console import number, plain, quiet_warp, write_json
+from ..base.devices import find_device
+from ..base.provenance import origin
+from ..base.writer import check_target
 
-__all__ = ["Found", "identify", "record", "rows", "run"]
+__all__ = ["Found", "identify", "record", "run"]
 
 TRUTH = {"E": 1.27e6, "eta": 4300.0}
 BOUNDS = {"E": (4e5, 4e6), "eta": (4e2, 4e4)}
@@ -131,16 +133,16 @@ def identify(
     )  # fmt: skip
 
 
-def rows(device: Any, worlds: int, generations: int) -> Iterator[dict[str, Any]]:
-    """The search, as a table of one row."""
-    yield asdict(identify(record(device), device=device, worlds=worlds, generations=generations))
-
-
 def run(options: argparse.Namespace) -> None:
     """Do `warpfea study identify`."""
-    check_out(options)
-    device = wp.get_device(options.device) if options.device else wp.get_preferred_device()
-    options.device = str(device)
+    if options.out is not None:
+        check_target(options.out, (".json",))
+    device = find_device(options.device)
     given = {"worlds": options.worlds or WORLDS, "generations": 3 if options.quick else GENERATIONS}
     settings = {**given, "truth": TRUTH, "bounds": BOUNDS, "noise": NOISE, "dt": DT, "t_end": T_END}
-    run_tables(options, {"rows": rows}, settings, device=device, **given)
+    with quiet_warp():
+        content = {"schema": 1, **origin(options.words, device), "settings": settings}
+        found = asdict(identify(record(device), device=device, **given))
+    print("  ".join(f"{name} {number(v) if isinstance(v, float) else v}" for name, v in found.items()), flush=True)
+    if options.out is not None:
+        write_json(options.out, plain(content | {"rows": [found]}))

@@ -1,4 +1,4 @@
-"""`warpfea study floor`: the error that `StepReport.floor` tells in float32, beside the true one.
+"""The error that `StepReport.floor` gives in float32, beside the true one.
 
 Random strips of 1 m, 2 to 10 times as long as wide and 2 to 80 times as wide as thick, loaded at one end mostly in
 their plane, where bending across it is soft: T4, T10, H3843, 3243 and 3443 elements, E = 1e6 to 2e11 Pa, two static
@@ -6,12 +6,10 @@ load steps or ten steps of BDF2 of a twentieth of the first period. Cases are dr
 have a reference in float64 (tol 1e-10) whose tangent is positive definite at each step, by a Cholesky factorisation;
 past a bifurcation a motion follows whatever disturbs it, so those that are not are rows of their own (`stable` false).
 Errors are the largest of any node over the largest displacement; of a motion they stand beside the sum of its floors.
-tests/results/floor_cpu.json is the committed result.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from typing import Any
 
@@ -19,9 +17,9 @@ import numpy as np
 
 import warpfea as wf
 
-from .parts import run_tables
+from .table import Row, Run, Table
 
-__all__ = ["draw", "rows", "run", "strip", "tried"]
+__all__ = ["CASES", "SEED", "TABLE", "draw", "tried"]
 
 SEED, CASES, QUICK = 6, 117, 6
 ELEMENTS = ("T4", "T10", "T10", "H3843", "3243", "3443")
@@ -40,17 +38,12 @@ def draw(rng: np.random.Generator) -> dict[str, Any]:
     width = 10 ** -rng.uniform(0.3, 1.0)
     element = str(rng.choice(ELEMENTS))
     return {
-        "element": element,
-        "motion": bool(rng.random() < 0.35),
-        "width": width,
-        "thickness": width / 10 ** rng.uniform(0.3, 1.9),
-        "cells": int(rng.integers(6, 25)),
+        "element": element, "motion": bool(rng.random() < 0.35), "width": width,
+        "thickness": width / 10 ** rng.uniform(0.3, 1.9), "cells": int(rng.integers(6, 25)),
         "across": int(rng.integers(1, 4)) if element in ("H3843", "3443") else 1,
-        "tilt": float(rng.choice([0.0, 0.0, 1e-3, 1e-2, 0.1, 0.5])),
-        "axial": float(rng.choice([0.0, 0.0, 0.5])),
-        "sag": 10 ** rng.uniform(-3.0, -1.0),
-        "E": 10 ** rng.uniform(6.0, 11.3),
-    }
+        "tilt": float(rng.choice([0.0, 0.0, 1e-3, 1e-2, 0.1, 0.5])), "axial": float(rng.choice([0.0, 0.0, 0.5])),
+        "sag": 10 ** rng.uniform(-3.0, -1.0), "E": 10 ** rng.uniform(6.0, 11.3),
+    }  # fmt: skip
 
 
 def strip(case: dict[str, Any]) -> wf.ModelBuilder:
@@ -129,19 +122,19 @@ def tried(case: dict[str, Any], device: Any) -> dict[str, Any]:
     return row | told | {"stable": row["stable"], "outcome": "accepted", "error": off}
 
 
-def rows(device: Any, count: int) -> Iterator[dict[str, Any]]:
+def rows(run: Run) -> Iterator[Row]:
     """Rows until so many cases have a stable reference."""
     rng = np.random.default_rng(SEED)
     found = 0
-    while found < count:
-        row = tried(draw(rng), device)
+    while found < (QUICK if run.quick else CASES):
+        row = tried(draw(rng), run.device)
         found += row["stable"] is True
         yield row
 
 
-def run(options: argparse.Namespace) -> None:
-    """Do `warpfea study floor`."""
-    options.device = options.device or "cpu"
-    count = QUICK if options.quick else CASES
-    settings = {"seed": SEED, "cases": count, "dtype": "float32", "reference": f"float64, tol {REFERENCE:g}"}
-    run_tables(options, {"rows": rows}, settings, device=options.device, count=count)
+TABLE = Table(
+    about=__doc__,
+    parts={"rows": rows},
+    results={"floor_cpu.json": "floor --out tests/results/floor_cpu.json"},
+    settings={"seed": SEED, "cases": CASES, "dtype": "float32", "reference": f"float64, tol {REFERENCE:g}"},
+)

@@ -1,17 +1,16 @@
-"""`warpfea study conservation`: energy and momenta of `energy_momentum` over ten thousand steps and more.
+"""Energy and momenta of `energy_momentum` over ten thousand steps and more.
 
 A free body of each family and law is thrown with a spin and stretched at the same time, so that it tumbles and
 pulsates with large strains; mechanisms without damping swing under gravity. Errors are the largest of all steps
 measured, over the first value; of mechanisms the energy less the work of their drives, over the largest of what moves
-and is stored. tests/results/conservation_cpu.json is the committed result.
+and is stored.
 """
 
 from __future__ import annotations
 
-import argparse
-import pathlib
 import time as clock
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,21 +19,9 @@ import warpfea as wf
 from warpfea.builder.scene import find
 from warpfea.simulation.checkpoint import save_checkpoint
 
-from .parts import Part, check_out, run_parts
+from .table import Part, Row, Run, Table
 
-__all__ = [
-    "CASES",
-    "FREE",
-    "MECHANISMS",
-    "RATE",
-    "Conserved",
-    "constrained",
-    "free",
-    "mechanism",
-    "revolutions",
-    "run",
-    "tumble",
-]
+__all__ = ["CASES", "DT", "FREE", "LAWS", "MECHANISMS", "RATE", "STEPS", "TABLE", "Conserved", "mechanism", "tumble"]
 
 STEPS = 10_000
 TURNS = 10_000
@@ -173,14 +160,14 @@ def _count(steps: int, quick: bool) -> int:
     return steps // QUICK if quick else steps
 
 
-def free(family: str, device: Any, quick: bool) -> Iterator[dict[str, Any]]:
-    """Rows of a family: a body of each integration and law."""
+def free(run: Run, family: str) -> Iterator[Row]:
+    """Largest relative errors of energy, momentum and angular momentum over 1e4 steps: each integration and law."""
     for name, law in CASES:
         if name.split()[0] != family:
             continue
-        sim = _sim(tumble(name, law, device), DT)
+        sim = _sim(tumble(name, law, run.device), DT)
         watch, newton, halvings, began = Conserved(sim), [], 0, clock.perf_counter()
-        for _ in range(_count(STEPS, quick)):
+        for _ in range(_count(STEPS, run.quick)):
             report = sim.step()
             newton.append(int(report.newton[0]))
             halvings += int(report.halvings[0])
@@ -191,12 +178,12 @@ def free(family: str, device: Any, quick: bool) -> Iterator[dict[str, Any]]:
         yield row | {"ms_per_step": 1e3 * seconds / sim.steps}
 
 
-def constrained(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
+def constrained(run: Run) -> Iterator[Row]:
     """Energy of mechanisms less the work of their drives, over the largest of what moves and is stored, 1e4 steps."""
     for name, (_, dt) in MECHANISMS.items():
-        sim = _sim(mechanism(name, device), dt, constraint_tol=CLOSED)
+        sim = _sim(mechanism(name, run.device), dt, constraint_tol=CLOSED)
         first, size, error, violation, halvings, newton = _mechanical(sim), 0.0, 0.0, 0.0, 0, []
-        for _ in range(_count(STEPS, quick)):
+        for _ in range(_count(STEPS, run.quick)):
             report = sim.step()
             newton.append(int(report.newton[0]))
             halvings += int(report.halvings[0])
@@ -208,8 +195,8 @@ def constrained(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
         yield {
             "scene": name, "steps": sim.steps, "dt": dt, "energy": error / size, "violation": violation,
             "integrator": abs(float(e["integrator"][0])) / size,
-            "ledger_residual": abs(float(e["ledger_residual"][0])) / size,
-            "newton": float(np.mean(newton)), "newton_max": max(newton), "halvings": halvings,
+            "ledger_residual": abs(float(e["ledger_residual"][0])) / size, "newton": float(np.mean(newton)),
+            "newton_max": max(newton), "halvings": halvings,
         }  # fmt: skip
 
 
@@ -226,15 +213,15 @@ def _mechanical(sim: wf.Simulation) -> float:
     return sum(float(e[name][0]) for name in ("kinetic", "strain", "potential")) - work
 
 
-def revolutions(device: Any, quick: bool, checkpoint: pathlib.Path | None = None) -> Iterator[dict[str, Any]]:
+def revolutions(run: Run) -> Iterator[Row]:
     """Errors after 1e4 revolutions of two bodies, and the largest of all hundredths of the way since resumed."""
     for family in ("T10", "3243 tied"):
-        start = _sim(tumble(family, "svk", device), DT)
+        start = _sim(tumble(family, "svk", run.device), DT)
         sim = _sim(start.model, DT, state=start.model.state())
         watch = Conserved(sim, start)
         step = RATE * DT
-        target = _count(round(TURNS * 2.0 * np.pi / step), quick)
-        kept = checkpoint and checkpoint.with_suffix(f".{family.replace(' ', '_')}.npz")
+        target = _count(round(TURNS * 2.0 * np.pi / step), run.quick)
+        kept = run.checkpoint(family)
         if kept and kept.exists():
             sim.resume(kept)
             print(f"    goes on from step {sim.steps} of {kept}", flush=True)
@@ -250,23 +237,12 @@ def revolutions(device: Any, quick: bool, checkpoint: pathlib.Path | None = None
             kept.unlink(missing_ok=True)
 
 
-def _free_part(family: str) -> Part:
-    def part(device: Any, quick: bool) -> Iterator[dict[str, Any]]:
-        return free(family, device, quick)
-
-    part.__doc__ = f"Largest relative errors of energy, momentum and angular momentum over 1e4 steps, {family}."
-    return part
-
-
 FREE = (*SOLIDS, "3243", "3443")
-PARTS: dict[str, Part] = {family: _free_part(family) for family in FREE}
-PARTS |= {f.__name__: f for f in (constrained, revolutions)}
-
-
-def run(options: argparse.Namespace) -> None:
-    """Do `warpfea study conservation`; revolutions keeps checkpoints beside the result, and goes on from them."""
-    more = {}
-    if options.out is not None:
-        check_out(options)
-        more["revolutions"] = {"checkpoint": pathlib.Path(options.out)}
-    run_parts(options, PARTS, **more)
+PARTS: dict[str, Part] = {family: partial(free, family=family) for family in FREE}
+TABLE = Table(
+    about=__doc__,
+    parts=PARTS | {"constrained": constrained, "revolutions": revolutions},
+    results={"conservation_cpu.json": "conservation --out tests/results/conservation_cpu.json"},
+    takes="an hour",
+    apart=True,
+)

@@ -1,4 +1,4 @@
-"""`warpfea study joints`: cost and stability of constraints.
+"""Cost and stability of constraints.
 
 cost        a chain of m links and m revolute joints that hangs and swings to the side, m = 10, 100, 1000: ms per step
             and iterations (outer: multiplier updates), for the default (multipliers with every Newton step,
@@ -7,16 +7,13 @@ cost        a chain of m links and m revolute joints that hangs and swings to th
 stability   mass ratios to 1e4, E from 1e4 to 1e12 Pa, steps from 1e-5 to 1e-2 s; a door on four hinges; a parallelogram
             linkage driven through its dead points. A case passes when every step is accepted and the violation stays
             within 1e-8 of the model's size, or when a named error of warpfea ends it.
-
-tests/results/joints_cpu.json and joints_h200.json are the committed results.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time as clock
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -24,9 +21,9 @@ import warp as wp
 
 import warpfea as wf
 
-from .parts import Part, run_tables
+from .table import Row, Run, Table
 
-__all__ = ["PARTS", "cost", "run", "stability"]
+__all__ = ["TABLE"]
 
 METHODS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -126,24 +123,21 @@ def simulate(
     energies = sim.energies()
     scale = max(float(np.abs(energies[k][0])) for k in ("kinetic", "strain", "potential", "work"))
     row |= {
-        "steps": done,
-        "outcome": outcome,
+        "steps": done, "outcome": outcome,
         "ms_per_step": 1e3 * statistics.median(times[min(5, len(times) - 1) :]) if times else None,
-        "outer": outer / n,
-        "newton": float(sim.totals["newton"][0]) / n,
-        "pcg": float(sim.totals["pcg"][0]) / n,
-        "halvings": halvings,
-        "violation": float(sim.max_violation) / model.size,
+        "outer": outer / n, "newton": float(sim.totals["newton"][0]) / n, "pcg": float(sim.totals["pcg"][0]) / n,
+        "halvings": halvings, "violation": float(sim.max_violation) / model.size,
         "residual": float(sim.max_residual),
         "ledger_residual": float(energies["ledger_residual"][0]) / max(scale, 1e-300),
-    }
+    }  # fmt: skip
     if model.probes and done:
         row["tip"] = sim.probe("tip").position[0, -1].tolist()
     return row
 
 
-def cost(device: Any, joints: Sequence[int], steps: int) -> Iterator[dict[str, Any]]:
-    """Rows of the cost part; the tips of the methods are compared with the default's."""
+def cost(run: Run) -> Iterator[Row]:
+    """Chains of m links on m joints; the tips of the methods are compared with the default's."""
+    device, joints, steps = run.device, run.options["joints"], run.options["steps"]
     for m, E in [(m, 7e8) for m in joints] + [(min(joints), 7e10), (min(joints), 7e12)]:
         tip = None
         for name, solver in METHODS.items():
@@ -162,8 +156,9 @@ def cost(device: Any, joints: Sequence[int], steps: int) -> Iterator[dict[str, A
             yield row
 
 
-def stability(device: Any, joints: Sequence[int], steps: int) -> Iterator[dict[str, Any]]:
-    """Rows of the stability part."""
+def stability(run: Run) -> Iterator[Row]:
+    """Hard cases."""
+    device, steps = run.device, run.options["steps"]
 
     def case(problem: str, builder: wf.ModelBuilder, dt: float, count: int, **labels: Any) -> dict[str, Any]:
         row = {"problem": problem, **labels} | simulate(builder, dt=dt, steps=count, device=device)
@@ -185,12 +180,13 @@ def stability(device: Any, joints: Sequence[int], steps: int) -> Iterator[dict[s
             yield case("parallelogram through its dead points", parallelogram(E), 0.05 / count, count, E=E, ratio=1.0)
 
 
-PARTS: dict[str, Part] = {f.__name__: f for f in (cost, stability)}
-
-
-def run(options: argparse.Namespace) -> None:
-    """Do `warpfea study joints`."""
-    steps = options.steps or 40
-    settings = {"steps": steps, "integrator": "bdf2", "constraint_tol": 1e-8, "cost_dt": 1e-3}
-    joints = options.joints or (10, 100, 1000)
-    run_tables(options, PARTS, settings, device=options.device, joints=joints, steps=steps)
+TABLE = Table(
+    about=__doc__,
+    parts={"cost": cost, "stability": stability},
+    results={
+        "joints_cpu.json": "joints --out tests/results/joints_cpu.json",
+        "joints_h200.json": "joints --device cuda:0 --out tests/results/joints_h200.json",
+    },
+    settings={"integrator": "bdf2", "constraint_tol": 1e-8, "cost_dt": 1e-3},
+    options={"steps": 40, "joints": (10, 100, 1000)},
+)

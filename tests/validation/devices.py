@@ -1,11 +1,15 @@
-"""Small models with every kind of element, law, load and constraint: each gives its builder and a body."""
+"""A CUDA device against the CPU on the same models, in both precisions: every kind of element, law, load, constraint.
+
+h = 1e-3 s; differences over the tip's travel. The tests run the same cases where there is a device.
+"""
 
 # mypy: disable-error-code="index"
 # (vectors of device functions: Warp does not declare that they can be indexed)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time as clock
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -13,10 +17,12 @@ import numpy as np
 import warp as wp
 
 import warpfea as wf
+from warpfea.base.errors import UsageError
+from warpfea.studies.checkout import data_file
 
-from ...checkout import data_file
+from .table import Row, Run, Table
 
-__all__ = ["CASES", "cantilever", "s3_mesh"]
+__all__ = ["CASES", "TABLE", "cantilever", "compare", "s3_mesh", "simulate"]
 
 SVK: dict[str, Any] = {"E": 1e6, "nu": 0.3, "density": 1000.0}
 DAMPING = {form: wf.KelvinVoigt(3e3, 4.5e3, form=form) for form in ("incremental", "rate", "explicit")}
@@ -153,3 +159,59 @@ CASES: dict[str, Callable[[], tuple[wf.ModelBuilder, wf.Body]]] = {
     "mechanism": mechanism,
     "T10 chain": chain,
 }
+
+
+STEPS = 100
+CONSTRAINT_TOL = {"float64": 1e-13, "float32": None}
+"""Rows of a weld are almost dependent: what the default leaves of them, 1e-8 of the size, depends on the way there."""
+
+
+def simulate(case, device, dtype="float64", steps=100, integrator="backward_euler", tol=None, worlds=1, dt=1e-3):
+    """Tip displacement over time (worlds, steps, 3) and the last report, of one case on one device."""
+    b, body = CASES[case]()
+    model = b.finalize(device=device, dtype=dtype, worlds=worlds)
+    tol = tol or (1e-12 if dtype == "float64" else None)
+    solver = wf.NewtonPCG(tol=tol)
+    sim = wf.Simulation(model, dt=dt, integrator=integrator, solver=solver, constraint_tol=CONSTRAINT_TOL[dtype])
+    start = clock.perf_counter()
+    report = sim.step(steps)
+    wall = (clock.perf_counter() - start) / steps
+    return sim.probe("tip").displacement, report, wall, sim
+
+
+def compare(case, integrator="backward_euler", steps=STEPS, cuda="cuda:0"):
+    """One row: how far CUDA is from the CPU in both precisions, relative to the tip's travel."""
+    row = {"case": case, "integrator": integrator, "steps": steps, "tol_float64": 1e-12}
+    reference, _, wall, _ = simulate(case, "cpu", steps=steps, integrator=integrator)
+    travel = np.abs(reference).max()
+    row["cpu_ms_per_step"] = 1e3 * wall
+    for dtype in ("float64", "float32"):
+        tip, report, wall, _ = simulate(case, cuda, dtype, steps=steps, integrator=integrator)
+        row[f"cuda_{dtype}_difference"] = float(np.abs(tip - reference).max() / travel)
+        row[f"cuda_{dtype}_residual"] = float(report.residual[0])
+        row[f"cuda_{dtype}_ms_per_step"] = 1e3 * wall
+    return row
+
+
+def rows(run: Run) -> Iterator[Row]:
+    """A row per case, and one of bdf2."""
+    for case in CASES:
+        yield compare(case, steps=run.options["steps"], cuda=run.device)
+    yield compare("S3 svk tet4", integrator="bdf2", steps=run.options["steps"], cuda=run.device)
+
+
+def check(run: Run) -> None:
+    """UsageError without a CUDA device."""
+    if not wp.get_device(run.device).is_cuda:
+        raise UsageError(f"--device {run.device}: name a CUDA device, it is compared with the CPU")
+
+
+TABLE = Table(
+    about=__doc__,
+    parts={"rows": rows},
+    results={"device_agreement.json": "devices --device cuda:0 --out tests/results/device_agreement.json"},
+    settings={"dt": 1e-3, "tol_float64": 1e-12},
+    options={"steps": STEPS},
+    device="cuda:0",
+    check=check,
+)

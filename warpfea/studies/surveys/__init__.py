@@ -1,1 +1,0 @@
-"""Studies made of many studies of error against run time."""
