@@ -1,14 +1,15 @@
-"""`warpfea bench --peer`, `--growth`, `--cpu` and others, in this process on tiny rows; the table of the peer."""
+"""`warpfea bench --peer`, the tables of costs in tests/validation, on tiny rows in this process."""
 
 import json
 import pathlib
 
 import numpy as np
 import pytest
+from validation import cpu as bench_cpu
+from validation import growth as bench_growth
+from validation import runner
 
 from warpfea.cli import main
-from warpfea.studies.bench import cpu as bench_cpu
-from warpfea.studies.bench import growth as bench_growth
 from warpfea.studies.bench import peer as bench_peer
 from warpfea.studies.bench.problems import PROBLEMS
 
@@ -21,7 +22,8 @@ def bench(tmp_path, capfd):
 
     def run(*words):
         target = tmp_path / "out.json"
-        code = main(["bench", *words, "--device", "cpu", "--out", str(target)])
+        todo = (main, "bench") if not words or words[0].startswith("-") else (runner.main,)
+        code = todo[0]([*todo[1:], *words, "--device", "cpu", "--out", str(target)])
         out, err = capfd.readouterr()
         return code, out + err, json.loads(target.read_text()) if target.exists() else None
 
@@ -111,7 +113,7 @@ def test_unstructured_meshes_are_as_large_as_the_peers(case):
 
 
 def test_growth_covers_the_product(bench):
-    code, text, content = bench("--growth", "--problem", "beam", "--sizes", "24,96")
+    code, text, content = bench("growth", "--set", "problems=beam", "--set", "sizes=24,96")
     assert code == 0, text
     rows = content["rows"]
     assert {(r["E"], r["dt"], r["nu"]) for r in rows} == {
@@ -133,20 +135,20 @@ def test_growth_shows_failures(bench, monkeypatch, limits, tol, words):
     monkeypatch.setattr(bench_growth, "LIMITS", bench_growth.LIMITS | limits)
     monkeypatch.setattr(bench_growth, "TOL", tol)
     monkeypatch.setattr(bench_growth, "MODULI", (1e8,))
-    code, text, content = bench("--growth", "--problem", "beam", "--sizes", "24,96")
+    code, text, content = bench("growth", "--set", "problems=beam", "--set", "sizes=24,96")
     assert code == 0, text
     for row in content["rows"]:
         assert all(outcome.startswith(words) for outcome in row["outcome"])
         assert (row["pcg"], row["growth"]) == ([None, None], None)
     assert content["worst"] == {"beam": {"growth": None, "failures": 12}}
-    assert "failed" in text
+    assert "failures" in text
 
 
 def test_cpu_steps_with_three_solvers(bench, monkeypatch):
     sizes = {"a": (1, 1, 1), "b": (3, 2, 1)}
     cases = [bench_cpu.CpuCase(f"bar-{k}", "bar", size, (1.0, 2.0)) for k, size in sizes.items()]
     monkeypatch.setattr(bench_cpu, "CASES", (*cases, bench_cpu.CpuCase("beam-1", "beam", 1)))
-    code, text, content = bench("--cpu", "--rows", "bar-*", "--steps", "3")
+    code, text, content = bench("cpu", "--rows", "bar-*", "--set", "steps=3")
     assert code == 0, text
     rows = content["rows"]
     assert [(r["label"], r["solver"]) for r in rows] == [(f"bar-{k}", s) for k in sizes for s in bench_cpu.SOLVERS]
@@ -162,7 +164,7 @@ def test_cpu_steps_with_three_solvers(bench, monkeypatch):
 def test_cpu_leaves_out_what_takes_too_long(bench, monkeypatch):
     cases = [bench_cpu.CpuCase(f"bar-{k}", "bar", (k, 1, 1)) for k in (1, 2, 3)]
     monkeypatch.setattr(bench_cpu, "CASES", tuple(cases))
-    code, text, content = bench("--cpu", "--steps", "3", "--limit", "1e-9")
+    code, text, content = bench("cpu", "--set", "steps=3", "--set", "limit_s=1e-9")
     assert code == 0, text
     rows = [r for r in content["rows"] if r["solver"] == "direct"]
     assert [r["steps"] for r in rows] == [1, 0, 0]
@@ -183,7 +185,7 @@ def test_rows_of_the_cpu_are_as_large_as_they_say():
 
 
 def test_contact_stands_beside_a_step_without(bench):
-    code, text, content = bench("--contact", "--unknowns", "300", "--steps", "2", "--repeat", "1")
+    code, text, content = bench("contact_cost", "--set", "sizes=300", "--set", "steps=2", "--set", "repeat=1")
     assert code == 0, text
     rows = {row["scene"]: row for row in content["rows"]}
     assert set(rows) == {"none", "clamped", "apart", "resting", "sliding"}
@@ -200,7 +202,7 @@ def test_contact_stands_beside_a_step_without(bench):
 @pytest.mark.slow
 def test_pairs_measure_rows_of_each_kind(bench):
     rows = "pile-4-loose,pile-4-T10-tight,search-1e3,core-1e4,worlds-blocks-1,worlds-finger-16"
-    code, text, content = bench("--pairs", "--rows", rows, "--steps", "2")
+    code, text, content = bench("pair_cost", "--rows", rows, "--set", "steps=2")
     assert code == 0, text
     found = {row["label"]: row for row in content["rows"]}
     assert list(found) == rows.split(",")
@@ -218,17 +220,14 @@ def test_pairs_measure_rows_of_each_kind(bench):
 BAD = {
     "unknown row": (["--peer", "--rows", "bar-1"], ["'bar-1'", "bar-3x2x1"]),
     "no such folder": (["--peer", "--meshes", "nowhere"], ["nowhere"]),
-    "both": (["--peer", "--growth"], ["--growth", "--peer"]),
+    "both": (["--peer", "--worlds"], ["--worlds", "--peer"]),
+    "a kind that moved": (["--growth", "--steps", "3"], ["--growth", "tests.validation growth"]),
     "rows alone": (["--rows", "bar-3x2x1"], ["--rows", "--peer"]),
     "sizes of the peer": (["--peer", "--unknowns", "1000"], ["--unknowns", "--peer"]),
-    "steps of growth": (["--growth", "--steps", "3"], ["--steps", "--growth"]),
-    "steps of the product": (["--product", "--steps", "3"], ["--steps", "--product"]),
-    "limit of contact": (["--contact", "--limit", "3"], ["--limit", "--contact"]),
-    "limit of the peer": (["--peer", "--limit", "3"], ["--limit", "--peer"]),
-    "precision on the CPU": (["--cpu", "--dtype", "float32"], ["--dtype", "--cpu"]),
-    "repeats of pairs": (["--pairs", "--repeat", "3"], ["--repeat", "--pairs"]),
-    "unknown row of the CPU": (["--cpu", "--rows", "bar"], ["'bar'", "brick-1080"]),
-    "too small": (["--growth", "--sizes", "5"], ["5", "270"]),
+    "steps of worlds": (["--worlds", "--steps", "3"], ["--steps", "--worlds"]),
+    "unknown row of the CPU": (["cpu", "--rows", "bar"], ["bar"]),
+    "another device": (["cpu", "--device", "cuda:0"], ["cpu"]),
+    "too small": (["growth", "--set", "sizes=5"], ["5", "270"]),
 }
 
 

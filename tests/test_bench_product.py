@@ -1,14 +1,14 @@
-"""`warpfea bench --product` on tiny problems: its operators are H, its counts are those of the tables."""
+"""The table `product` on tiny problems: its operators are H, its counts are those of the tables."""
 
 import json
 import types
 
 import numpy as np
 import pytest
+from validation import product as bench_product
+from validation.product_cost import cost
+from validation.runner import main
 
-from warpfea.cli import main
-from warpfea.studies.bench import product as bench_product
-from warpfea.studies.bench.cost import cost
 from warpfea.studies.bench.problems import LAW, PROBLEMS
 
 SIZES = {"bar": (2, 1, 1), "beam": 2, "plate": 1, "ENMC": (1, 1, 1), "FN18": (1, 1, 1)}
@@ -64,20 +64,9 @@ def test_bytes_of_the_matrix():
 
 def test_product_measures_both_operators(tmp_path, capfd):
     target = tmp_path / "out.json"
-    words = [
-        "--product",
-        "--problem",
-        "beam",
-        "--sizes",
-        "24",
-        "--repeat",
-        "1",
-        "--device",
-        "cpu",
-        "--out",
-        str(target),
-    ]
-    assert main(["bench", *words]) == 0
+    assert (
+        main(["product", "--set", "problems=beam", "--set", "sizes=24", "--set", "repeat=1", "--out", str(target)]) == 0
+    )
     text = capfd.readouterr().out
     content = json.loads(target.read_text())
     assert {"schema", "command", "commit", "machine", "versions", "settings"} <= set(content)

@@ -105,7 +105,7 @@ BAD = {
     "render a wrong size": (["render", "bad.usdc", "-o", "o.png", "--size", "big"], ["--size", "'big'"]),
     "bench too small": (["bench", "--unknowns", "10"], ["--unknowns 10", "270"]),
     "bench text": (["bench", "--unknowns", "many"], ["--unknowns", "'many'"]),
-    "no such study": (["study", "hok"], ["'hok'", "ancf-tets", "did you mean 'hook'"]),
+    "no such study": (["study", "hok"], ["'hok'", "identify", "did you mean 'hook'"]),
     "later command": (["sweep", "--set", "E=1"], ["sweep", "not part of this version"]),
 }
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from validation import product as bench_product
 from warpfea.kernels.elements.cluster import cluster_size, slot_capacity, table_layout
 
 import warpfea as wf
 from warpfea.solvers.clusters import cluster_tables
-from warpfea.studies.bench import product as bench_product
 
 
 def summed(conn, size, values, n):

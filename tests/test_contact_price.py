@@ -1,14 +1,11 @@
-"""The committed tables of `warpfea bench --contact`: what contact costs beside a step without it."""
+"""The committed tables `contact_cost`: what contact costs beside a step without it."""
 
 import json
 import pathlib
-from dataclasses import asdict
 
 import numpy as np
 import pytest
-
-from warpfea.studies.bench.contact import start
-from warpfea.studies.bench.contact_solves import BESIDE, SOLVES, solve_rows
+from validation.contact_cost import BESIDE, SOLVES, solve_rows, start
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 FILES = {"contact_cpu.json": ("cpu", 8000, 1.3), "contact_h200.json": ("cuda", 100_000, 1.1)}
@@ -17,7 +14,7 @@ FILES = {"contact_cpu.json": ("cpu", 8000, 1.3), "contact_h200.json": ("cuda", 1
 
 def content_of(name):
     path = RESULTS / name
-    assert path.exists(), f"{path} is missing: make it with `warpfea bench --contact`"
+    assert path.exists(), f"{path} is missing: make it with `python -m tests.validation contact_cost`"
     content = json.loads(path.read_text())
     device, _, _ = FILES[name]
     assert content["command"].startswith("warpfea bench --contact --device")
@@ -72,4 +69,4 @@ def test_solves_take_few_more_iterations_than_with_contact_nodes_clamped(name, l
 
 def test_solves_of_a_small_block():
     sims = {key: start(key[0], 4, "float64", "cpu", None, key[1]).sim for key in SOLVES}
-    assert_solves([asdict(row) for row in solve_rows(sims)])
+    assert_solves(solve_rows(sims))

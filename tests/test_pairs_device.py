@@ -1,4 +1,4 @@
-"""tests/results/pairs_h200.json, made by `warpfea bench --pairs --device cuda:0`: contact between bodies on a GPU."""
+"""tests/results/pairs_h200.json, the table `pair_cost`: contact between bodies on a GPU."""
 
 import json
 import pathlib

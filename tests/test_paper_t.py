@@ -6,9 +6,9 @@ import functools
 import itertools
 
 import numpy as np
+import paper_t as T
 import pytest
 
-from warpfea.elements import paper_t as T
 from warpfea.elements.ancf_solid import CORNERS, FACES, tet_functions
 
 FACTORS = (2.0 / 81.0, 1.0 / 18.0)  # FN as printed, FN18

@@ -1,13 +1,13 @@
-"""The committed table of `warpfea bench --price`: what features that a scene does not use would cost it."""
+"""The committed table `price`: what features that a scene does not use would cost it."""
 
 import json
 import pathlib
 
 import pytest
+from validation.price import measure
+from validation.runner import main
 
-from warpfea.builder.scene import names
-from warpfea.cli import main
-from warpfea.studies.bench.price import cases, measure
+from warpfea.builder.scene import find, names
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "price_cpu.json"
 TRACES = {
@@ -53,16 +53,15 @@ def test_no_scene_pays_for_what_it_does_not_use():
 
 def test_a_scene_is_priced_as_in_the_table(tmp_path, capfd):
     out = tmp_path / "price.json"
-    words = ["--rows", "cantilever", "--steps", "2", "--repeat", "1", "--device", "cpu", "--out", str(out)]
-    assert main(["bench", "--price", *words]) == 0
+    words = ["--rows", "cantilever", "--set", "steps=2", "--set", "repeat=1", "--out", str(out)]
+    assert main(["price", *words]) == 0
     assert "cantilever" in capfd.readouterr().out
     (row,) = json.loads(out.read_text())["rows"]
     assert_priced(row)
 
 
 def test_what_is_forced_in_is_all_that_the_scene_leaves_out():
-    (case,) = [case for case in cases() if case.label == "slider_crank"]
-    row = measure(case, device="cpu", steps=1, repeat=1)
-    missing = set(case.scene().finalize(device="cpu").info()["left_out"])
-    assert set(row.forced) == missing
-    assert row.left == []
+    scene = find("slider_crank")
+    row = measure(scene, device="cpu", steps=1, repeat=1)
+    assert set(row["forced"]) == set(scene().finalize(device="cpu").info()["left_out"])
+    assert row["left"] == []

@@ -1,22 +1,22 @@
-"""The committed table of `warpfea bench --scenes`: no scene records or compiles more than it did before.
+"""The committed table `scene_costs`: no scene records or compiles more than it did before.
 
 Before, steps were cut by Armijo's rule alone and began where the predictor said; some scenes take an iteration more or
 less since, all together fewer.
 
 After a change that is meant to alter them, make the table anew (it keeps what it is compared with):
 
-    warpfea bench --scenes --device cpu --before tests/results/scenes_cpu.json --out tests/results/scenes_cpu.json
+    f=tests/results/scenes_cpu.json; python -m tests.validation scene_costs --set beside=$f --out $f
 """
 
 import json
 import pathlib
 
 import pytest
+from validation import scene_costs as bench
+from validation.runner import main
 
 import warpfea as wf
 from warpfea.builder.scene import names
-from warpfea.cli import main
-from warpfea.studies.bench import scenes as bench
 
 PATH = pathlib.Path(__file__).resolve().parent / "results" / "scenes_cpu.json"
 LABELS = [case.label for case in bench.cases()]
@@ -94,16 +94,16 @@ def test_the_table_is_up_to_date(tables, label):
 
 def test_the_command_compares_with_an_earlier_file(tmp_path, capfd):
     old, new = tmp_path / "old.json", tmp_path / "new.json"
-    words = ["bench", "--scenes", "--rows", "rollup", "--device", "cpu"]
+    words = ["scene_costs", "--rows", "rollup"]
     assert main([*words, "--out", str(old)]) == 0
     (row,) = json.loads(old.read_text())["rows"]
     assert row["per_step"] >= row["newton"] / bench.STEPS > 0
-    assert "before" not in capfd.readouterr().out
+    assert "rollup before" not in capfd.readouterr().out
     earlier = json.loads(old.read_text())
     earlier["rows"][0]["launches"] += 1
     old.write_text(json.dumps(earlier))
-    assert main([*words, "--before", str(old), "--out", str(new)]) == 0
-    assert f"before: launches {row['launches'] + 1}" in capfd.readouterr().out
+    assert main([*words, "--set", f"beside={old}", "--out", str(new)]) == 0
+    assert f"rollup before: launches {row['launches'] + 1}" in capfd.readouterr().out
     found = json.loads(new.read_text())
     assert found["rows"] == [row]
     assert found["before"]["rows"] == earlier["rows"]
@@ -114,14 +114,13 @@ def test_the_command_compares_with_an_earlier_file(tmp_path, capfd):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--scenes", "--before", "nowhere.json"], "nowhere.json"),
-        (["--scenes", "--rows", "crane"], "'crane'"),
-        (["--scenes", "--steps", "3"], "--steps"),
-        (["--before", "x.json"], "--scenes"),
+        (["--set", "beside=nowhere.json"], "nowhere.json"),
+        (["--rows", "crane"], "crane"),
+        (["--set", "steps=3"], "steps"),
     ],
 )
 def test_bad_usage_is_named(words, named, capsys):
-    assert main(["bench", *words, "--device", "cpu"]) == 2
+    assert main(["scene_costs", *words]) == 2
     assert named in capsys.readouterr().err
 
 
@@ -129,5 +128,5 @@ def test_a_file_of_another_kind_is_refused(tmp_path, capsys):
     for text in ("{}", "[]", "no json"):
         path = tmp_path / "x.json"
         path.write_text(text)
-        assert main(["bench", "--scenes", "--before", str(path)]) == 2
+        assert main(["scene_costs", "--set", f"beside={path}"]) == 2
         assert "x.json" in capsys.readouterr().err

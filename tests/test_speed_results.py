@@ -4,8 +4,7 @@ import json
 import pathlib
 
 import pytest
-
-from warpfea.studies.bench.cpu import CASES
+from validation.cpu import CASES
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 

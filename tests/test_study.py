@@ -1,18 +1,16 @@
-"""warpfea study ancf-tets: its parts, a trial run, its errors, and the committed result."""
+"""The table `ancf_tets`: its parts, a trial run, and the committed result."""
 
-import csv
 import json
 import pathlib
-import sys
 
 import numpy as np
 import pytest
+from validation import ancf_bars as problems
+from validation.ancf_bars import exact_tip, stepped_tip
+from validation.ancf_tets import observed_order
+from validation.runner import main
 
 import warpfea as wf
-from warpfea.cli import main
-from warpfea.studies.ancf_tets import ancf_tets, problems
-from warpfea.studies.ancf_tets.comparison import observed_order
-from warpfea.studies.ancf_tets.rigid import exact_tip, stepped_tip
 
 RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 CONVERGING = ("T10", "FN18", "ENMC", "H3843")
@@ -82,67 +80,29 @@ def test_observed_order_finds_the_exponent():
 # a trial
 
 
-def test_quick_command_writes_table_json_csv_and_plot(tmp_path, capsys):
-    pytest.importorskip("matplotlib")
-    out = tmp_path / "new"
-    words = ["study", "ancf-tets", "--quick", "--sizes", "100,300", "--device", "cpu", "--out", str(out)]
+def test_quick_rows(tmp_path, capsys):
+    path = tmp_path / "ancf_tets.json"
+    words = ["ancf_tets", "--quick", "--set", "sizes=300", "--out", str(path)]
     assert main(words) == 0
-    printed, progress = capsys.readouterr()
-    assert not progress  # stderr is no terminal
-    content = json.loads((out / "ancf_tets.json").read_text())
+    content, printed = json.loads(path.read_text()), capsys.readouterr().out
     assert content["schema"] == 1
-    assert content["command"].startswith("warpfea study ancf-tets --quick")
     assert content["settings"]["quick"] is True
+    assert set(content["references"]) == set(problems.PROBLEMS)
     assert {(r["problem"], r["element"]) for r in content["rows"]} == {
         (p, e) for p in problems.PROBLEMS for e in problems.ELEMENTS
     }
+    committed = json.loads((RESULTS / "ancf_tets.json").read_text())
+    assert set(content["rows"][0]) == set(committed["rows"][0])
     assert all(r["seconds"] > 0.0 and r["newton"] > 0 and r["pcg"] > 0 for r in content["rows"])
-    with open(out / "ancf_tets.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
-    assert len(lines) == len(content["rows"])
-    assert [float(x["error"]) for x in lines] == [r["error"] for r in content["rows"]]
-    assert (out / "ancf_tets.png").read_bytes().startswith(b"\x89PNG")
-    for text in (*problems.ELEMENTS, *problems.PROBLEMS, "unknowns", "mesh order", "seconds", "pcg"):
+    for text in (*problems.ELEMENTS, *problems.PROBLEMS, "unknowns", "mesh_order", "seconds", "pcg"):
         assert text in printed
 
 
 @pytest.mark.slow
 def test_quick_command_as_it_stands(tmp_path):
-    assert main(["study", "ancf-tets", "--quick", "--device", "cpu", "--out", str(tmp_path)]) == 0
-    check_errors(json.loads((tmp_path / "ancf_tets.json").read_text()), least=2)
-
-
-# errors
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"problems": ["flat"]}, "'flat'"),
-        ({"elements": ["T4", "T9"]}, "'T9'"),
-        ({"elements": "T4"}, "'T4'"),
-        ({"sizes": []}, "sizes"),
-        ({"sizes": [100, 0]}, "sizes"),
-        ({"repeat": 0}, "repeat"),
-    ],
-)
-def test_bad_options_are_named(options, named):
-    with pytest.raises(wf.ModelError, match=named):
-        ancf_tets(**options)
-
-
-def test_bad_usage(tmp_path, capsys, monkeypatch):
-    missing = tmp_path / "no" / "folder"
-    assert main(["study", "other"]) == 2
-    assert "ancf-tets" in capsys.readouterr().err
-    assert main(["study", "ancf-tets", "--sizes", "few"]) == 2
-    assert "'few'" in capsys.readouterr().err
-    pytest.importorskip("matplotlib")
-    assert main(["study", "ancf-tets", "--out", str(missing)]) == 4
-    assert str(missing) in capsys.readouterr().err
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert main(["study", "ancf-tets", "--out", str(tmp_path)]) == 4
-    assert "warpfea[plots]" in capsys.readouterr().err
+    path = tmp_path / "ancf_tets.json"
+    assert main(["ancf_tets", "--quick", "--out", str(path)]) == 0
+    check_errors(json.loads(path.read_text()), least=2)
 
 
 # the committed result

@@ -73,28 +73,21 @@ def add_bench(commands: Any) -> None:
         "3 x 2 x 1 m, 5000 N along x. beam: 3243, elements of 0.5 x 0.1 x 0.1 m, 3100 N across. plate: 3443, "
         "4 x 2 x 0.1 m, 1000 N down. ENMC, FN18, H3843: the bar of ANCF solids.",
         epilog="examples:\n  warpfea bench --problem plate --unknowns 1e4,1e5\n"
+        "  warpfea bench --linear pcg --linear direct --device cpu --out bench.json\n"
         "  warpfea bench --peer --large --out peer.json\n  warpfea bench --peer --rows 'beam-*,bar-3x2x1'\n"
-        "  warpfea bench --growth --out growth.json\n  warpfea bench --product --out product.json\n"
-        "  warpfea bench --cpu --out cpu.json\n  warpfea bench --contact --out contact.json\n"
-        "  warpfea bench --scenes --device cpu --before old.json --out scenes.json\n"
-        "  warpfea bench --price --rows 'pendulum,hook' --out price.json\n"
-        "  warpfea bench --pairs --rows 'pile-4-*' --out pairs.json",
+        "  warpfea bench --worlds --rows 'finger-*,pendulum-auto-64' --dtype float32\n\n"
+        "how to read it:\n  residual is relative, tip error is of the tip over its travel, against a much tighter "
+        "solve of the same steps.\n  set-up is the model, compile what a simulation takes before its first step.\n\n"
+        "The measurements behind the tables of tests/results: python -m tests.validation --list, in a checkout.",
     )
     kind = to.add_mutually_exclusive_group()
     kind.add_argument("--peer", action="store_true", help="120 steps to 5e-4 N on the peer's sizes, beside its times")
-    kind.add_argument("--growth", action="store_true", help="PCG iterations of a step for all E, dt and nu, by size")
-    kind.add_argument("--product", action="store_true", help="unknowns per second of the operator H v, its limits")
-    kind.add_argument("--cpu", action="store_true", help="ms per step of three linear solvers on this CPU, to 5e-4 N")
-    kind.add_argument("--scenes", action="store_true", help="launches, modules, bytes and iterations of every scene")
-    kind.add_argument("--contact", action="store_true", help="a step with contact beside one without")
-    kind.add_argument("--price", action="store_true", help="every scene beside itself with all that it leaves out")
-    kind.add_argument("--pairs", action="store_true", help="contact between bodies: piles, solves, search, worlds")
     kind.add_argument("--worlds", action="store_true", help="many worlds of small models: error beside run time")
     to.add_argument(
         "--problem",
         action="append",
         choices=("bar", "beam", "plate", "ENMC", "FN18", "H3843"),
-        help="may be repeated; default bar, of --growth and --product several",
+        help="may be repeated; default bar",
     )
     to.add_argument(
         "--unknowns", "--sizes", type=counts, default=[], metavar="N,N,...", help="sizes (default: a few per problem)"
@@ -104,13 +97,13 @@ def add_bench(commands: Any) -> None:
         "--dtype",
         action="append",
         choices=("float64", "float32"),
-        help="may be repeated; default both, of --peer float64 (--cpu: float64 only)",
+        help="may be repeated; default both, of --peer float64",
     )
     to.add_argument(
         "--linear", action="append", choices=("pcg", "direct"), help="linear solver, may be repeated; default pcg"
     )
-    to.add_argument("--steps", type=count, metavar="N", help="steps to simulate (default 10, --peer 120, --cpu 20)")
-    to.add_argument("--repeat", type=count, metavar="N", help="runs; the median counts (default 3, --product 9)")
+    to.add_argument("--steps", type=count, metavar="N", help="steps to simulate (default 10, --peer 120)")
+    to.add_argument("--repeat", type=count, metavar="N", help="runs; the median counts (default 3)")
     to.add_argument("--dt", type=positive, metavar="S", help="step, s (default 1e-3)")
     to.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
     to.add_argument(
@@ -119,16 +112,12 @@ def add_bench(commands: Any) -> None:
         metavar="N",
         help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
     )
-    group = to.add_argument_group("with --peer, --cpu, --scenes, --price, --pairs or --worlds")
+    group = to.add_argument_group("with --peer or --worlds")
     group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
+    group.add_argument("--large", action="store_true", help="--peer: a bar of 4 million unknowns too, ten steps")
     group.add_argument(
-        "--before", metavar="FILE", help="--scenes: an earlier file to stand beside (the `before` in it, if it has one)"
+        "--meshes", metavar="FOLDER", help="--peer: unstructured meshes (default: tests/data of the checkout)"
     )
-    group.add_argument(
-        "--limit", type=positive, metavar="S", help="--cpu: s after which a row takes no more steps (default 60)"
-    )
-    group.add_argument("--large", action="store_true", help="a bar of 4 million unknowns too, ten steps")
-    group.add_argument("--meshes", metavar="FOLDER", help="unstructured meshes (default: tests/data of the checkout)")
     to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")
     add_general(to, "no bars; the table is what it is for")
     to.set_defaults(command=_bench)

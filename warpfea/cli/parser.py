@@ -26,6 +26,7 @@ from .arguments import (
     vector,
 )
 from .measuring import add_bench, add_profile, add_stress, add_study, with_scene
+from .moved import refuse_moved
 
 __all__ = ["parse"]
 
@@ -99,6 +100,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     add_profile(commands, _add_model)
     if words and words[0] in LATER:
         raise UsageError(f"{words[0]}: {LATER[words[0]]} is not part of this version")
+    refuse_moved(words)
     arguments, rest = top.parse_known_args(_join_negative(with_scene(words)))
     if rest:
         known = commands.choices[words[0]]._option_string_actions if words[0] in commands.choices else ()

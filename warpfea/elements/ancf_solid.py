@@ -3,7 +3,8 @@
 ENMC: four corners with position and three gradients, four face centroids with a position: the complete cubic. FN: the
 face centroids are eliminated, r_c = (r_1 + r_2 + r_3)/3 + c sum of the edge derivatives that leave the face's corners
 (T-A.2), with c = 2/81 as printed, which reproduces linear fields only, or 1/18 (FN18), which reproduces all quadratics.
-Slots are Cartesian gradients d/dX_k (Paper T's S* = S T). Its printed formulas are in `paper_t`; a test compares both.
+Slots are Cartesian gradients d/dX_k (Paper T's S* = S T). Its printed formulas are in `tests/paper_t.py`; a test
+compares both.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
-"""What all benchmarks share: a run from rest, its columns, and writing rows with where they come from."""
+"""The loop of all kinds of `warpfea bench`: cases that are declared, a row after another, printed and written."""
 
 from __future__ import annotations
 
 import argparse
 import fnmatch
-import itertools
 import math
-import statistics
+import re
 import time as clock
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,48 +19,31 @@ from ...base.provenance import origin
 from ...model.model import Model
 from ...simulation.simulation import Simulation
 from ...solvers import NewtonPCG
-from .problems import Problem
 
-__all__ = [
-    "SCHEMA",
-    "TIGHTER",
-    "WARM_UP",
-    "Row",
-    "Run",
-    "by_label",
-    "check_sizes",
-    "figures",
-    "measure",
-    "run_once",
-    "solver",
-    "write",
-]
+__all__ = ["Kind", "Row", "Run", "by_label", "figures", "run_kind", "run_once", "solver"]
 
 SCHEMA = 1
-WARM_UP = 2
-"""First steps whose time does not count."""
-TIGHTER = 100.0
-"""By how much the tolerance of a reference is smaller."""
+Row = dict[str, Any]
+"""Numbers and texts by column."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """A measurement. Times in ms or s, the tip in m; `tip_error` is None where no reference was made."""
+class Kind:
+    """A kind of measurement, declared.
 
-    problem: str
-    dtype: str
-    linear: str
-    unknowns: int
-    elements: int
-    ms_per_step: float
-    newton_per_step: float
-    pcg_per_step: float
-    bytes_per_unknown: float
-    residual: float
-    tip: float
-    tip_error: float | None
-    setup_s: float
-    compile_s: float
+    Attributes:
+        options: names of the command line's options that it takes, besides those of all kinds.
+        columns: all columns of its rows -> heading and number format, "ms/step 9.3f"; "" where it is written alone.
+        cases: options -> cases, after defaults are set in the options. UsageError.
+        settings: options, cases -> all that the numbers depend on, for the file.
+        measure: case, precision, options -> a row, or a text that says why there is none.
+    """
+
+    options: frozenset[str]
+    columns: Mapping[str, str]
+    cases: Callable[[argparse.Namespace], Sequence[Any]]
+    settings: Callable[[argparse.Namespace, Sequence[Any]], dict[str, Any]]
+    measure: Callable[[Any, str, argparse.Namespace], Row | str]
 
 
 @dataclass(frozen=True)
@@ -83,6 +65,48 @@ class Run:
     def tip(self, axis: int) -> np.ndarray:
         """Displacement of the tip along an axis after each step, m."""
         return self.sim.probe("tip").displacement[0, :, axis]
+
+
+def run_kind(kind: Kind, options: argparse.Namespace) -> None:
+    """Measure the cases of a kind; a line per row, and the file --out after each. UsageError, OutputError."""
+    cases = kind.cases(options)
+    about = {
+        "schema": SCHEMA,
+        **origin(options.words or ["bench"], options.device),
+        "settings": kind.settings(options, cases),
+    }
+    rows: list[Row] = []
+
+    def write() -> None:
+        if options.out is not None:
+            write_json(options.out, about | {"rows": rows})
+
+    print(_line(kind.columns), flush=True)
+    for case in cases:
+        for dtype in options.dtype:
+            found = kind.measure(case, dtype, options)
+            if not isinstance(found, str):
+                rows.append(dict.fromkeys(kind.columns) | found)
+            print(found if isinstance(found, str) else _line(kind.columns, rows[-1]), flush=True)
+            write()
+    write()
+
+
+def _line(columns: Mapping[str, str], row: Row | None = None) -> str:
+    """The row as text, or the headings; texts end with their column's left side, the note stands last."""
+    cells = []
+    for name, shown in columns.items():
+        head, _, form = shown.rpartition(" ")
+        if not shown:
+            continue
+        width = int(re.match(r"\d+", form)[0])  # type: ignore[index]
+        value = head if row is None else row[name]
+        if isinstance(value, str):
+            cells.append(value.ljust(width) if form.isdigit() else value.rjust(width))
+        else:
+            text = "-" if value is None else str(value) if isinstance(value, bool) else format(value, form)
+            cells.append(text.rjust(width))
+    return " ".join([*cells, (row or {}).get("note") or ""]).rstrip()
 
 
 def solver(tol: float | None, **options: Any) -> NewtonPCG:
@@ -107,8 +131,8 @@ def run_once(model: Model, *, dt: float, steps: int, solver: NewtonPCG, limit: f
     return Run(sim, times, ready, largest)
 
 
-def figures(run: Run, seconds: float) -> dict[str, Any]:
-    """The columns that all tables share; `seconds` is what a step takes. Bytes are per free unknown."""
+def figures(run: Run, seconds: float) -> Row:
+    """The columns of every run from rest; `seconds` is the time of a step. Bytes are per free unknown."""
     sim, steps = run.sim, len(run.times)
     info = sim.model.info()
     return {
@@ -123,75 +147,10 @@ def figures(run: Run, seconds: float) -> dict[str, Any]:
     }
 
 
-def measure(
-    problem: Problem,
-    size: Any,
-    dtypes: list[str],
-    linear: Sequence[str] = ("pcg",),
-    *,
-    device: Any,
-    steps: int,
-    repeat: int,
-    dt: float,
-    tol: float | None,
-    with_reference: bool,
-) -> list[Row]:
-    """Rows of one mesh, one per precision and linear solver."""
-    builder = problem.build(size)
-    reference = None
-    if with_reference:
-        tight = solver(NewtonPCG(tol=tol).tolerance("float64") / TIGHTER)
-        reference = run_once(builder.finalize(device=device), dt=dt, steps=steps, solver=tight).tip(problem.axis)
-    rows = []
-    for dtype, name in itertools.product(dtypes, linear):
-        began = clock.perf_counter()
-        model = builder.finalize(device=device, dtype=dtype)
-        setup = clock.perf_counter() - began
-        first = min(WARM_UP, steps - 1)
-        how = solver(tol, linear=name)
-        run = run_once(model, dt=dt, steps=steps, solver=how)
-        times = run.times[first:]
-        for _ in range(repeat - 1):
-            times += run_once(model, dt=dt, steps=steps, solver=how).times[first:]
-        tip = run.tip(problem.axis)
-        rows.append(
-            Row(
-                problem=problem.name,
-                linear=name,
-                unknowns=model.info()["unknowns"],
-                tip=float(tip[-1]),
-                tip_error=None if reference is None else float(np.abs(tip - reference).max() / np.abs(reference).max()),
-                setup_s=setup,
-                **figures(run, statistics.median(times)),
-            )
-        )
-    return rows
-
-
-def check_sizes(problems: list[Problem], sizes: list[int]) -> None:
-    """Refuse sizes that a problem does not have. UsageError."""
-    for problem in problems:
-        if sizes and min(sizes) < problem.smallest:
-            raise UsageError(f"--unknowns {min(sizes)}: the smallest {problem.name} has {problem.smallest}")
-
-
-def by_label(rows: str, every: Sequence[Any]) -> list[Any]:
-    """Cases whose labels fit one of the words with commas, in their order. UsageError for a word that fits none."""
-    words = [word.strip() for word in rows.split(",")]
+def by_label(rows: str | None, every: Sequence[Any]) -> list[Any]:
+    """Cases whose labels fit one of the words with commas, in their order; all without words. UsageError."""
+    words = [word.strip() for word in (rows or "*").split(",")]
     for word in words:
         if not any(fnmatch.fnmatchcase(case.label, word) for case in every):
             raise UsageError(f"--rows: no row {word!r}; there are {', '.join(case.label for case in every)}")
     return [case for case in every if any(fnmatch.fnmatchcase(case.label, word) for word in words)]
-
-
-def write(options: argparse.Namespace, settings: dict[str, Any], rows: list[Any], **more: Any) -> None:
-    """Write rows (dataclasses) with where they come from to --out, if given. OutputError."""
-    if options.out is not None:
-        content = {
-            "schema": SCHEMA,
-            **origin(options.words or ["bench"], options.device),
-            "settings": settings,
-            **more,
-            "rows": [asdict(row) for row in rows],
-        }
-        write_json(options.out, content)

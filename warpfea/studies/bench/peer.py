@@ -4,7 +4,16 @@ Each row steps a problem of problems.py from rest with h = 1 ms. ms per step is 
 with the Newton iterations that |g|_2 < 5e-4 N takes; set-up and compilation are told apart. The tip after 0.1 s is
 compared with a solve ten times tighter in float64. The peer spreads the bar's 5000 N evenly over the nodes of x = 3,
 here it is a uniform traction of the same total. Its unstructured meshes are not published: those here have nearly as
-many elements and nodes (`warpfea study peer-meshes`).
+many elements and nodes (`python -m tests.validation peer_meshes`).
+
+Columns, with times in ms or s, the tip in m after 0.1 s (or the last step), forces in N:
+
+unknowns        3 x nodes or slots, as the peer counts
+free_unknowns   those that are not clamped; bytes are per free unknown
+speedup         peer_ms over ms_per_step; None where a step kept more than FORCE_TOL, as float32 may
+required        smallest speedup that will do
+residual_force  largest |g|_2 of a step
+tip_difference  of the tip from the tighter solve, over the latter
 """
 
 from __future__ import annotations
@@ -13,7 +22,8 @@ import argparse
 import pathlib
 import statistics
 import time as clock
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,10 +32,10 @@ from ...base.errors import UsageError
 from ...mesh import Mesh, check
 from ...solvers import NewtonPCG
 from ..checkout import DATA
-from .measure import Run, by_label, figures, run_once, solver, write
+from .measure import Kind, Row, by_label, figures, run_once, solver
 from .problems import PROBLEMS
 
-__all__ = ["DT", "FORCE_TOL", "LARGE", "PEER", "Case", "PeerRow", "peer", "required"]
+__all__ = ["DT", "FORCE_TOL", "LARGE", "PEER", "PEER_KIND", "Case", "required"]
 
 SOURCE = "the authors' own CUDA code (Newton + cuDSS, fixed sparsity), H200, two Newton iterations per step"
 DT = 1e-3
@@ -68,40 +78,13 @@ PEER = (
 )
 LARGE = Case("bar-90x60x30", "bar", (90, 60, 30), 4007883, None)
 LARGE_STEPS = 10
-
-
-@dataclass(frozen=True)
-class PeerRow:
-    """A measurement beside the peer's. Times in ms or s, the tip in m after 0.1 s (or the last step), forces in N.
-
-    Attributes:
-        unknowns: 3 x nodes or slots, as the peer counts.
-        free_unknowns: those that are not clamped; bytes are per free unknown.
-        speedup: peer_ms over ms_per_step; None where a step kept more than FORCE_TOL, as float32 may.
-        required: smallest speedup that will do.
-        residual_force: largest |g|_2 of a step.
-        tip_difference: of the tip from the tighter solve, over the latter.
-    """
-
-    problem: str
-    label: str
-    unknowns: int
-    free_unknowns: int
-    elements: int
-    dtype: str
-    peer_ms: float | None
-    ms_per_step: float
-    speedup: float | None
-    required: float | None
-    newton_per_step: float
-    pcg_per_step: float
-    residual: float
-    residual_force: float
-    tip: float
-    tip_difference: float | None
-    bytes_per_unknown: float
-    setup_s: float
-    compile_s: float
+COLUMNS = {
+    "problem": "", "label": "row 22", "dtype": "dtype 8", "unknowns": "unknowns 8d", "free_unknowns": "",
+    "elements": "elements 8d", "peer_ms": "peer, ms 8g", "ms_per_step": "ms/step 9.3f", "speedup": "faster 7.1f",
+    "required": "bar 4g", "newton_per_step": "Newton 6.2f", "pcg_per_step": "PCG 6.0f", "residual": "",
+    "residual_force": "|g|, N 8.1e", "tip": "tip, m 13.6e", "tip_difference": "tip diff. 9.1e",
+    "bytes_per_unknown": "B/unknown 9.0f", "setup_s": "set-up, s 9.1f", "compile_s": "compile, s 10.1f",
+}  # fmt: skip
 
 
 def required(case: Case) -> float | None:
@@ -109,49 +92,6 @@ def required(case: Case) -> float | None:
     if case.peer_ms is None:
         return None
     return 40.0 if case.unknowns >= 800_000 else 10.0 if case.unknowns >= 100_000 else 3.0
-
-
-def measure(case: Case, dtype: str, *, device: Any, steps: int, meshes: pathlib.Path) -> PeerRow:
-    """The row of a case; what has no peer is timed only."""
-    problem = PROBLEMS[case.problem]
-    size = load(meshes / case.size) if isinstance(case.size, str) else case.size
-    began = clock.perf_counter()
-    builder = problem.build(size)
-    model = builder.finalize(device=device, dtype=dtype)
-    setup = clock.perf_counter() - began
-    if case.peer_ms is None:
-        steps = min(steps, LARGE_STEPS)
-    run = run_once(model, dt=DT, steps=steps, solver=solver(None, force_tol=FORCE_TOL, **OPTIONS))
-    at = min(steps, TIP_STEP)
-    tip = float(run.tip(problem.axis)[at - 1])
-    row = PeerRow(
-        problem=case.problem,
-        label=case.label,
-        unknowns=3 * model.slots,
-        free_unknowns=model.info()["unknowns"],
-        peer_ms=case.peer_ms,
-        speedup=None,
-        required=required(case),
-        residual_force=run.residual_force,
-        tip=tip,
-        tip_difference=None,
-        setup_s=setup,
-        **figures(run, statistics.median(run.times[first_counted(steps) - 1 :])),
-    )
-    if case.peer_ms is None:
-        return row
-    if dtype != "float64":
-        model = builder.finalize(device=device)
-    exact = float(tight(model, at).tip(problem.axis)[-1])
-    met = row.residual_force <= FORCE_TOL
-    speedup = case.peer_ms / row.ms_per_step if met else None
-    return replace(row, speedup=speedup, tip_difference=abs(tip - exact) / abs(exact))
-
-
-def tight(model: Any, steps: int) -> Run:
-    """The reference, ten times tighter."""
-    tol = NewtonPCG().tolerance("float64") / TIGHTER
-    return run_once(model, dt=DT, steps=steps, solver=solver(tol, force_tol=FORCE_TOL / TIGHTER))
 
 
 def first_counted(steps: int) -> int:
@@ -165,62 +105,67 @@ def load(path: pathlib.Path) -> Mesh:
         return check(Mesh(data["points"], data["cells"], "tetra10", name=path.stem))
 
 
-def chosen(rows: str | None, large: bool) -> list[Case]:
-    """Cases by label. UsageError for a label that fits none."""
-    if rows is None:
-        return [*PEER, *([LARGE] if large else [])]
-    every = [*PEER, LARGE]
-    out = by_label(rows, every)
-    return [case for case in every if case in out or (large and case is LARGE)]
-
-
-def peer(options: argparse.Namespace) -> None:
-    """Do `warpfea bench --peer`: a line per row, and the file after each."""
-    cases = chosen(options.rows, options.large)
-    folder = pathlib.Path(options.meshes or DATA)
-    if options.meshes and not folder.is_dir():
+def _cases(options: argparse.Namespace) -> list[Case]:
+    """Cases by label, and the large one where it is asked for. UsageError."""
+    if options.meshes and not pathlib.Path(options.meshes).is_dir():
         raise UsageError(f"--meshes {options.meshes}: no such folder")
-    steps, dtypes = options.steps or STEPS, options.dtype or ["float64"]
-    settings = {
+    options.steps, options.dtype = options.steps or STEPS, options.dtype or ["float64"]
+    every = [*PEER, LARGE]
+    named = by_label(options.rows, every) if options.rows else PEER
+    return [case for case in every if case in named or (options.large and case is LARGE)]
+
+
+def _settings(options: argparse.Namespace, cases: Sequence[Case]) -> dict[str, Any]:
+    return {
         "peer": SOURCE,
         "rows": [case.label for case in cases],
-        "dtypes": dtypes,
+        "dtypes": options.dtype,
         "dt": DT,
-        "steps": steps,
-        "first_step_timed": first_counted(steps),
+        "steps": options.steps,
+        "first_step_timed": first_counted(options.steps),
         "force_tol": FORCE_TOL,
         **OPTIONS,
-        "tip_after_step": min(steps, TIP_STEP),
+        "tip_after_step": min(options.steps, TIP_STEP),
         "reference_tolerance_factor": 1.0 / TIGHTER,
-        "steps_without_peer": min(steps, LARGE_STEPS),
+        "steps_without_peer": min(options.steps, LARGE_STEPS),
     }
-    rows: list[PeerRow] = []
-    print(HEADER, flush=True)
-    for case in cases:
-        if isinstance(case.size, str) and not (folder / case.size).is_file():
-            print(f"{case.label}: left out, there is no {case.size} in {folder} (--meshes)", flush=True)
-            continue
-        for dtype in dtypes:
-            rows.append(measure(case, dtype, device=options.device, steps=steps, meshes=folder))
-            print(_line(rows[-1]), flush=True)
-            write(options, settings, rows)
-    write(options, settings, rows)
 
 
-HEADER = (
-    f"{'row':22} {'dtype':8} {'unknowns':>8} {'elements':>8} {'peer, ms':>8} {'ms/step':>9} {'faster':>7} {'bar':>4} "
-    f"{'Newton':>6} {'PCG':>6} {'|g|, N':>8} {'tip, m':>13} {'tip diff.':>9} {'B/unknown':>9} {'set-up, s':>9} "
-    f"{'compile, s':>10}"
-)
+def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row | str:
+    """The row of a case; what has no peer is timed only."""
+    problem, size = PROBLEMS[case.problem], case.size
+    if isinstance(size, str):
+        path = pathlib.Path(options.meshes or DATA) / size
+        if not path.is_file():
+            return f"{case.label}: left out, there is no {size} in {path.parent} (--meshes)"
+        size = load(path)
+    steps = options.steps if case.peer_ms else min(options.steps, LARGE_STEPS)
+    at = min(steps, TIP_STEP)
+    began = clock.perf_counter()
+    builder = problem.build(size)
+    model = builder.finalize(device=options.device, dtype=dtype)
+    setup = clock.perf_counter() - began
+    run = run_once(model, dt=DT, steps=steps, solver=solver(None, force_tol=FORCE_TOL, **OPTIONS))
+    row = {
+        "problem": case.problem,
+        "label": case.label,
+        "unknowns": 3 * model.slots,
+        "free_unknowns": model.info()["unknowns"],
+        "peer_ms": case.peer_ms,
+        "required": required(case),
+        "residual_force": run.residual_force,
+        "tip": float(run.tip(problem.axis)[at - 1]),
+        "setup_s": setup,
+        **figures(run, statistics.median(run.times[first_counted(steps) - 1 :])),
+    }
+    if case.peer_ms:
+        if dtype != "float64":
+            model = builder.finalize(device=options.device)
+        how = solver(NewtonPCG().tolerance("float64") / TIGHTER, force_tol=FORCE_TOL / TIGHTER)
+        exact = float(run_once(model, dt=DT, steps=at, solver=how).tip(problem.axis)[-1])
+        row["speedup"] = case.peer_ms / row["ms_per_step"] if run.residual_force <= FORCE_TOL else None
+        row["tip_difference"] = abs(row["tip"] - exact) / abs(exact)
+    return row
 
 
-def _line(r: PeerRow) -> str:
-    def text(value: float | None, form: str) -> str:
-        return "-" if value is None else format(value, form)
-
-    return (
-        f"{r.label:22} {r.dtype:8} {r.unknowns:8d} {r.elements:8d} {text(r.peer_ms, 'g'):>8} {r.ms_per_step:9.3f} "
-        f"{text(r.speedup, '.1f'):>7} {text(r.required, 'g'):>4} {r.newton_per_step:6.2f} {r.pcg_per_step:6.0f} "
-        f"{r.residual_force:8.1e} {r.tip:13.6e} {text(r.tip_difference, '.1e'):>9} "
-        f"{r.bytes_per_unknown:9.0f} {r.setup_s:9.1f} {r.compile_s:10.1f}"
-    )
+PEER_KIND = Kind(frozenset({"rows", "large", "meshes", "dtype", "steps"}), COLUMNS, _cases, _settings, _measure)

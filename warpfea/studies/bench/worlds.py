@@ -12,13 +12,21 @@ on_failure="freeze", no ledger). The tip of world 0 is compared with that of one
 `auto`, the defaults; `banded`, factors of a narrow band by a block of threads per world; `loose` and `rough`, with a
 tolerance of 1e-4 and 1e-2, and the factors where the band is narrow. `goal`: world-steps per second that were asked for
 at 4096 worlds in float64.
+
+Columns, with times in ms and errors over the tip's travel:
+
+later_ms, later_error   after `LATER` steps
+equal                   every world has the bits of the first
+whole_ms                of all steps of a scene in `WHOLE`, from the start; there `goal` and `reached` are about it
+goal, reached           world-steps per second asked for, and whether they are
+note                    why there are no numbers, such as too little memory
 """
 
 from __future__ import annotations
 
 import argparse
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -33,10 +41,9 @@ from ...builder.scene import find
 from ...materials import KelvinVoigt, NeoHookean
 from ...simulation.simulation import Simulation
 from ...solvers import NewtonPCG
-from .measure import by_label
-from .measure import write as write_file
+from .measure import Kind, Row, by_label
 
-__all__ = ["CASES", "GOALS", "WorldsRow", "five_tets", "worlds"]
+__all__ = ["CASES", "GOALS", "WORLDS_KIND", "five_tets"]
 
 WORLDS = (1, 64, 1024, 4096, 16384)
 WARM, TIMED, LATER = 3, 10, 100
@@ -119,68 +126,42 @@ def _methods(scene: str) -> list[str]:
 CASES = [Case(f"{s}-{m}-{B}", s, m, B) for s in SCENES for m in _methods(s) for B in WORLDS]
 
 
-@dataclass(frozen=True)
-class WorldsRow:
-    """A measurement; times in ms, errors over the tip's travel.
-
-    Attributes:
-        later_ms, later_error: after `LATER` steps.
-        equal: every world has the bits of the first.
-        whole_ms: of all steps of a scene in `WHOLE`, from the start on, which `goal` and `reached` are about there.
-        goal, reached: world-steps per second asked for, and whether they are.
-        note: why there are no numbers, such as too little memory.
-    """
-
-    label: str
-    dtype: str
-    worlds: int
-    unknowns: int
-    ms_per_step: float | None = None
-    world_steps_per_s: float | None = None
-    newton_per_step: float | None = None
-    pcg_per_step: float | None = None
-    tip_error: float | None = None
-    later_ms: float | None = None
-    later_error: float | None = None
-    bytes_per_world: float | None = None
-    equal: bool | None = None
-    goal: float | None = None
-    reached: bool | None = None
-    setup_s: float | None = None
-    methods: dict[str, str] | None = None
-    whole_ms: float | None = None
-    note: str | None = None
+COLUMNS = {
+    "label": "worlds 22", "dtype": "dtype 8", "worlds": "", "unknowns": "unknowns 8d", "ms_per_step": "ms/step 9.2f",
+    "world_steps_per_s": "world-steps/s 13.1f", "newton_per_step": "Newton 6.1f", "pcg_per_step": "PCG 6.1f",
+    "tip_error": "tip error 9.1e", "later_ms": "later, ms 9.2f", "later_error": "error 8.1e",
+    "bytes_per_world": "B/world 9.0f", "equal": "equal 5", "goal": "goal 9.0f", "reached": "", "setup_s": "",
+    "methods": "", "whole_ms": "", "note": "",
+}  # fmt: skip
 
 
-class References:
+class References(dict[str, list[Any]]):
     """Tips of one world with a tight tolerance, by scene: after the timed steps, and after the later ones."""
 
     def __init__(self, device: Any) -> None:
         self.device = device
-        self.known: dict[str, list[np.ndarray | None]] = {}
 
-    def of(self, scene: str) -> list[np.ndarray | None]:
-        """Displacements (3,), m, after `WARM + TIMED` and `LATER + TIMED` steps."""
-        if scene not in self.known:
-            build, dt = SCENES[scene]
-            model = build().finalize(device=self.device)
-            steps = WARM + TIMED, LATER + TIMED
-            found: list[np.ndarray | None] = [None, None]
-            for tol in TIGHT:
-                sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol), ledger=False)
-                whole = 0
-                while whole < max(steps) and not sim.step().halvings.any():
-                    whole += 1
-                moved = sim.probe(model.probes[0].name).displacement[0]
-                found = [moved[k - 1] if f is None and k <= whole else f for k, f in zip(steps, found)]
-                if whole == max(steps):
-                    break
-            self.known[scene] = found
-        return self.known[scene]
+    def __missing__(self, scene: str) -> list[Any]:
+        """Displacements (3,), m, after `WARM + TIMED` and `LATER + TIMED` steps; None where each tolerance halves."""
+        build, dt = SCENES[scene]
+        model = build().finalize(device=self.device)
+        steps = WARM + TIMED, LATER + TIMED
+        found: list[Any] = [None, None]
+        for tol in TIGHT:
+            sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol), ledger=False)
+            whole = 0
+            while whole < max(steps) and not sim.step().halvings.any():
+                whole += 1
+            moved = sim.probe(model.probes[0].name).displacement[0]
+            found = [moved[k - 1] if f is None and k <= whole else f for k, f in zip(steps, found)]
+            if whole == max(steps):
+                break
+        self[scene] = found
+        return found
 
     def error(self, scene: str, which: int, tip: np.ndarray) -> float | None:
-        """Distance of a tip from the reference, over its travel; None where each tolerance halves steps."""
-        wanted = self.of(scene)[which]
+        """Distance of a tip from the reference, over its travel; None without one."""
+        wanted = self[scene][which]
         return None if wanted is None else float(np.linalg.norm(tip - wanted) / np.linalg.norm(wanted))
 
 
@@ -193,78 +174,53 @@ def _timed(sim: Simulation, steps: int = TIMED) -> float:
     return 1e3 * (clock.perf_counter() - began) / steps
 
 
-def measure(case: Case, dtype: str, device: Any, references: References) -> WorldsRow:
+def _cases(options: argparse.Namespace) -> list[Case]:
+    options.dtype = options.dtype or ["float64", "float32"]
+    options.references = References(options.device)
+    return by_label(options.rows, CASES)
+
+
+def _settings(options: argparse.Namespace, cases: Sequence[Case]) -> dict[str, Any]:
+    return {
+        "rows": [case.label for case in cases], "dtypes": options.dtype, "warm_up": WARM, "timed": TIMED,
+        "later": LATER, "reference_tol": TIGHT,
+    }  # fmt: skip
+
+
+def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row:
     """A row; where memory does not suffice, or a method does not serve, it says so."""
-    build, dt = SCENES[case.scene]
+    (build, dt), references = SCENES[case.scene], options.references
     began = clock.perf_counter()
     goal = GOALS[case.scene] if case.worlds == 4096 and dtype == "float64" else None
-    unknowns = 0
+    row: Row = {"label": case.label, "dtype": dtype, "worlds": case.worlds, "unknowns": 0, "goal": goal}
     try:
-        model = build().finalize(device=device, dtype=dtype, worlds=case.worlds)
-        unknowns = model.info()["unknowns"]
+        model = build().finalize(device=options.device, dtype=dtype, worlds=case.worlds)
+        row["unknowns"] = model.info()["unknowns"]
         banded = case.method != "auto" and case.scene in NARROW
-        kind = "banded" if banded else "auto"
-        method = NewtonPCG(tol=TOLERANCES[case.method], preconditioner=kind)
+        method = NewtonPCG(tol=TOLERANCES[case.method], preconditioner="banded" if banded else "auto")
         sim = Simulation(model, dt=dt, solver=method, ledger=False, record=False, on_failure="freeze")
         sim.step(WARM)
     except (CapacityError, ModelError) as refused:
-        return WorldsRow(case.label, dtype, case.worlds, unknowns, goal=goal, note=str(refused))
-    setup = clock.perf_counter() - began
+        return row | {"note": str(refused)}
+    row |= {"setup_s": clock.perf_counter() - began, "methods": sim.methods}
     before = {name: int(sim.totals[name][0]) for name in ("newton", "pcg")}
-    ms = _timed(sim)
-    spent = {name: (int(sim.totals[name][0]) - count) / TIMED for name, count in before.items()}
+    ms = row["ms_per_step"] = _timed(sim)
+    row |= {f"{name}_per_step": (int(sim.totals[name][0]) - count) / TIMED for name, count in before.items()}
     name = model.probes[0].name
-    error = references.error(case.scene, 0, sim.probe(name).displacement[0, -1])
+    row["tip_error"] = references.error(case.scene, 0, sim.probe(name).displacement[0, -1])
     sim.step(LATER - WARM - TIMED)
-    later = _timed(sim)
+    row["later_ms"] = _timed(sim)
     u = sim.state.displacement.numpy()
-    after = references.error(case.scene, 1, sim.probe(name).displacement[0, -1])
-    whole = None
+    row["later_error"] = references.error(case.scene, 1, sim.probe(name).displacement[0, -1])
     if case.scene in WHOLE:
         sim.reset()
-        whole = _timed(sim, WHOLE[case.scene])
-    rate = 1e3 * case.worlds / (whole or ms)
-    return WorldsRow(
-        case.label, dtype, case.worlds, unknowns, ms, rate, spent["newton"], spent["pcg"], error, later,
-        after, sum(sim.bytes().values()) / case.worlds, bool((u == u[:1]).all()), goal,
-        None if goal is None else rate >= goal, setup, sim.methods, whole,
-    )  # fmt: skip
+        ms = row["whole_ms"] = _timed(sim, WHOLE[case.scene])
+    rate = row["world_steps_per_s"] = 1e3 * case.worlds / ms
+    return row | {
+        "bytes_per_world": sum(sim.bytes().values()) / case.worlds,
+        "equal": bool((u == u[:1]).all()),
+        "reached": None if goal is None else rate >= goal,
+    }
 
 
-HEADER = (f"{'worlds':22} {'dtype':8} {'unknowns':>8} {'ms/step':>9} {'world-steps/s':>13} {'Newton':>6} {'PCG':>6} "
-          f"{'tip error':>9} {'later, ms':>9} {'error':>8} {'MB/world':>8} {'equal':>5} {'goal':>9}")  # fmt: skip
-
-
-def _error(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1e}"
-
-
-def _line(r: WorldsRow) -> str:
-    if r.ms_per_step is None:
-        return f"{r.label:22} {r.dtype:8} {r.unknowns:8d} {r.note}"
-    return (
-        f"{r.label:22} {r.dtype:8} {r.unknowns:8d} {r.ms_per_step:9.2f} {r.world_steps_per_s:13.1f} "
-        f"{r.newton_per_step:6.1f} {r.pcg_per_step:6.1f} {_error(r.tip_error):>9} {r.later_ms:9.2f} "
-        f"{_error(r.later_error):>8} "
-        f"{(r.bytes_per_world or 0.0) / 1e6:8.3f} {r.equal!s:>5} {'-' if r.goal is None else f'{r.goal:9.0f}'}"
-    )
-
-
-def worlds(options: argparse.Namespace) -> None:
-    """Do `warpfea bench --worlds`: a line per row, and the file after each."""
-    device = wp.get_device(options.device) if options.device else wp.get_preferred_device()
-    options.device = str(device)
-    cases = by_label(options.rows, CASES) if options.rows else CASES
-    dtypes = options.dtype or ["float64", "float32"]
-    settings = {
-        "rows": [case.label for case in cases], "dtypes": dtypes, "warm_up": WARM, "timed": TIMED, "later": LATER,
-        "reference_tol": TIGHT,
-    }  # fmt: skip
-    references = References(device)
-    rows: list[WorldsRow] = []
-    print(HEADER, flush=True)
-    for case in cases:
-        for dtype in dtypes:
-            rows.append(measure(case, dtype, device, references))
-            print(_line(rows[-1]), flush=True)
-            write_file(options, settings, rows)
+WORLDS_KIND = Kind(frozenset({"rows", "dtype"}), COLUMNS, _cases, _settings, _measure)

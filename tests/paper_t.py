@@ -22,7 +22,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .ancf_solid import CORNERS, FACES
+from warpfea.elements.ancf_solid import CORNERS, FACES
 
 __all__ = [
     "LATTICE",

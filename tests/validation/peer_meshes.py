@@ -1,4 +1,4 @@
-"""`warpfea study peer-meshes`: the unstructured meshes of `warpfea bench --peer`, tests/data/bar_*.npz.
+"""The unstructured meshes of `warpfea bench --peer`, tests/data/bar_*.npz: counts, and files where `folder` is set.
 
 A box of 3 x 2 x 1 m in tetrahedra of second order with straight edges, by Gmsh (4.15.2 for the committed files; not one
 of the project's requirements). The peer's meshes are not published; their counts (4567 elements, 9050 nodes; 20 829 and
@@ -11,17 +11,18 @@ cells   (elements, 10) int32: in the order of mesh.Mesh
 
 from __future__ import annotations
 
-import argparse
 import pathlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from ...base.errors import UsageError
-from ...base.writer import check_folder
-from ..checkout import DATA
+from warpfea.base.errors import UsageError
+from warpfea.base.writer import check_folder
 
-__all__ = ["run", "second_order", "tetrahedra"]
+from .table import Row, Run, Table
+
+__all__ = ["TABLE", "second_order", "tetrahedra"]
 
 SIZES = {"bar_4752": (0.14476, 3.0), "bar_20822": (0.0678, 0.39)}
 """Name of the file: size of the surface's triangles and largest size inside, m."""
@@ -58,21 +59,24 @@ def second_order(corners: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np
     return points, np.concatenate([cells, len(corners) + numbers.reshape(-1, len(EDGES))], axis=1)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Do `warpfea study peer-meshes`."""
+def rows(run: Run) -> Iterator[Row]:
+    """Elements and nodes of each mesh."""
     try:
         import gmsh
     except ImportError as error:
-        raise UsageError(f"peer-meshes makes its meshes with Gmsh: pip install gmsh ({error})") from error
-    folder = pathlib.Path(options.out or DATA)
-    check_folder(folder, folder)
+        raise UsageError(f"peer_meshes makes its meshes with Gmsh: pip install gmsh ({error})") from error
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     for name, sizes in SIZES.items():
         points, cells = second_order(*tetrahedra(gmsh, *sizes))
         stored = points.astype(np.float32)
         assert np.array_equal(stored, points)
-        target = folder / f"{name}.npz"
-        np.savez_compressed(target, points=stored, cells=cells.astype(np.int32))
-        print(f"{name}: {len(cells)} elements, {len(points)} nodes, {target.stat().st_size} bytes")
+        if run.options["folder"]:
+            folder = pathlib.Path(run.options["folder"])
+            check_folder(folder, folder)
+            np.savez_compressed(folder / f"{name}.npz", points=stored, cells=cells.astype(np.int32))
+        yield {"mesh": name, "elements": len(cells), "nodes": len(points)}
     gmsh.finalize()
+
+
+TABLE = Table(about=__doc__, parts={"rows": rows}, options={"folder": ""}, takes="seconds")

@@ -34,7 +34,7 @@ import numpy as np
 import warp as wp
 
 if TYPE_CHECKING:
-    from ...solvers.residual import Residual
+    from warpfea.solvers.residual import Residual
 
 __all__ = ["Cost", "cost"]
 
