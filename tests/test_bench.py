@@ -226,7 +226,6 @@ BAD = {
     "sizes of the peer": (["--peer", "--unknowns", "1000"], ["--unknowns", "--peer"]),
     "steps of worlds": (["--worlds", "--steps", "3"], ["--steps", "--worlds"]),
     "unknown row of the CPU": (["cpu", "--rows", "bar"], ["bar"]),
-    "another device": (["cpu", "--device", "cuda:0"], ["cpu"]),
     "too small": (["growth", "--set", "sizes=5"], ["5", "270"]),
 }
 

@@ -43,7 +43,7 @@ class CpuCase:
     label: str
     problem: str
     size: Any
-    chrono: tuple[float, float] | tuple[None, None] = (None, None)
+    chrono: tuple[float, float] | None = None
 
 
 CASES: tuple[CpuCase, ...] = (
@@ -83,7 +83,9 @@ def rows(run: Run) -> Iterator[Row]:
         for name, options in SOLVERS.items():
             row: Row = {"problem": case.problem, "label": case.label, "solver": name, "dtype": model.dtype}
             row |= {"unknowns": info["unknowns"], "elements": info["elements"]}
-            row |= dict.fromkeys((*MEASURED, "compile_s")) | dict(zip(("chrono_1", "chrono_2"), case.chrono))
+            row |= dict.fromkeys((*MEASURED, "compile_s")) | dict(
+                zip(("chrono_1", "chrono_2"), case.chrono or (None, None))
+            )
             note = too_long(before.get(case.problem), info["unknowns"], limit) if name == "direct" else None
             row |= {"steps": 0, "note": note}
             if note is None:
