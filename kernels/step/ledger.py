@@ -218,8 +218,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         ledger[world, 9] = ledger[world, 9] + sums[6, world]
         if step.watched != 0:
             turnover += wp.abs(loads) + wp.abs(sums[4, world]) + wp.abs(fields) + wp.abs(viscous)
-            # where damping is stiff, `viscous` has too much by what `numerical` has too little; `balance` is the work
-            # of residuals that were accepted, which adds up where a tolerance or rounding leaves them large
+            # stiff damping moves energy from `numerical` to `viscous`; `balance` is the work of accepted residuals
             added = step.counted * balance - (numerical + viscous)
             watch(step, world, energy - (change_K + change_W + stored), energy, turnover, added)
 
