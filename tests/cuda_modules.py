@@ -1,7 +1,6 @@
 """Device code of all scenes: the calls that make it, recorded on one machine and compiled for CUDA on another.
 
-On a machine with a CUDA device, `python tests/cuda_modules.py --record --device cuda` writes `tests/data/cuda_modules.json`:
-the calls of the factories of `kernels/` while a simulation of each scene is made. `python tests/cuda_modules.py` makes
+On a machine with a CUDA device, `python tests/cuda_modules.py --record` writes `tests/data/cuda_modules.json`: the calls of the factories of `kernels/` while a simulation of each scene is made. `python tests/cuda_modules.py` makes
 the same kernels and compiles them for sm_90, which needs no driver; `test_cuda_modules.py` does so too.
 """
 
@@ -104,8 +103,8 @@ def record(device: str) -> None:
                     f'"calls": [\n{lines}\n]\n}}\n')  # fmt: skip
 
 
-def compile_all(folder: str) -> list[tuple[float, str]]:
-    """Compile the recorded modules for CUDA: seconds and name of each, the slowest first."""
+def compile_all(folder: str) -> list[str]:
+    """Compile the recorded modules for CUDA and print how long each took; their names."""
     wp.is_cuda_available = lambda: True  # options of modules are those of a machine with a device
     for module, factory, args, kwargs in json.loads(FILE.read_text())["calls"]:
         make = getattr(importlib.import_module(module), factory)
@@ -115,10 +114,12 @@ def compile_all(folder: str) -> list[tuple[float, str]]:
     def compiled(module):
         began = time.perf_counter()
         wp.compile_aot_module(module, arch=ARCH, module_dir=f"{folder}/{module.name}")
-        return time.perf_counter() - began, module.name
+        took = time.perf_counter() - began
+        print(f"{took:6.2f} s  {module.name}", flush=True)
+        return module.name
 
     with ThreadPoolExecutor(2) as pool:
-        return sorted(pool.map(compiled, modules), reverse=True)
+        return list(pool.map(compiled, modules))
 
 
 def main() -> None:
@@ -130,8 +131,6 @@ def main() -> None:
         return record(options.device)
     with tempfile.TemporaryDirectory() as folder:
         rows = compile_all(folder)
-    for seconds, name in rows[:10]:
-        print(f"{seconds:6.2f} s  {name}")
     print(f"{len(rows)} modules compiled for sm_{ARCH}")
 
 
