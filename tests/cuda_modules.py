@@ -1,8 +1,8 @@
 """Device code of all scenes: the calls that make it, recorded on one machine and compiled for CUDA on another.
 
 On a machine with a CUDA device, `python tests/cuda_modules.py --record` writes `tests/data/cuda_modules.json`:
-the calls of the factories of `kernels/` while a simulation of each scene is made. `python tests/cuda_modules.py` makes the
-same kernels and compiles them for sm_90, which needs no driver; `test_cuda_modules.py` does so too.
+the calls of the factories of `kernels/` while a simulation of each scene is made. `python tests/cuda_modules.py`
+makes the same kernels and compiles them for sm_90, which needs no driver; `test_cuda_modules.py` does so too.
 """
 
 from __future__ import annotations
