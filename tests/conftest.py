@@ -10,12 +10,41 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from warp._src.apic.capture import APICapture
+from warp._src.codegen import Struct
 
 import warpfea as wf
 
 DATA = Path(__file__).parent / "data"
 
 wp.config.log_level = 30  # warnings and errors: no greeting, no lines for loaded modules
+
+
+def remember_structs():
+    """Make Warp's recorder of CPU graphs walk a struct that it has walked once in a capture no more.
+
+    A step passes the same few structs, of some forty arrays each, to nearly every launch, and the walk through them, in
+    Python, is half of what a short test takes. The relocations of a struct follow from its bytes, which hold its
+    pointers. Returns a function that undoes it.
+    """
+    walk = APICapture._walk_value_pointers
+
+    def remembered(self, arg_type, original, packed, base, out):
+        if base != 0 or not isinstance(arg_type, Struct):
+            return walk(self, arg_type, original, packed, base, out)
+        known = self.__dict__.setdefault("known_structs", {})
+        key = arg_type, bytes(packed)
+        if key not in known:
+            known[key] = []
+            walk(self, arg_type, original, packed, base, known[key])
+        out.extend(known[key])
+        return None
+
+    APICapture._walk_value_pointers = remembered
+    return lambda: setattr(APICapture, "_walk_value_pointers", walk)
+
+
+remember_structs()
 
 
 @functools.cache

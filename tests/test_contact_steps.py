@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from contact_runs import DEVICES, DT, DTYPES, PLACES, TIGHT, simulated, thrown
+from pairwise import covering
 
 import warpfea as wf
 from warpfea.simulation.checkpoint import save_checkpoint
@@ -147,9 +150,17 @@ LAWS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum"])
-@pytest.mark.parametrize("law", LAWS)
-@placed("plane", "rotation", "capsule")
+BOOKED = (LAWS, ("backward_euler", "bdf2", "energy_momentum"))
+
+
+@pytest.mark.parametrize(
+    ("device", "place", "law", "integrator"),
+    covering(["cpu"], PLACES, *BOOKED)
+    + [
+        pytest.param("cuda", *case, marks=pytest.mark.cuda)
+        for case in itertools.product(("plane", "rotation", "capsule"), *BOOKED)
+    ],
+)
 def test_the_ledger_closes(device, place, law, integrator):
     sim = simulated(40, place, device=device, solver=TIGHT, integrator=integrator, **LAWS[law])
     energies = {name: float(values[0]) for name, values in sim.energies().items()}

@@ -1,10 +1,9 @@
 """Unsupported bodies fall as backward Euler's closed form says, whatever the law, step, precision or iteration cap."""
 
-import itertools
-
 import numpy as np
 import pytest
 import warp as wp
+from pairwise import covering
 
 import warpfea as wf
 
@@ -55,19 +54,9 @@ LAWS = ("svk", "mooney_rivlin", "neo_hookean")
 FORMS = (None, "incremental", "rate", "explicit")
 
 
-CASES = tuple(itertools.product(("T10", "T4"), LAWS, FORMS, ("float64", "float32")))
-
-
-def soon(element, law, damping, dtype):
-    """Whether a case is among the first tests: each law with each damping once, by turns of element and precision."""
-    turn = (LAWS.index(law) + FORMS.index(damping)) % 4
-    return damping is None or (element, dtype) == (("T10", "T4")[turn % 2], ("float64", "float32")[turn // 2])
-
-
 # each compiles two or three modules of its own
 @pytest.mark.parametrize(
-    ("element", "law", "damping", "dtype"),
-    [pytest.param(*case, marks=[] if soon(*case) else [pytest.mark.slow]) for case in CASES],
+    ("element", "law", "damping", "dtype"), covering(("T10", "T4"), LAWS, FORMS, ("float64", "float32"))
 )
 def test_free_fall_is_exact(element, law, damping, dtype):
     bound = 1e-12 if dtype == "float64" else 1e-5

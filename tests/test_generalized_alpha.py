@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import warp as wp
+from pairwise import covering
 
 import warpfea as wf
 from warpfea.simulation import integrators
@@ -142,9 +143,7 @@ def errors_of_changing_steps(start, exact, kind, counts, end, rho):
 CHANGES = {"0.67/1.5": (1.0 / 1.5, 1.5), "0.6/1.4": (0.6, 1.4), "0.4/1.6": (0.4, 1.6), "random": "random"}
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("rho", [0.0, 0.8])
+@pytest.mark.parametrize(("rho", "change", "dtype"), covering([0.0, 0.8], CHANGES, ["float64", "float32"]))
 def test_order_of_a_mode_where_steps_change(mode, rho, change, dtype):
     """A small free vibration against its cosine, and the errors of equal steps of the same number.
 
@@ -295,9 +294,7 @@ def driven_link():
     return model, turning(model, bodies, anchor, 5.0)
 
 
-@pytest.mark.parametrize("halved", [False, True], ids=["uniform", "halved"])
-@pytest.mark.parametrize("rho", [0.5, 0.8])
-@pytest.mark.parametrize("make", [double_pendulum, driven_link])
+@pytest.mark.parametrize(("make", "rho", "halved"), covering([double_pendulum, driven_link], [0.5, 0.8], [False, True]))
 def test_order_with_joints(make, rho, halved):
     assert orders(make, rho, halved)[:2] == pytest.approx([2.0, 2.0], abs=0.1)
 

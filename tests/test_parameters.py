@@ -98,7 +98,15 @@ def alone_with(case, world, dtype="float64", names=tuple(VALUES)):
 
 @pytest.mark.parametrize(
     ("case", "dtype"),
-    [*((case, "float64") for case in CASES), *((case, "float32") for case in ("T10", "3243", "3443"))],
+    [
+        # five modules of their own each
+        *(
+            pytest.param(case, "float64", marks=[pytest.mark.slow] if case in ("3243 full", "3443 full") else [])
+            for case in CASES
+        ),
+        ("T10", "float32"),
+        *(pytest.param(case, "float32", marks=pytest.mark.slow) for case in ("3243", "3443")),
+    ],
 )
 def test_each_world_equals_a_run_built_with_its_values(case, dtype):
     add, law = CASES[case]

@@ -166,7 +166,11 @@ def test_large_bodies_are_numbered_by_place_and_report_in_file_order(monkeypatch
 
 @pytest.mark.parametrize(
     ("scene", "dtype"),
-    [(scene, "float64") for scene in SCENES] + [("T10 rubber", "float32"), ("3243 askew, incremental", "float32")],
+    [
+        pytest.param(scene, "float64", marks=[pytest.mark.slow] if scene == "3243 askew, rate" else [])
+        for scene in SCENES
+    ]
+    + [("T10 rubber", "float32"), pytest.param("3243 askew, incremental", "float32", marks=pytest.mark.slow)],
 )
 def test_columns_and_whole_elements_give_one_matrix(scene, dtype):
     """What a GPU launches and what the CPU does, here on the CPU both."""

@@ -25,12 +25,21 @@ def precision(dtype: str) -> _types.SimpleNamespace:
     )
 
 
-def kernel_module(name: str, **options) -> wp.Module:
+def kernel_module(name: str, light: bool = False, **options) -> wp.Module:
     """The Warp module `name` with the options all our kernels share.
 
     Loops are not unrolled: a T10 tangent kernel with the default unrolling compiles for minutes. No adjoint code is
     generated: it triples compile time.
+
+    Args:
+        name: of the module, without the package.
+        light: whether its kernels have one thread per world. Compiling them takes longer than they ever run, so that
+            it is done without optimisation: an eighth of the time, and the same bits. Not where there is a CUDA device,
+            for which the option would count too.
+        options: of Warp, for this module.
     """
     module = wp.get_module(f"warpfea.kernels.{name}")
+    if light and not wp.is_cuda_available():
+        options = {"optimization_level": 0} | options
     wp.set_module_options({"enable_backward": False, "max_unroll": 1} | options, module=module)
     return module

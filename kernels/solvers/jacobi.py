@@ -52,7 +52,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
-    shared = newton_kernels(dtype, traits)
+    shared = newton_kernels(traits)
     measure, record, accept = shared.measure, shared.record, shared.accept
     closure = judging_functions(traits).closure
     paired = acceleration in ("secants", "anderson")

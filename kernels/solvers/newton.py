@@ -23,7 +23,6 @@ from .outer import outer_kernels
 from .pcg import pcg_struct
 from .perturbation import SCATTER
 from .searching import NOISE, TURN, search_kernels
-from .vectors import vector_kernels
 
 __all__ = ["newton_kernels"]
 
@@ -37,8 +36,8 @@ HOPELESS = 3.0
 
 
 @functools.cache
-def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """Kernels of the Newton iteration in one precision of the vectors; scalars are float64.
+def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+    """Kernels of the Newton iteration, of one thread per world; scalars are float64.
 
     Of the traits "stored", "gated", "limited", "walls" and "midpoint" count.
     """
@@ -51,7 +50,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     objective, magnitude = judging.objective, judging.magnitude
     measure, settle, fail = judging.measure, judging.settle, judging.fail
     accept, give_up, record, patience = judging.accept, judging.give_up, judging.record, judging.patience
-    module = kernel_module(f"newton_{dtype}{traits.suffix('stored', 'gated', 'limited', 'walls', 'midpoint')}")
+    module = kernel_module(f"newton{traits.suffix('stored', 'gated', 'limited', 'walls', 'midpoint')}", light=True)
 
     searching = search_kernels(traits, module)
     lost = searching.lost
@@ -273,10 +272,8 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         else:
             open_search(ctl, world)
 
-    vectors = vector_kernels(dtype, module)
     outer = outer_kernels(traits, module)
     return _types.SimpleNamespace(
-        **vars(vectors),
         **vars(outer),
         **vars(searching),
         module=module,

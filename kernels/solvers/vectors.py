@@ -5,19 +5,20 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import precision
+from ..common.types import kernel_module, precision
 from .control import FLOOR_LANES, GROUP_ROWS, LANES, control_struct
 
 __all__ = ["vector_kernels"]
 
 
 @functools.cache
-def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
-    """Kernels in a module of Newton's method, in one precision of the vectors."""
+def vector_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the vectors."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
+    module = kernel_module(f"vectors_{dtype}")
 
     @wp.kernel(module=module)
     def norm_partial(
@@ -170,6 +171,7 @@ def vector_kernels(dtype: str, module: wp.Module) -> _types.SimpleNamespace:
             wp.atomic_max(out, 0, 1)
 
     return _types.SimpleNamespace(
+        module=module,
         norm_partial=norm_partial,
         norm_sum=norm_sum,
         update_position=update_position,

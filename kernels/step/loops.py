@@ -25,7 +25,7 @@ VALUES = {"length": 0, "travel": 1, "angle": 2}
 def loop_kernels() -> _types.SimpleNamespace:
     """Kernels of one thread per world."""
     f64 = wp.float64
-    module = kernel_module("loops")
+    module = kernel_module("loops", light=True)
     column = {name: REPORT.index(name) for name in REPORT}
     running = STATUS["running"]
 

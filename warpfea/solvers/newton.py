@@ -16,6 +16,7 @@ from ..kernels.elements.materials import ANY_J
 from ..kernels.solvers.control import FLOOR_LANES
 from ..kernels.solvers.newton import newton_kernels
 from ..kernels.solvers.perturbation import SAMPLES, perturbation_kernels
+from ..kernels.solvers.vectors import vector_kernels
 from .bicgstab import BiCGStab
 from .direct import Direct
 from .pcg import PCG
@@ -168,7 +169,7 @@ class NewtonLoop:
         self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
         self.constraint_tol = constraint_tol
         traits = at.traits
-        self.kernels = newton_kernels(model.dtype, traits)
+        self.kernels, self.vectors = newton_kernels(traits), vector_kernels(model.dtype)
         self.limited = traits.limited
         self.classical = traits.gated and options.multipliers == "outer"
         self.max_outer = options.max_outer
@@ -300,13 +301,13 @@ class NewtonLoop:
         w, k, launch = self.work, self.kernels, self.launch
         choose, better = w.newton.choose, w.newton.searching
         launch(k.compare, self.model.worlds, [w.newton, 1, better])
-        launch(k.copy_active, self.dim, [w.v, better, w.best])
+        launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
         for put in self.candidates:
             put()
             self.residual.evaluate(choose, hold=True)
             launch(k.compare, self.model.worlds, [w.newton, 0, better])
-            launch(k.copy_active, self.dim, [w.v, better, w.best])
-        launch(k.copy_active, self.dim, [w.best, choose, w.v])
+            launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
+        launch(self.vectors.copy_active, self.dim, [w.best, choose, w.v])
         self.preconditioner.renew(choose)
         self._open(choose)
         launch(k.begin, self.model.worlds, [w.newton, 2])
@@ -339,8 +340,8 @@ class NewtonLoop:
         if self.limited:
             launch(k.free_step, self.model.worlds, [w.newton])
         self._each("aim", active)
-        launch(k.set_base, self.dim, [w.newton, w.v, w.base, w.best])
-        launch(k.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
+        launch(self.vectors.set_base, self.dim, [w.newton, w.v, w.base, w.best])
+        launch(self.vectors.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
         self._any(w.newton.searching, self.searching)
@@ -395,7 +396,7 @@ class NewtonLoop:
         parts = m.residual_parts
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
-        self.launch(k.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
+        self.launch(self.vectors.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
         self.launch(k.judge_floor, m.worlds, [w.newton, parts.component])
         if self.perturbation:
             self.residual.evaluate(self.perturbed)
@@ -416,7 +417,7 @@ class NewtonLoop:
 
     def _search(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
-        launch(k.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
+        launch(self.vectors.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.judge_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:
@@ -435,7 +436,7 @@ class NewtonLoop:
 
     def _any(self, flags: wp.array, out: wp.array) -> None:
         out.zero_()
-        self.launch(self.kernels.any_set, self.model.worlds, [flags, out])
+        self.launch(self.vectors.any_set, self.model.worlds, [flags, out])
 
     def _clear_direction(self, active: wp.array) -> None:
         self.launch(self.pcg.kernels.start, self.dim, [self.work.g, self.model.topology.free, active,

@@ -13,6 +13,7 @@ from ..kernels.common.reduce import CHUNK, SHORT, reduce_kernels
 from ..kernels.common.structs import additions_struct
 from ..kernels.solvers.control import GROUP_ROWS, LANES, TERM_ROWS
 from ..kernels.solvers.newton import newton_kernels
+from ..kernels.solvers.vectors import vector_kernels
 from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.step.stage import stage_kernels
 from ..kernels.terms.constraints import constraint_struct
@@ -81,7 +82,7 @@ class Residual:
         self.reduce = Reducer(launch, work, model.worlds)
         traits = at.traits
         self.gather = gather_kernels(model.dtype, traits)
-        self.newton = newton_kernels(model.dtype, traits)
+        self.newton, self.vectors = newton_kernels(traits), vector_kernels(model.dtype)
         self.stage = stage_kernels(model.dtype)
         self.con = model.constraints.data if traits.ties else constraint_struct()()
         self.dim = (model.worlds, model.slots)
@@ -152,7 +153,7 @@ class Residual:
 
     def modules(self) -> set[wp.Module]:
         """Modules of the gather, and of the matrix where there is one; those of the terms are theirs."""
-        out = {self.gather.module} | ({self.stage.module} if self.at.midpoint else set())
+        out = {self.gather.module, self.vectors.module} | ({self.stage.module} if self.at.midpoint else set())
         if self.by_matrix:
             assert self.assembled is not None
             out |= {self.gather.matrix_module} | self.assembled.modules()
@@ -220,7 +221,7 @@ class Residual:
     def place(self, active: wp.array) -> None:
         """q of the iterate v, and where forces are taken, if that is not there."""
         w, state = self.work, self.at.state
-        self.launch(self.newton.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
+        self.launch(self.vectors.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.at.midpoint:
             args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
             self.launch(self.stage.take_stage, self.dim, args)
@@ -260,16 +261,16 @@ class Residual:
         if groups.count > 1:
             args = [groups.slot_start, groups.slot, groups.element_start, groups.element]
             args += [w.rows, w.energy_rows, active, w.residual_group_partial]
-            launch(self.newton.norm_partial, (m.worlds, groups.count, LANES), args)
+            launch(self.vectors.norm_partial, (m.worlds, groups.count, LANES), args)
             sums = (GROUP_ROWS, m.worlds, groups.count)
-            launch(self.newton.norm_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
+            launch(self.vectors.norm_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
     @labelled("loads")
     def hold_nonpotential(self, active: wp.array) -> None:
         """From here on Phi holds the non-potential forces of this iterate."""
         if self.terms.traits.nonpotential:
             args = [self.work.nonpotential, active, self.work.nonpotential_held]
-            self.launch(self.newton.copy_active, self.dim, args)
+            self.launch(self.vectors.copy_active, self.dim, args)
 
     @labelled("build")
     def blocks(self, active: wp.array) -> None:
@@ -334,5 +335,5 @@ class Residual:
                 term.product(self.at, w.direction, active)
         args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather.gather_force, self.dim, args)
-        launch(self.newton.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
+        launch(self.vectors.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
         self.reduce(w.rows, 1, active, w.newton.tangent_sum)

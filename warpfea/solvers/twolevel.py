@@ -420,7 +420,7 @@ class TwoLevel:
         w, dim = self.work, (len(worlds), 3 * self.assembled.pattern.entries)
         rows = slice(worlds.start, worlds.stop)
         given, copy = (shaped(a, dim, self.model.types.vec3) for a in (value[rows], self.value))
-        self.launch(self.residual.newton.copy_active, dim, [given, flags[rows], copy])
+        self.launch(self.residual.vectors.copy_active, dim, [given, flags[rows], copy])
         for term in self.terms:
             live = [array for _, array in term.keep(self.at)]
             term.blocks(self.at, self.assembled, live, w.step.dq_dv, flags, out, projected=False)
