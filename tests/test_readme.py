@@ -1,4 +1,4 @@
-"""READMEs, notes and the tutorial: every Python block runs, commands parse, links and names exist, numbers are those of the result files."""
+"""READMEs, notes, tutorial: Python blocks run, commands parse, links and names exist, numbers are of the result files."""
 
 from __future__ import annotations
 
@@ -43,9 +43,8 @@ def prose(name):
     return FENCE.sub("", TEXT[name])
 
 
-PYTHON = [
-    pytest.param(code, id=f"{name}:{line}") for name in TEXT if name != TUTORIAL for code, line in fences(name, "python")
-]
+OTHERS = [name for name in TEXT if name != TUTORIAL]
+PYTHON = [pytest.param(code, id=f"{name}:{line}") for name in OTHERS for code, line in fences(name, "python")]
 PYTHON += [pytest.param("\n\n".join(code for code, _ in fences(TUTORIAL, "python")), id=TUTORIAL)]  # one file
 
 
