@@ -1,4 +1,4 @@
-"""READMEs, notes, tutorial: Python blocks run, commands parse, links and names exist, numbers are of the result files."""
+"""READMEs, notes, tutorial: Python blocks run, commands parse, links and names exist, numbers match result files."""
 
 from __future__ import annotations
 
