@@ -1,4 +1,4 @@
-"""READMEs: every Python block runs, commands parse, links and names exist, numbers are those of the result files."""
+"""READMEs, notes, tutorial: Python blocks run, commands parse, links and names exist, numbers match result files."""
 
 from __future__ import annotations
 
@@ -22,29 +22,36 @@ from warpfea.simulation import integrators
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "tests" / "results"
 FOLDERS = (".", "kernels", "scenes", "tests", "warpfea", "warpfea/builder", "warpfea/simulation", "warpfea/solvers")
-READMES = [ROOT / folder / "README.md" for folder in FOLDERS]
-TEXT = {path.relative_to(ROOT).as_posix(): path.read_text() for path in READMES}
+NOTES = ("tests", "warpfea/builder", "warpfea/simulation", "warpfea/solvers")
+TUTORIAL = "scenes/TUTORIAL.md"
+PAGES = [ROOT / folder / "README.md" for folder in FOLDERS]
+PAGES += [ROOT / folder / "NOTES.md" for folder in NOTES]
+PAGES += [ROOT / TUTORIAL, ROOT / "warpfea/builder/CONTACT.md", ROOT / "warpfea/simulation/LEARNING.md"]
+TEXT = {path.relative_to(ROOT).as_posix(): path.read_text() for path in PAGES}
 REGISTRIES = (family._families, materials.LAWS, integrators.INTEGRATORS)
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
 def fences(name, *languages):
-    """The text of the fenced blocks of a README in some languages, with the lines that they begin at."""
+    """The text of the fenced blocks of a page in some languages, with the lines that they begin at."""
     found = FENCE.finditer(TEXT[name])
     return [(m[2], TEXT[name][: m.start()].count("\n") + 1) for m in found if m[1] in languages]
 
 
 def prose(name):
-    """A README without its fenced blocks."""
+    """A page without its fenced blocks."""
     return FENCE.sub("", TEXT[name])
 
 
-PYTHON = [pytest.param(code, id=f"{name}:{line}") for name in TEXT for code, line in fences(name, "python")]
+OTHERS = [name for name in TEXT if name != TUTORIAL]
+PYTHON = [pytest.param(code, id=f"{name}:{line}") for name in OTHERS for code, line in fences(name, "python")]
+PYTHON += [pytest.param("\n\n".join(code for code, _ in fences(TUTORIAL, "python")), id=TUTORIAL)]  # one file
 
 
-def test_all_readmes_are_known():
-    found = {p for p in ROOT.rglob("README.md") if not any(part.startswith(".") for part in p.relative_to(ROOT).parts)}
-    assert {p for p in found if "build" not in p.relative_to(ROOT).parts} == set(READMES)
+def test_all_pages_are_known():
+    names = [p.relative_to(ROOT) for p in ROOT.rglob("*.md")]
+    found = {ROOT / p for p in names if not any(part.startswith(".") or part == "build" for part in p.parts)}
+    assert found - {ROOT / "CHANGELOG.md"} == set(PAGES)
 
 
 def test_files_are_short():
@@ -59,8 +66,11 @@ def test_files_are_short():
             assert len(path.read_text().splitlines()) <= 450, name
 
 
-def test_the_first_readme_is_short():
-    assert len(TEXT["README.md"].splitlines()) <= 240
+def test_pages_are_short():
+    lines = {name: len(text.splitlines()) for name, text in TEXT.items()}
+    assert lines["README.md"] <= 240
+    assert lines["warpfea/builder/README.md"] + lines["warpfea/simulation/README.md"] <= 700
+    assert sum(count for name, count in lines.items() if name.endswith(("README.md", "NOTES.md"))) <= 2300
 
 
 @pytest.mark.parametrize("name", TEXT)
