@@ -80,7 +80,7 @@ def facet_struct(dtype: str):
         points: wp.int32  # of a facet
         moving: wp.int32  # a single point acts, with the shape values `Attempt.weight`
         corners: wp.int32
-        coords: wp.array(dtype=wp.vec2d)  # [point] on the unit triangle or square; this and the next two: lumped contacts
+        coords: wp.array(dtype=wp.vec2d)  # [point] on the unit triangle or square; with the next two: lumped contacts
         basis: wp.array2d(dtype=wp.float64)  # [point, monomial] Lagrange polynomials of the points
         power: wp.array(dtype=wp.vec2i)  # [monomial] exponents
 

@@ -24,7 +24,7 @@ def master_struct(dtype: str):
         tree: wp.uint64  # bounding-box tree of [world, facet], grouped by world and surface
         of: wp.array(dtype=wp.int32)  # [contact] its master surface
         sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points belong to the second body
-        bodies: wp.array(dtype=wp.vec2i)  # [contact] bodies of the points and of the facets, numbered among those in pairs
+        bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points and of the facets, numbered among bodies in pairs
         surfaces: wp.int32
         touch: wp.float64  # depth at the start of a step that counts as contact, m
         most: wp.int32  # maximum number of monomials of a facet
@@ -37,7 +37,7 @@ def master_struct(dtype: str):
         terms: wp.array(dtype=wp.int32)  # [kind] number of monomials
         corners: wp.array(dtype=wp.int32)  # [kind]
         power: wp.array2d(dtype=wp.vec2i)  # [kind, monomial] exponents
-        hull: wp.array3d(dtype=wp.float64)  # [kind, point, monomial] control points; their convex hull contains the facet
+        hull: wp.array3d(dtype=wp.float64)  # [kind, point, monomial] control points; convex hull of the facet
         limit: wp.array(dtype=wp.float64)  # [facet] depth beyond which a point would leave through the opposite side, m
         size: wp.array(dtype=wp.float64)  # [facet] length of a side, m
         surface: wp.array(dtype=wp.int32)  # [facet]
