@@ -8,7 +8,7 @@ import warp as wp
 __all__ = ["SMALL", "kernel_module", "precision"]
 
 SMALL = 4
-"""`max_unroll` of modules whose short loops go over components: unrolled they index registers, not memory."""
+"""`max_unroll` of modules with short loops over components: unrolled they index registers, not memory."""
 
 
 @functools.cache
@@ -26,10 +26,10 @@ def precision(dtype: str) -> _types.SimpleNamespace:
 
 
 def kernel_module(name: str, **options) -> wp.Module:
-    """The Warp module `name` with the options all our kernels share.
+    """The Warp module `name` with the options common to all kernels.
 
-    Loops are not unrolled: a T10 tangent kernel with the default unrolling compiles for minutes. No adjoint code is
-    generated: it triples compile time.
+    Loops are not unrolled: a T10 tangent kernel with the default unrolling compiles for minutes. Adjoint code is
+    disabled: it triples compile time.
     """
     module = wp.get_module(f"warpfea.kernels.{name}")
     wp.set_module_options({"enable_backward": False, "max_unroll": 1} | options, module=module)

@@ -88,10 +88,8 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         """Columns of L^-1, with A = L L^T.
 
         A pivot that is not safely positive against the `given` diagonal is replaced by that diagonal and the rest of
-        the
-        column of L is zero, so that L L^T is positive definite for any A. The diagonal entry of L^-1 is then negative,
-        as a
-        flag for the blocks below.
+        the column of L is zero, so that L L^T is positive definite for any A. The diagonal entry of L^-1 is then
+        negative, as a flag for the blocks below.
         """
         S = Block()
         for c in range(BLOCK):

@@ -22,8 +22,7 @@ BICGSTAB_ROWS = 4
 FAR, CLOSE = 0.1, 1.0e-8
 """Relative residual above which the stress of an iterate is unreliable: a rotation error delta strains a stiff body by
 delta^2, and E delta^2 spoils the geometric stiffness. Products then use the stress at the start of the step, and solves
-go to CLOSE, as the residual of a rotation is small beside that of strains.
-"""
+go to CLOSE, as the residual of a rotation is small beside that of strains."""
 STALLED = 50
 """Iterations without halving the best residual after which a solve ends with the best: later residuals may grow."""
 FOUND = 0.1

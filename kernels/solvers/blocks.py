@@ -19,9 +19,7 @@ __all__ = ["assembly_kernels", "block_kernels"]
 @functools.cache
 def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespace:
     """Assembly from the matrices of elements with a given number of slots, in the layout of `element_matrix` or,
-    `rows`, of
-    `element_rows`.
-    """
+    `rows`, of `element_rows`."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
@@ -67,9 +65,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         source: wp.array(dtype=wp.int32),
     ):
         """Contributions of elements to an entry of Pattern.upper: start[index + 1] = their number, or with `listing`
-        the
-        `source`s from start[index] on, 2 (PLACES elem + place) + 1 for a transposed block.
-        """
+        the `source`s from start[index] on, 2 (PLACES elem + place) + 1 for a transposed block."""
         index = wp.tid()
         at = pattern.upper[index]
         found = wp.int32(0)

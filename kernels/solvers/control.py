@@ -45,8 +45,7 @@ FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v
 LANES, FLOOR_LANES = 32, 16
 TERM_ROWS = 3
 """Rows summed per world over terms with stored energy: the potential with the quantities frozen in a line search
-(multipliers, friction limits), the potential with their next values, and its magnitude.
-"""
+(multipliers, friction limits), the potential with their next values, and its magnitude."""
 
 
 @functools.cache
@@ -108,7 +107,7 @@ def control_struct():
         any_hard: wp.array(dtype=wp.int32)  # 1 if any world needs a rare branch: any of the flags below
         # nonmonotone steps, see searching.py
         leaps: wp.array(dtype=wp.int32)  # nonmonotone steps since the best iterate
-        mixed: wp.array(dtype=wp.int32)  # 1: H has the predicted stress; 2: again after failure
+        mixed: wp.array(dtype=wp.int32)  # 1: H has the predicted stress; 2: positive semi-definite
         wish: wp.array(dtype=wp.int32)  # 1: a nonmonotone trial is requested, its length is due; 2: the trial is one
         turn: wp.array(dtype=wp.float64)  # largest gradient of the direction
         radius: wp.array(dtype=wp.float64)  # trust radius: largest rotation or stretch of an element in such a step

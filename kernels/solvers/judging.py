@@ -35,9 +35,7 @@ FAR = 3
 """Multiple of the iteration limit added by `patience`."""
 ALIKE = 64.0
 """Last step in the energy norm, over the round-off unit, below which a stall may also be due to round-off: laws that
-are
-steep at small J amplify round-off of the positions in the stress.
-"""
+are steep at small J amplify round-off of the positions in the stress."""
 DROWNED = 32.0
 """Roundings of the positions below which, for a residual as large as the forces, round-off dominates the residual."""
 COARSE = 1.0e-10
@@ -66,11 +64,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
         Phi = 1/2 (v - v~).M (v - v~) c_M - f_held.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv); its derivative by v is
         the residual, Eq. (17). Sums over a world: inertia and the frozen forces f_held (dead loads, and
-        non-conservative
-        forces at the start of the search) are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc, J, are
-        elem_sums[0]
-        and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is term_sums[0]. With the trait
-        "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual replaces it.
+        non-conservative forces at the start of the search) are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc,
+        J, are elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is
+        term_sums[0]. With the trait "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual
+        replaces it.
         """
         if wp.static(midpoint):
             return ctl.slot_sums[4, world]
@@ -125,9 +122,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def rounded(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
         """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
-        component:
-        further iterations would not reduce it.
-        """
+        component: further iterations would not reduce it."""
         if ctl.groups == ctl.components or ctl.eps > f64(COARSE) or norm > f64(ROUNDED) * rounding:
             return False
         internal, loads, inertia = f64(0.0), f64(0.0), f64(0.0)
@@ -143,8 +138,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """Norms and acceptance of the current residual, separately for each residual group.
 
         The forces of one component or stiff material must not hide the residual of another; a component of the model
-        whose
-        groups have all converged is excluded from further solves.
+        whose groups have all converged is excluded from further solves.
         """
         force = wp.sqrt(ctl.slot_sums[9, world])
         ctl.force[world] = force
@@ -230,18 +224,15 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def patience(ctl: Control, world: int) -> int:
         """Factor on `max_iterations` of an attempt: larger for a start far from the solution, or after negative
-        curvature with
-        a law that has its own tangent, since shorter steps meet it again.
-        """
+        curvature with a law that has its own tangent, since shorter steps meet it again."""
         far = wp.max(ctl.choose[world], ctl.bent[world] * (1 - ctl.linear_stress))
         return 1 + FAR * far
 
     @wp.func
     def give_up(ctl: Control, world: int, why: int):
         """End without convergence. A residual as large as the forces but below `DROWNED` roundings is reported as
-        round-off in
-        single-precision statics, whatever the failure: a smaller load has smaller forces with the same noise.
-        """
+        round-off in single-precision statics, whatever the failure: a smaller load has smaller forces with the same
+        noise."""
         ctl.active[world] = 0
         ctl.searching[world] = 0
         ctl.failed[world] = why
@@ -256,9 +247,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def settle(ctl: Control, world: int):
         """End the iteration if it has converged or used up its iterations; if it stalls within round-off, request an
-        error
-        estimate.
-        """
+        error estimate."""
         record(ctl, world)
         # predicted energy change of the last step, relative to the energy
         energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]

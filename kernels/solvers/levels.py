@@ -1,8 +1,7 @@
 """Application of the two-level preconditioner: tile inverses, a coarse space of affine motions, a dense inverse.
 
 A level has slots of 3-vectors, in tiles of up to TILE_SLOTS slots and in groups. The four affine functions 1, x, y, z
-of
-each group are the slots of the next, coarser level; P interpolates from them (prolongation) and P^T sums onto them
+of each group are the slots of the next, coarser level; P interpolates from them (prolongation) and P^T sums onto them
 (restriction). levels_build.py computes the inverses.
 """
 

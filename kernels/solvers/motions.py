@@ -57,8 +57,7 @@ def motion_kernels(dtype: str) -> _types.SimpleNamespace:
         """R^T H R of each body, H its own blocks `value`: partial sums of a lane over slots, [world, body, lane].
 
         Blocks translation-translation, rotation-translation, rotation-rotation. A bound of the round-off of H is added
-        to the
-        diagonal.
+        to the diagonal.
         """
         world, body, lane = wp.tid()
         if active[world] == 0:

@@ -107,8 +107,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         """True if other first iterates should be tried: Phi exceeds a bound of Phi at q_n, or J <= 0.
 
         At q_n Phi is the strain energy of the state plus a kinetic energy: row 10 of `residual` for backward Euler, a
-        third
-        of it for BDF2.
+        third of it for BDF2.
         """
         phi = objective(ctl, world)
         if wp.static(midpoint):

@@ -17,12 +17,10 @@ __all__ = ["LANES", "groups_struct", "pcg_kernels", "pcg_struct"]
 TIGHTER = 0.4
 """Factor on the tolerance of solves with constraints. Of 0.03, 0.18, 0.4 and 1 it avoids the third Newton iteration at
 the least cost: with 0.18, 0.4 and 1 a chain of 100 joints takes 64, 54 and 52 PCG iterations per step, and 2.0, 2.0
-and 2.55 Newton iterations.
-"""
+and 2.55 Newton iterations."""
 TRUSTED = 3
 """Newton iterations whose linear solves rely on factors of the operator's own matrix. Later solves are checked and
-refined by conjugate gradients.
-"""
+refined by conjugate gradients."""
 STRICT_CHECK, STRICT_GAIN = 10, 0.01
 """An error-estimating solve ends when it gains less than STRICT_GAIN of the energy in STRICT_CHECK iterations."""
 LANES = 128
@@ -52,7 +50,7 @@ def pcg_struct():
         unsolved: wp.array(dtype=wp.int32)  # the last solve ended at max_iterations
         exact: wp.array(dtype=wp.int32)  # the preconditioner is the inverse of the operator, up to rounding
         taken: wp.array(dtype=wp.int32)  # 1: its z is the solution
-        flip: wp.array(dtype=wp.int32)  # 1: a direction of negative curvature is followed with the curvature's absolute value
+        flip: wp.array(dtype=wp.int32)  # 1: directions of negative curvature are followed, by its absolute value
         max_iterations: wp.int32  # of a solve
         max_work: wp.int32  # of a step
 
@@ -222,8 +220,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         """x += alpha p, r -= alpha H p with alpha = r.z / p.H p.
 
         A direction without positive curvature ends the solve: followed in full if it is the first, else not at all;
-        with
-        `flip` by the step of the absolute curvature, which leads away from a saddle.
+        with `flip` by the step of the absolute curvature, which leads away from a saddle.
         """
         world, slot = wp.tid()
         if world == 0 and slot == 0:

@@ -38,13 +38,13 @@ def reuse_struct():
         build: wp.array(dtype=wp.int32)  # build the object now
         moved: wp.array(dtype=wp.int32)  # 1: build it at this iterate; 0: at its old linearisation point
         changed: wp.array(dtype=wp.int32)  # the linearisation point has changed since it was stored in the state
-        stale: wp.array(dtype=wp.int32)  # 1: the object differs from the state's; 2: only its counts agree with the state's
+        stale: wp.array(dtype=wp.int32)  # 1: the object is not the state's; 2: nor is it, but its counts are
         due: wp.array(dtype=wp.int32)  # rebuild it at the next solve
         mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv of the object; negative: never built
         dq_dv: wp.array(dtype=wp.float64)
         rate: wp.array(dtype=wp.float64)  # iterations of its first solve (per decade) or step; 0: not yet known
         excess: wp.array(dtype=wp.float64)  # iterations beyond that rate since its first solve
-        made_at: wp.array(dtype=wp.int32)  # matrix: Newton iteration of this attempt that built it; -1: kept from before
+        made_at: wp.array(dtype=wp.int32)  # matrix: Newton iteration of this attempt that built it; -1: kept
         pace: wp.array(dtype=wp.float64)  # reduction of the residual by a step's first iteration with a kept matrix
         kept: wp.array2d(dtype=wp.float64)  # in the state: due, mass_factor, dq_dv, rate, excess, pace
         limit: wp.float64  # excess at which a rebuild pays
@@ -116,8 +116,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
         The number of remaining iterations with the present matrix is estimated from its gain per iteration: that of the
         last one or, at the start of a step, of the first one of the last step that began with a kept matrix (`pace`,
-        which
-        fades). `keep`: 1: the matrix may be kept within a step; 2: from step to step.
+        which fades). `keep`: 1: the matrix may be kept within a step; 2: from step to step.
         """
         world = wp.tid()
         if newton.active[world] == 0:
@@ -234,8 +233,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def which(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
         """Copy direction: 1: iterate to linearisation point; 2: state to linearisation point; 3: linearisation point to
-        state;
-        0: none.
+        state; 0: none.
 
         1 and 2 come before a solve, 3 after a step with the flags `accepted` (else an empty array).
         """

@@ -17,8 +17,7 @@ MAX_SEARCH = 20
 REUSED_SEARCH = 2
 LEAPS = 5
 """Consecutive full steps that may raise Phi: with the predicted stress in H, a slender body reaches equilibrium over
-iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017).
-"""
+iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
 TURN, SHRINK = 0.5, 0.4
 """Largest rotation or stretch of an element in such a step, and its reduction factor after restoring the best
 iterate."""
@@ -28,8 +27,7 @@ EXCURSIONS = 1  # maximum deep penetrations by full steps in an attempt: the ret
 KINK, KINKS = 0.5, 8
 """Contact: a positive slope of Phi at a trial above KINK times that at the iterate indicates that slipping points have
 reversed and Phi has a kink before. It is located by at most KINKS trials: a step beyond it makes the points slip back,
-again and again, while one that ends near it makes them stick.
-"""
+again and again, while one that ends near it makes them stick."""
 
 
 def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
@@ -44,17 +42,13 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     @wp.func
     def lost(ctl: Control, world: int) -> bool:
         """True if solves with matrices other than the tangent have failed too often, for laws with their own tangent:
-        beyond a
-        bifurcation only the exact tangent gives descent.
-        """
+        beyond a bifurcation only the exact tangent gives descent."""
         return ctl.linear_stress == 0 and ctl.rounds[world] - ctl.iterations[world] > LOST
 
     @wp.func
     def watch(ctl: Control, world: int, old_phi: f64, old_norm: f64):
         """Bookkeeping after a step that raised Phi and the steps that follow it: restore the best iterate if for LEAPS
-        steps
-        neither the residual halved nor Phi fell below its best value.
-        """
+        steps neither the residual halved nor Phi fell below its best value."""
         if ctl.leaps[world] == 0:
             ctl.mark[world] = 1
             ctl.best_phi[world] = old_phi
@@ -153,9 +147,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     @wp.func
     def lengthen(ctl: Control, world: int, good: bool, slope: f64) -> bool:
         """Double the step while Phi falls ever faster along it, undo the last doubling if the trial fails: replaces
-        solves near
-        a saddle. Statics, after a solve that met negative curvature.
-        """
+        solves near a saddle. Statics, after a solve that met negative curvature."""
         alpha = ctl.alpha[world]
         longer = good and slope <= ctl.slope[world] and ctl.grown[world] >= 0 and ctl.grown[world] < GROWN
         if wp.static(limited):
@@ -172,9 +164,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     @wp.func
     def between(ctl: Control, world: int, slope: f64) -> f64:
         """Next step length when the trial is beyond a kink of Phi, or still steep before it: Illinois method on slopes
-        (Dowell
-        and Jarratt 1971).
-        """
+        (Dowell and Jarratt 1971)."""
         alpha = ctl.alpha[world]
         low = wp.vec2d(ctl.lower[world])
         high = wp.vec2d(ctl.upper[world])

@@ -182,8 +182,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         """Forces of points, N, their stiffness and potential.
 
         `fresh`: an attempt begins. Friction limits are frozen while Newton's method solves: the problem then has a
-        potential,
-        which it would lose with the limits of each iterate where an iterate lies deep in an obstacle.
+        potential, which it would lose with the limits of each iterate where an iterate lies deep in an obstacle.
         """
         world, item, q = wp.tid()
         if active[world] == 0:

@@ -79,8 +79,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
         The force on the body does `given` = f . (motion of the collider's material at the point) and, on the relative
         motion, -(change of stored energy + loss + friction + the integrator's part). The integrator's part has formulas
-        of
-        its own: chords of convex energies, and the contributions of a turning normal and a turning collider.
+        of its own: chords of convex energies, and the contributions of a turning normal and a turning collider.
         """
         out = Outcome()
         rec = record_of(con, c, point)
@@ -299,9 +298,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         at: Attempt, places: int, gap: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
         """Gap, m, and elastic force, N, of each point at a state, without rates; with `places` the gap of a moving
-        contact
-        point is written at the point next to it.
-        """
+        contact point is written at the point next to it."""
         world, item, q = wp.tid()
         point = facets.point + item * facets.points + q
         if facets.share[q, item] == f64(0.0):

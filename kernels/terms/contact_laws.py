@@ -46,8 +46,7 @@ def law_functions() -> _types.SimpleNamespace:
     @wp.func
     def hunt_crossley(lumped: int, k: f64, rate: f64, delta: f64, delta_n: f64) -> vec4d:
         """F = F_el (1 + rate (delta - delta_n)), not below 0 (Hunt and Crossley 1975), its derivative, its integral,
-        and the
-        magnitude of the terms that the integral is the difference of (for its round-off).
+        and the magnitude of the terms that the integral is the difference of (for its round-off).
 
         rate = chi / h, 1/m. F increases with delta wherever it is positive, so its integral is convex.
         """
@@ -131,9 +130,7 @@ def law_functions() -> _types.SimpleNamespace:
         law: int, lumped: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
     ) -> vec4d:  # fmt: skip
         """Normal force, N, its derivative by the depth, N/m, its integral, J, and the magnitude of its terms; g is
-        chi/h or
-        gamma_n/h.
-        """
+        chi/h or gamma_n/h."""
         if law == DEFAULT:
             return hunt_crossley(lumped, k, g, delta, delta_n)
         if law == PAPER:

@@ -317,8 +317,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
     @wp.func
     def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
         """Side through which a motion has passed the surface at its end, -1: none or any, -2: it passed through; see
-        `contact_shapes`.
-        """
+        `contact_shapes`."""
         h = hits(con, k, start, end, side)
         d = end - start
         if side >= 0:

@@ -105,8 +105,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def downhill(g: vec2d, h: vec3d, corners: int, s: vec2d) -> vec2d:
         """Newton step for a gap with gradient g and second derivatives h (aa, ab, bb), along an edge where that
-        blocks it, cut to the facet; 0 without a descent direction.
-        """
+        blocks it, cut to the facet; 0 without a descent direction."""
         det = h[0] * h[2] - h[1] * h[1]
         size = wp.abs(h[0]) + f64(2.0) * wp.abs(h[1]) + wp.abs(h[2])
         d = g * (f64(-1.0) / wp.max(wp.max(size, wp.length(g)), f64(1.0e-300)))

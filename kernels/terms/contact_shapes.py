@@ -115,9 +115,7 @@ def shape_functions() -> _types.SimpleNamespace:
     @wp.func
     def enters(kind: int, size: vec3d, a: vec3d, d: vec3d) -> vec3d:
         """Interval of t with a + t d within a box or a cylinder: t of entry, t of exit, and 16 x side of entry + side
-        of exit;
-        the first is larger than the second if there is none.
-        """
+        of exit; the first is larger than the second if there is none."""
         t_in = f64(-1.0e300)
         t_out = f64(1.0e300)
         side_in = wp.int32(0)

@@ -154,9 +154,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def in_plane(t: Touch, m: vec3d) -> Touch:
         """The point with friction in the plane of a normal m, frozen with the friction limits: on a curved shape the
-        force
-        would not be the derivative of its potential if the plane turned with the iterate.
-        """
+        force would not be the derivative of its potential if the plane turned with the iterate."""
         out = t
         out.m = m
         out.slip = plane(m, t.motion)

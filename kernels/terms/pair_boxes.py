@@ -131,9 +131,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def keep_middles(mas: Masters, active: wp.array(dtype=wp.int32), t: Touching):
         """Position and derivatives at the midpoint of each facet, at the start of the attempt and now, and the facet's
-        largest
-        height above the tangent plane there.
-        """
+        largest height above the tangent plane there."""
         world, item = wp.tid()
         if active[world] == 0:
             return

@@ -32,8 +32,7 @@ def pair_motion_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32), lanes: int, parts: wp.array4d(dtype=mat33d),
     ):  # fmt: skip
         """R_s^T K R_m of the points of a contact, partial sum of a lane, as blocks: translation-translation,
-        translation-rotation, rotation-translation, rotation-rotation of slave and master.
-        """
+        translation-rotation, rotation-translation, rotation-rotation of slave and master."""
         world, index, lane = wp.tid()
         if active[world] == 0:
             return

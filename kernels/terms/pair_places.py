@@ -15,15 +15,13 @@ FEET = 12
 """Maximum number of projection steps: each reduces the error by gap times curvature."""
 OUTER = 0.05
 """Distance over a side by which a point may lie outside of its facet: outward vectors of two elements differ, and a
-point on a border must not change facets from iterate to iterate.
-"""
+point on a border must not change facets from iterate to iterate."""
 INNER = 1e-9
 QUADRATIC = 1e-8
 """Step size below which Newton's method stops: the remaining error is its square."""
 HOLD = 0.5
 """Distance over a side beyond the surface's boundary up to which a point keeps contact in an attempt: it leaves between
-steps, since a force that ends at an iterate has no potential.
-"""
+steps, since a force that ends at an iterate has no potential."""
 
 
 @functools.cache
@@ -189,9 +187,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         motion: vec3d,
     ) -> wp.vec4d:  # fmt: skip
         """Coordinates of a point that was at `first` and has moved by `motion`, and 1 if converged; round-off of the
-        change is
-        relative to the motion.
-        """
+        change is relative to the motion."""
         spot = first
         last = f64(1.0e300)
         for _ in range(TURNS):

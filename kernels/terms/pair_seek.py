@@ -28,8 +28,7 @@ LOST = 0.25
 """Depth over the allowed depth above which a point without a facet has passed through."""
 OPPOSES = 0.5
 """Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
-face the same way.
-"""
+face the same way."""
 ALIKE = 2.0
 """Largest depth of a point that enters from beside a facet, over the deepest active penetration."""
 LEAN = 2.0
@@ -251,9 +250,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def apart(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d, pad: f64) -> bool:
         """True if a point is above a facet by more than `pad`, or moved little and is beside it, by the tangent plane
-        at its
-        midpoint.
-        """
+        at its midpoint."""
         corners = mas.corners[mas.kind[f]]
         s = jet_of(t.middle[world, f])
         if wp.dot(x - s.x, outward(s)) > f64(2.0) * pad + t.swell[world, f]:
@@ -290,9 +287,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, at: Attempt, t: Touching, world: int, c: int, point: int, f: int, spot: vec3d, gap: f64
     ) -> bool:  # fmt: skip
         """True if a point is at a facet now, was beside it at the start of the attempt, and was below its plane by at
-        most the
-        penetration of the bodies' contact: it slid under the edge of a body that has sunk in.
-        """
+        most the penetration of the bodies' contact: it slid under the edge of a body that has sunk in."""
         kind = mas.kind[f]
         most = wp.max(t.deepest[world, mas.bodies[c][0]], t.deepest[world, mas.bodies[c][1]])
         depth = at.reach[world, point] - gap
@@ -309,8 +304,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         left: f64, anchored: bool, facing: vec3d, settling: f64,
     ) -> int:  # fmt: skip
         """Rank of a facet for a point, -1: rejected by depth, by the previous facet, or by the side at the start of the
-        attempt. Higher for facets that face the slave's; among others, for one that the point reached from beside.
-        """
+        attempt. Higher for facets that face the slave's; among others, for one that the point reached from beside."""
         s = jet(mas, t.C, t.D, world, f, spot)
         n = outward(s)
         cosine = wp.dot(n, facing)
@@ -368,9 +362,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         at: Attempt, t: Touching, trio: wp.array(dtype=wp.vec3i),
     ):  # fmt: skip
         """Facet of each point at an iterate. `settling` > 0: no step; inner points up to that depth, m, are in contact.
-        `trio`:
-        three points of each slave facet, or -1.
-        """
+        `trio`: three points of each slave facet, or -1."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return

@@ -133,9 +133,9 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         """Geometric stiffness of the normal force: rotation of the facet under a force, and motion of the projection.
 
         With the relative displacement d at the projection, e_a = n.(change of the tangent a_a), t_a = a_a.d, b the
-        curvature,
-        M = a - gap b and m its inverse, it is 2 t m e + gap e m e + t a^-1 b m t (Wriggers, Computational Contact
-        Mechanics, 2006, 4.1, with the facet's curvature). `lean`: force m a; `bend`: force gap m, and M a^-1 b / force.
+        curvature, M = a - gap b and m its inverse, it is 2 t m e + gap e m e + t a^-1 b m t (Wriggers, Computational
+        Contact Mechanics, 2006, 4.1, with the facet's curvature). `lean`: force m a; `bend`: force gap m, and M a^-1 b
+        / force.
         """
         spot = t.foot[world, point]
         n = t.normal[world, point]
