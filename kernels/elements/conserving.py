@@ -46,7 +46,7 @@ def conserving_law(name: str, dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def mean_increment(G: mat33, dE: mat33, c: coef) -> mat33:
-        """S is linear in E."""
+        """Twice dS/dE1 : dE, exact for S linear in E, Pa."""
         return m.stiffness(dE, c)
 
     return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment, rest_increment=m.stiffness)

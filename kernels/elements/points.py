@@ -238,7 +238,7 @@ def point_functions(
 
     @wp.func
     def step_increment(block: Block, G: mat33, dE: mat33, c: coef) -> mat33:
-        """Change of S of a midpoint step, Pa, by twice a change dE of the strain at its end."""
+        """Twice the change of S of a midpoint step, Pa, by a change dE of the strain at its end."""
         dS = mean.mean_increment(G, dE, c)
         if wp.static(dissipative):
             dS += block.dissipation * mean.rest_increment(dE, c)

@@ -1,6 +1,6 @@
 """(c_M M + (dq/dv) K) p of straight T10 whose rule has a point on each line from the centroid to a vertex.
 
-A gradient is linear over such an element. With L_b the volume coordinates, e(v, b) the slot half-way from vertex v to
+A gradient is linear over such an element. With L_b the volume coordinates, e(v, b) the slot midway from vertex v to
 vertex b and e(v, v) = v, the gradient in parent coordinates is D_v at vertex v, S at the centroid, and D at the point
 that lies s of the way from the centroid to v:
 

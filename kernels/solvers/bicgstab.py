@@ -290,7 +290,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         """x and r of the smallest residual."""
         world, slot = wp.tid()
         if newton.active[world] == 0 or ctl.iterations[world] == 0:
-            return  # there is no best
+            return  # no best iterate yet
         if not ctl.norm[world] <= bi.best[world]:
             x[world, slot] = best_x[world, slot]
             r[world, slot] = best_r[world, slot]

@@ -181,7 +181,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """P^T A P: for two groups and two of their functions the sum of w w' A over the entries between them.
 
-        `pair`: first coarse entry of the group's rows, width of its rows, place of the other in them;
+        `pair`: first coarse entry of the group's rows, width of its rows, index of the other in them;
         `fine_entry`: an entry, its row, its column.
         """
         world, index = wp.tid()

@@ -69,7 +69,7 @@ def control_struct():
         relative: wp.array(dtype=wp.float64)  # |g| over the largest force, of the worst group
         excess: wp.array(dtype=wp.float64)  # largest norm over accepted norm, constraint violations included
         floor_excess: wp.array(dtype=wp.float64)  # residual over that of rounded positions
-        solve_norm: wp.array(dtype=wp.float64)  # |g| of the groups that are not converged
+        solve_norm: wp.array(dtype=wp.float64)  # |g| of the unconverged groups
         solve_accept: wp.array(dtype=wp.float64)  # smallest accepted norm among them
         group_sums: wp.array3d(dtype=wp.float64)  # [GROUP_ROWS, world, residual group], with several groups
         component_of_group: wp.array(dtype=wp.int32)  # [residual group]

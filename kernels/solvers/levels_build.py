@@ -261,7 +261,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """L^-1 of A = L L^T in place of A, and L^-T above the diagonal; one block per world.
 
-        An explicit inverse of A would have errors of its large eigenvalues times round-off in its small ones. A pivot
+        The small eigenvalues of an explicit inverse would have errors of its largest times round-off. A pivot
         that is not safely positive against the diagonal of A is replaced by that diagonal and the rest of its column of
         L is zero, so that L L^T is positive definite for any A. Unknowns without a diagonal get zeros.
         """

@@ -3,8 +3,8 @@ rebuild.
 
 It is kept until the extra iterations that it causes cost as much as a rebuild: iterations of PCG with a preconditioner,
 of Newton's method with a matrix. The rules count iterations, never time, and their counts are part of the state, so
-that a resumed run takes the same decisions. Below, "the object" is the preconditioner or the matrix, and "the place"
-its linearisation point (displacements).
+that a resumed run takes the same decisions. Below, "the object" is the preconditioner or the matrix, at its
+linearisation point (displacements).
 """
 
 import functools

@@ -85,7 +85,7 @@ def step_struct():
         a1: wp.array(dtype=wp.float64)
         b: wp.array(dtype=wp.float64)  # of schemes with v_n in q~
         q_a: wp.array(dtype=wp.float64)  # of schemes with accelerations in their state
-        h_before: wp.array(dtype=wp.float64)  # s, of the same schemes: the step that led to a_n, bounded below by h
+        h_before: wp.array(dtype=wp.float64)  # s, of the same schemes: the step that led to a_n, at least h / STRETCH
         dq_dv: wp.array(dtype=wp.float64)
         mass_factor: wp.array(dtype=wp.float64)  # c_M of the inertia; in statics of the springs, `stabilise`
         ramp: wp.array(dtype=wp.float64)  # factor of constant loads

@@ -163,9 +163,8 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
 def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNamespace:
     """Kernels of the constraints for one precision of the slots.
 
-    `midpoint`: rows hold at the end of a step; forces act along the gradient at its midpoint: of a distance (a0 + a1) /
-    (|a0| + |a1|), of a turn at the mean of its angles: the work of a step is lambda times the change of c, to the last
-    digit.
+    `midpoint`: rows hold at the end of a step; forces act along a midpoint gradient, (a0 + a1) / (|a0| + |a1|) of a
+    distance, at the mean of the angles of a turn: the work of a step is exactly lambda times the change of c.
     """
     p = precision(dtype)
     vec3 = p.vec3

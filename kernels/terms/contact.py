@@ -138,7 +138,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, v_n: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32), at: Attempt,
     ):  # fmt: skip
-        """Explicit forces, Eqs. (77)-(83), at the state that the attempt begins from."""
+        """Forces of explicit contacts at the state that the attempt begins from."""
         world, item, q = wp.tid()
         if active[world] == 0 or facets.share[q, item] == f64(0.0):
             return

@@ -32,7 +32,7 @@ def contact_struct(meshes: bool):
         dead: wp.array(dtype=wp.int32)  # explicit force of the last state
         first: wp.array(dtype=wp.int32)  # [contact + 1] index of its first point
         normal: wp.array2d(dtype=wp.float64)  # [world or 0, contact] k_n; of lumped contacts over sqrt(delta)
-        tangent: wp.array2d(dtype=wp.float64)  # k_t, in the same units
+        tangent: wp.array2d(dtype=wp.float64)  # k_t; of lumped contacts over sqrt(delta)
         normal_damping: wp.array2d(dtype=wp.float64)  # gamma_n over -beta; of lumped contacts over delta^(1/4)
         mass: wp.array2d(dtype=wp.float64)  # m_eff, kg
         ramp: wp.array(dtype=wp.float64)  # m
@@ -129,7 +129,7 @@ def attempt_struct(dtype: str):
         start: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the step in the collider's frame, m
         depth: wp.array2d(dtype=wp.float64)  # depth at the start of the step, m
         speed: wp.array2d(dtype=wp.float64)  # approach speed of the damping, m/s
-        held: wp.array2d(dtype=wp.vec3d)  # friction limit, k_t, spring reduction, frozen during a line search
+        held: wp.array2d(dtype=wp.vec3d)  # friction limit, k_t, spring factor; frozen in a line search
         next: wp.array2d(dtype=wp.vec3d)  # the same three at the iterate
         plane: wp.array2d(dtype=wp.vec3d)  # frozen normal of the plane of friction
         next_plane: wp.array2d(dtype=wp.vec3d)  # normal of the plane of friction at the iterate

@@ -250,7 +250,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def hold(con: Contacts, his: History, at: Attempt, world: int, c: int, point: int, t: Touch) -> vec3d:
-        """Friction limit, k_t and spring reduction at an iterate."""
+        """Friction limit, k_t and reduction factor of the spring at an iterate."""
         rec = record_of(con, c, point)
         mu = coefficient(con, his, world, c, rec)
         live = his.speed[world, rec] > f64(0.0)

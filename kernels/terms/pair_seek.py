@@ -378,7 +378,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         x0 = t.x0[world, point]
         seat = Seat(-1, vec3d(), f64(OUTER), f64(OUTER), f64(1.0e300), -1, False, False)
         if settling > f64(0.0):
-            seat.off = f64(0.0)  # in front of one face of a body is beside another
+            seat.off = f64(0.0)  # no tolerance: a point in front of one face may be beside another
         inside = allowance(con, his, world, c, point, clock.time[world])
         pad = settling + inside + wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)

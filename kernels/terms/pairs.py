@@ -72,7 +72,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt, t: Touching,
     ):  # fmt: skip
-        """Explicit forces at the state that the attempt begins from."""
+        """Forces of explicit contacts at the state that the attempt begins from."""
         world, item, q = wp.tid()
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
