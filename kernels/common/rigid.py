@@ -1,4 +1,4 @@
-"""Rigid-body modes, see solvers/motions.py: shared data and functions for the terms' parts of the matrix."""
+"""Rigid-body modes (kernels/solvers/motions.py): shared data and functions for terms."""
 
 import functools
 import types as _types

@@ -39,9 +39,8 @@ def element_kernels(
         affine: straight elements with parent gradients and one J0 each; False: a table of h_i per element and point.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         framed: the law has axes of its own at each point, `block.frame`.
-        midpoint: conserving scheme, see `point_functions` and conserving.py; u is that at the midpoint of the step and
-        v
-            half of the change of u. Energies and J are those at its end.
+        midpoint: conserving scheme, see `point_functions` and kernels/elements/conserving.py; u is that at the
+            midpoint of the step and v half of the change of u. Energies and J are those at its end.
         dissipative: its dissipative form.
     """
     fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint, dissipative)

@@ -47,7 +47,7 @@ def block_struct(dtype: str, dissipative: bool = False):
         history_offset: wp.int32
         count: wp.int32  # elements
         if dissipative:
-            dissipation: T  # chi of conserving.py
+            dissipation: T  # chi of kernels/elements/conserving.py
 
     return ElementBlock
 
@@ -230,7 +230,7 @@ def point_functions(
 
     @wp.func
     def step_stress(block: Block, G: mat33, D: mat33, c: coef) -> mat33:
-        """S of a midpoint step, Pa: that of conserving.py with its dissipation."""
+        """S of a midpoint step, Pa: that of kernels/elements/conserving.py with its dissipation."""
         S = mean.mean_stress(G, D, c)
         if wp.static(dissipative):
             S += block.dissipation * mean.rest_increment(t.sym(D + wp.transpose(G) * D), c)

@@ -37,7 +37,7 @@ def tied_kernels(
         midpoint: conserving scheme: u is that at the midpoint of the step, v half of the change of u; the shears in
         forces
             and products are the mean of those at both ends, and the energy is that at the end.
-        dissipative: with (chi/2) of the shears' change added to the mean, see conserving.py.
+        dissipative: with (chi/2) of the shears' change added to the mean, see kernels/elements/conserving.py.
         worlds: A differs between worlds, stored side by side.
     """
     p = precision(dtype)

@@ -33,7 +33,7 @@ def tied_struct(dtype: str, dissipative: bool = False):
         history_offset: wp.int32
         count: wp.int32
         if dissipative:
-            dissipation: T  # chi of conserving.py
+            dissipation: T  # chi of kernels/elements/conserving.py
 
     return TiedBlock
 

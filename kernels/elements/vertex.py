@@ -48,7 +48,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
     Args:
         points: 4, one for each vertex, or 5, the centroid before them.
         fn: functions of points.py.
-        shared: functions of cluster.py.
+        shared: functions of kernels/elements/cluster.py.
     """
     p, rate = fn.types, fn.uses_v
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym

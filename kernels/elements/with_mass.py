@@ -1,4 +1,4 @@
-"""The product (c_M M + (dq/dv) K) p of straight elements, mass included, by clusters of elements (cluster.py)."""
+"""Product (c_M M + (dq/dv) K) p of straight elements, mass included; see kernels/elements/cluster.py."""
 
 import functools
 

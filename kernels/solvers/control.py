@@ -105,7 +105,7 @@ def control_struct():
         tol: wp.float64
         eps: wp.float64
         any_hard: wp.array(dtype=wp.int32)  # 1 if any world needs a rare branch: any of the flags below
-        # nonmonotone steps, see searching.py
+        # nonmonotone steps, see kernels/solvers/searching.py
         leaps: wp.array(dtype=wp.int32)  # nonmonotone steps since the best iterate
         mixed: wp.array(dtype=wp.int32)  # 1: H has the predicted stress; 2: positive semi-definite
         wish: wp.array(dtype=wp.int32)  # 1: a nonmonotone trial is requested, its length is due; 2: the trial is one

@@ -1,5 +1,4 @@
-"""Reuse rule of a preconditioner, or of the operator's matrix, from an earlier iterate: when to keep it, when to
-rebuild.
+"""Reuse rule of a preconditioner or operator matrix from an earlier iterate: when to keep it, when to rebuild it.
 
 It is kept until the extra iterations that it causes cost as much as a rebuild: iterations of PCG with a preconditioner,
 of Newton's method with a matrix. The rules count iterations, never time, and their counts are part of the state, so

@@ -166,7 +166,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
         u: wp.array2d(dtype=vec3d), time: f64, inv_h: f64, shrink: f64,
     ) -> Touch:  # fmt: skip
-        """A point at displacements u (float64, see contact_exact.py)."""
+        """A point at displacements u (float64, see kernels/terms/contact_exact.py)."""
         out = Touch()
         k = con.collider[c]
         rec = record_of(con, c, point)

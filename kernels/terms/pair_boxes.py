@@ -48,7 +48,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
         D: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """Coefficients of displacements on master facets in float64, see contact_exact.py."""
+        """Coefficients of displacements on master facets in float64, see kernels/terms/contact_exact.py."""
         world, item, m = wp.tid()
         if active[world] != 0 and m < mas.terms[mas.kind[item]]:
             control(mas, u, world, item, m, C, D)

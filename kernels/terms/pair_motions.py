@@ -1,4 +1,4 @@
-"""Cross terms of contact between bodies in the matrix of their rigid-body modes, see solvers/motions.py."""
+"""Cross terms of pair contact in the matrix of rigid-body modes, see kernels/solvers/motions.py."""
 
 import functools
 import types as _types
