@@ -19,7 +19,7 @@ class Scene:
     forward: wp.vec3
     right: wp.vec3  # half the picture's width at distance one
     up: wp.vec3  # half its height
-    center: wp.vec2  # where the axis `forward` meets the picture, in [-1, 1]
+    center: wp.vec2  # intersection of the axis `forward` with the picture, in [-1, 1]
     width: float  # pixels
     height: float
     light: wp.vec3  # towards the light

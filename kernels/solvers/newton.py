@@ -183,7 +183,7 @@ def newton_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         """Error estimate of a stalled residual, relative to the solution, of the worst part.
 
         With H p = -g in the energy norm: eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); for each part
-        separately, since a stiff part joined to a soft one would hide its error.
+        separately, since a stiff part would hide the error of a soft one joined to it.
         """
         world = wp.tid()
         if ctl.strict[world] != 2:
