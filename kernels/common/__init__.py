@@ -1,1 +1,1 @@
-"""What kernels share: number types, structs, sums over threads, inverses of 3x3 blocks."""
+"""Shared device code: number types, structs, sums over threads, inverses of 3x3 blocks."""

@@ -1,4 +1,4 @@
-"""Adding to an entry of a symmetric matrix of 3x3 blocks."""
+"""Addition to an entry of a symmetric matrix of 3x3 blocks."""
 
 import functools
 
@@ -12,7 +12,7 @@ __all__ = ["add_block_function", "add_symmetric_function"]
 
 @functools.cache
 def add_block_function(dtype: str) -> wp.Function:
-    """The function add_block(topo, at, A, world, value), `at` being a row of Pattern.upper."""
+    """Function add_block(topo, at, A, world, value), with `at` a row of Pattern.upper."""
     mat33 = precision(dtype).mat33
     Topology = topology_struct(dtype)
 
@@ -35,7 +35,7 @@ def add_block_function(dtype: str) -> wp.Function:
 
 @functools.cache
 def add_symmetric_function(dtype: str) -> wp.Function:
-    """The function add_symmetric(topo, at, k6, world, value), like add_block."""
+    """Function add_symmetric(topo, at, k6, world, value), like add_block."""
     p = precision(dtype)
     mat33, sym = p.mat33, p.sym
     Topology = topology_struct(dtype)

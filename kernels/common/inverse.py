@@ -20,9 +20,9 @@ def inverse_function(dtype: str):
 
     @wp.func
     def positive_inverse(A: mat33, least: T) -> mat33:
-        """A^-1 where the leading minors of A are safely positive, else the inverse of |diag A|, at least `least`.
+        """A^-1 if the leading minors of A are safely positive, else the inverse of |diag A|, at least `least`.
 
-        For an A of about 1, whose minors neither overflow nor vanish.
+        For A of order 1, whose minors neither overflow nor vanish.
         """
         d1 = A[0, 0]
         d2 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]

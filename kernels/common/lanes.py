@@ -67,7 +67,7 @@ def lane_sum_float32(x: wp.float32, lanes: int) -> wp.float32:
 def warp_low(x: wp.float64, world: int) -> wp.float64:
     """Smallest x of a warp, in its first thread and 1e300 in others, if all are of one world; else x itself.
 
-    For an atomic minimum, which in double precision is a loop that threads of a world wait in for each other.
+    For an atomic minimum, which in double precision is a loop that serialises the threads of a world.
     """
     ...
 
@@ -85,16 +85,16 @@ _NUMBER = {"float64": "double", "float32": "float"}
 
 @functools.cache
 def block_memory(dtype: str, size: int) -> _types.SimpleNamespace:
-    """Device functions for `size` numbers that the threads of a block share.
+    """Device functions for `size` numbers shared by the threads of a block.
 
-    `open(outside)` is where they are: memory of the block or, on the CPU, that at `outside`. `load(at, i)`,
-    `store(at, i, x)`.
+    `open(outside)` is their location: memory of the block or, on the CPU, that at `outside`. `load(at, i)` and
+    `store(at, i, x)` access number i.
     """
     T, number = precision(dtype).T, _NUMBER[dtype]
 
     @wp.func_native(snippet=_SHARED.format(number=number, size=size))
     def open_memory(outside: wp.uint64) -> wp.uint64:
-        """Where the numbers are."""
+        """Location of the numbers."""
         ...
 
     @wp.func_native(snippet=f"return (({number}*)at)[i];")
@@ -116,7 +116,7 @@ def lane_functions(dtype: str) -> _types.SimpleNamespace:
 
     `sync()` is the barrier of a block. `lane_sum(v, lanes)` sums vectors, `row_sum(x, lanes)` float64 numbers and
     `scalar_sum(x, lanes)` numbers of this precision over runs of `lanes` threads, a power of two up to WARP. The first
-    thread of a run gets the sum. Every thread of a warp must take part, so launches pad their rows to whole warps.
+    thread of a run gets the sum. Every thread of a warp must participate, so launches pad their rows to whole warps.
     """
     vec3 = precision(dtype).vec3
     scalar_sum = {"float64": lane_sum_float64, "float32": lane_sum_float32}[dtype]

@@ -1,4 +1,4 @@
-"""A kernel that does nothing, to measure what a launch costs by itself."""
+"""Empty kernel, to measure the cost of a launch."""
 
 import functools
 import types as _types
@@ -12,7 +12,7 @@ __all__ = ["probe_kernels"]
 
 @functools.cache
 def probe_kernels() -> _types.SimpleNamespace:
-    """The kernel `empty`."""
+    """Kernel `empty`."""
     module = kernel_module("probe")
 
     @wp.kernel(module=module)

@@ -1,4 +1,4 @@
-"""Sums per world, in an order that depends on the length of a row alone, not on how many worlds there are."""
+"""Sums per world, in an order that depends on the row length only, not on the number of worlds."""
 
 import functools
 import types as _types
@@ -11,10 +11,10 @@ from .types import kernel_module
 __all__ = ["CHUNK", "SHORT", "reduce_kernels"]
 
 TILE = 1024
-"""Numbers that a block adds up at once."""
+"""Numbers summed at once by a block."""
 SHORT = 512
-"""Rows up to this length are summed by a warp, which leaves room for those of many worlds (4096 worlds on an H200, rows
-of 67: 5 us for 48)."""
+"""Rows up to this length are summed by a warp, which leaves room for many worlds (4096 worlds on an H200, rows of 67: 5
+us for 48)."""
 CHUNK = 16384
 """Rows up to this length are summed by one block; longer ones in chunks of this length first."""
 
@@ -51,7 +51,7 @@ def reduce_kernels() -> _types.SimpleNamespace:
     def short_sums(
         rows: wp.array3d(dtype=f64), lanes: int, active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=f64)
     ):
-        """One warp sums one row of one world; on the CPU one thread does, `lanes` is 1."""
+        """One warp sums one row of one world; on the CPU one thread, `lanes` is 1."""
         item = wp.tid() / lanes
         lane = wp.tid() % lanes
         world = item % rows.shape[1]

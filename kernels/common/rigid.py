@@ -1,4 +1,4 @@
-"""Rigid motions of bodies, see solvers/motions.py: what terms make their parts of the matrix with."""
+"""Rigid-body modes (kernels/solvers/motions.py): shared data and functions for terms."""
 
 import functools
 import types as _types
@@ -10,25 +10,25 @@ from .types import precision
 __all__ = ["MOTIONS", "bodies_struct", "motion_functions"]
 
 MOTIONS = 6
-"""Of a body: three translations, three turns."""
+"""Modes of a body: three translations, three rotations."""
 
 
 @functools.cache
 def bodies_struct(dtype: str):
-    """The bodies whose motions these are, and where their slots are."""
+    """Bodies with rigid-body modes, and their slots."""
     T = precision(dtype).T
 
     @wp.struct
     class Bodies:
         first: wp.array(dtype=wp.int32)  # [body] first slot
-        last: wp.array(dtype=wp.int32)  # the slot after its last one
+        last: wp.array(dtype=wp.int32)  # [body] last slot + 1
         size: wp.array(dtype=wp.float64)  # m
-        move: wp.array(dtype=wp.vec3d)  # 1 for translations that nothing prescribes
-        turn: wp.array(dtype=wp.vec3d)  # 1 for turns, or 0
-        sample: wp.array2d(dtype=wp.int32)  # [place, body] slots whose mean is the centre
+        move: wp.array(dtype=wp.vec3d)  # [body] 1 for free translations, 0 for prescribed ones
+        turn: wp.array(dtype=wp.vec3d)  # [body] 1 for free rotations, else 0
+        sample: wp.array2d(dtype=wp.int32)  # [place, body] slots whose mean position is the centre
         of_slot: wp.array(dtype=wp.int32)  # [slot] body or -1
-        is_place: wp.array(dtype=T)  # [slot] 1, or 0 of a gradient
-        X: wp.array(dtype=wp.vec3d)  # [slot] reference place, m, or gradient
+        is_place: wp.array(dtype=T)  # [slot] 1 for a position, 0 for a gradient
+        X: wp.array(dtype=wp.vec3d)  # [slot] reference position, m, or gradient
         arm: wp.array2d(dtype=wp.vec3d)  # [world, slot] a
 
     return Bodies
@@ -36,18 +36,18 @@ def bodies_struct(dtype: str):
 
 @functools.cache
 def motion_functions(dtype: str) -> _types.SimpleNamespace:
-    """Device functions that terms make their parts of the matrix with."""
+    """Device functions for the terms' parts of the matrix."""
     mat33d = wp.mat33d
     Bodies = bodies_struct(dtype)
 
     @wp.func
     def moves(bodies: Bodies, body: int, slot: int) -> mat33d:
-        """How a slot moves with the translations of its body: the columns."""
+        """Motion of a slot by the translations of its body, as columns."""
         return wp.float64(bodies.is_place[slot]) * wp.diag(bodies.move[body])
 
     @wp.func
     def turns(bodies: Bodies, world: int, body: int, slot: int) -> mat33d:
-        """And with its turns: the columns e_k x a."""
+        """Motion of a slot by the rotations of its body, as columns e_k x a."""
         return -wp.skew(bodies.arm[world, slot]) @ wp.diag(bodies.turn[body])
 
     return _types.SimpleNamespace(moves=moves, turns=turns)

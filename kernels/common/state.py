@@ -1,4 +1,4 @@
-"""Copies of the state of chosen worlds; arrays of any type are copied as rows of 32-bit words."""
+"""Masked copies of the state; arrays of any type are copied as rows of 32-bit words."""
 
 import functools
 import types as _types
@@ -12,7 +12,7 @@ __all__ = ["state_kernels"]
 
 @functools.cache
 def state_kernels() -> _types.SimpleNamespace:
-    """Kernels that treat every state array as [world, word]."""
+    """Kernels for state arrays as [world, word]."""
     module = kernel_module("state")
 
     @wp.kernel(module=module)

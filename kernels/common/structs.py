@@ -1,4 +1,4 @@
-"""Structs that many kernels take: contributions to slots, patterns of matrices, the balance of forces."""
+"""Shared structs: contributions to slots, patterns of matrices, the balance of forces."""
 
 import functools
 
@@ -24,19 +24,19 @@ def pattern_struct():
 
 @functools.cache
 def topology_struct(dtype: str):
-    """What the gather of a slot reads: its contributions, its row of the mass matrix (CSR), its free components."""
+    """Gather data of a slot: its contributions, its row of the mass matrix (CSR), its free components."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
     @wp.struct
     class Topology:
         start: wp.array(dtype=wp.int32)  # [slot + 1]
-        entry: wp.array(dtype=wp.int32)  # contributions that a slot sums, in a fixed order
+        entry: wp.array(dtype=wp.int32)  # contributions to a slot, in a fixed order
         mass_start: wp.array(dtype=wp.int32)  # [slot + 1]
         mass_column: wp.array(dtype=wp.int32)
         mass_value: wp.array2d(dtype=T)  # [world or 0, entry] kg
         free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
-        held: wp.array(dtype=wp.uint8)  # [slot] bit k is set where component k is prescribed: `free` in one byte
+        held: wp.array(dtype=wp.uint8)  # [slot] bit k is set if component k is prescribed: `free` in one byte
         pool_start: wp.array(dtype=wp.int32)  # [slot + 1] of the pool of terms; with pooled terms
         pool_entry: wp.array(dtype=wp.int32)  # indices into the pool
 
@@ -50,7 +50,7 @@ def mass_function(dtype: str):
 
     @wp.func
     def mass_at(topo: Topology, world: int, k: int) -> T:
-        """Entry k as the world has it."""
+        """Entry k in the given world."""
         return topo.mass_value[world % topo.mass_value.shape[0], k]
 
     return mass_at
@@ -58,7 +58,7 @@ def mass_function(dtype: str):
 
 @functools.cache
 def balance_struct(dtype: str):
-    """The balance of forces at an iterate, Eq. (17): what it is made of and its parts, [world, slot]; forces in N."""
+    """Balance of forces at an iterate, Eq. (17): inputs and parts, [world, slot]; forces in N."""
     vec3 = precision(dtype).vec3
 
     @wp.struct
@@ -66,16 +66,16 @@ def balance_struct(dtype: str):
         u: wp.array2d(dtype=vec3)  # displacements, m
         v: wp.array2d(dtype=vec3)  # velocities, m/s
         v_tilde: wp.array2d(dtype=vec3)  # the inertia term is c_M M (v - v_tilde)
-        dead: wp.array2d(dtype=vec3)  # loads that do not depend on the iterate, and the sum of their magnitudes
+        dead: wp.array2d(dtype=vec3)  # loads independent of the iterate, and the sum of their magnitudes
         dead_magnitude: wp.array2d(dtype=vec3)
-        nonpotential: wp.array2d(dtype=vec3)  # forces without a potential, and what a line search holds of them
+        nonpotential: wp.array2d(dtype=vec3)  # non-conservative forces, and their values frozen in a line search
         nonpotential_held: wp.array2d(dtype=vec3)
-        direction: wp.array2d(dtype=vec3)  # p, along which the line search moves v
+        direction: wp.array2d(dtype=vec3)  # p, search direction
         diagonal: wp.array2d(dtype=vec3)  # D, the diagonal of H, which weights the norms
         inertia: wp.array2d(dtype=vec3)
         internal: wp.array2d(dtype=vec3)
         g: wp.array2d(dtype=vec3)  # the residual
-        gradient: wp.array2d(dtype=vec3)  # of the augmented potential: what the Newton step is solved for
+        gradient: wp.array2d(dtype=vec3)  # of the augmented potential: right side of the Newton step
         pool_force: wp.array2d(dtype=vec3)  # [world, entry] forces of pooled terms
         rows: wp.array3d(dtype=wp.float64)  # [row, world, slot] to be summed
         mass_factor: wp.array(dtype=wp.float64)  # [world]
@@ -86,19 +86,19 @@ def balance_struct(dtype: str):
 
 @functools.cache
 def additions_struct(dtype: str):
-    """What a product needs besides the elements' part: factors, and tangents of the terms."""
+    """Additions to the elements' part of a product: factors, and tangents of the terms."""
     vec3 = precision(dtype).vec3
 
     @wp.struct
     class Additions:
-        start: wp.array(dtype=wp.int32)  # of forces without a potential: [slot + 1]
+        start: wp.array(dtype=wp.int32)  # of non-conservative forces: [slot + 1]
         entry: wp.array(dtype=wp.int32)  # indices into their contributions
         contribution: wp.array2d(dtype=vec3)
-        pool_start: wp.array(dtype=wp.int32)  # as of Topology; with pooled terms
+        pool_start: wp.array(dtype=wp.int32)  # as in Topology; with pooled terms
         pool_entry: wp.array(dtype=wp.int32)
         pool: wp.array2d(dtype=vec3)  # [world, entry] K p of pooled terms
         mass_factor: wp.array(dtype=wp.float64)  # [world]
         dq_dv: wp.array(dtype=wp.float64)
-        warp: wp.int32  # threads whose values make one partial sum
+        warp: wp.int32  # number of threads per partial sum
 
     return Additions

@@ -1,4 +1,4 @@
-"""What the terms of a model ask of the kernels of a step, which are specialised by it: absent terms cost nothing."""
+"""Traits of a model's terms that specialise the kernels of a step: absent terms cost nothing."""
 
 from typing import NamedTuple
 
@@ -6,18 +6,18 @@ __all__ = ["NO_TERMS", "Traits"]
 
 
 class Traits(NamedTuple):
-    """What is there besides the elements.
+    """Terms present besides the elements.
 
     Attributes:
-        nonpotential: forces without a potential; Phi holds those of the last iterate in a line search.
-        tangent: such forces have a symmetric tangent that counts in H.
-        pooled: terms with a potential that contribute to slots by the pool of terms.
+        nonpotential: non-conservative forces; Phi freezes those of the last iterate in a line search.
+        tangent: such forces have a symmetric tangent in H.
+        pooled: terms with a potential that contribute to slots through the pool of terms.
         ties: constraints, whose rows are gathered with the slots.
-        stored: terms have a potential of their own, in rows that are summed per world.
-        gated: constraints whose violation must fall below a tolerance, and whose multipliers change with the iterate.
+        stored: terms have stored energy, in rows that are summed per world.
+        gated: constraints with a violation tolerance, and with multipliers that change with the iterate.
         limited: terms may shorten a Newton step.
-        walls: terms have forces that set in suddenly, such as contact.
-        midpoint: of the integrator: forces are those of the middle of a step and have no potential by its end.
+        walls: terms have unilateral forces, such as contact.
+        midpoint: of the integrator: forces are those at the midpoint of a step and have no potential in its end state.
     """
 
     nonpotential: bool = False
@@ -31,7 +31,7 @@ class Traits(NamedTuple):
     midpoint: bool = False
 
     def suffix(self, *names: str) -> str:
-        """Part of a module's name that tells the traits in `names` that are there."""
+        """Module name suffix of those traits in `names` that are set."""
         return "".join(f"_{name}" for name in names if getattr(self, name))
 
 

@@ -8,7 +8,7 @@ import warp as wp
 __all__ = ["SMALL", "kernel_module", "precision"]
 
 SMALL = 4
-"""`max_unroll` of modules whose short loops go over components: unrolled they index registers, not memory."""
+"""`max_unroll` of modules with short loops over components: unrolled they index registers, not memory."""
 
 
 @functools.cache
@@ -26,16 +26,16 @@ def precision(dtype: str) -> _types.SimpleNamespace:
 
 
 def kernel_module(name: str, light: bool = False, **options) -> wp.Module:
-    """The Warp module `name` with the options all our kernels share.
+    """The Warp module `name` with the options common to all kernels.
 
-    Loops are not unrolled: a T10 tangent kernel with the default unrolling compiles for minutes. No adjoint code is
-    generated: it triples compile time.
+    Loops are not unrolled: a T10 tangent kernel with the default unrolling compiles for minutes. Adjoint code is
+    disabled: it triples compile time.
 
     Args:
         name: of the module, without the package.
-        light: whether its kernels have one thread per world. Compiling them takes longer than they ever run, so that
-            it is done without optimisation: an eighth of the time, and the same bits. Not where there is a CUDA device,
-            for which the option would count too.
+        light: its kernels have one thread per world. Compilation outweighs their run time, so that they are compiled
+            without optimisation: an eighth of the time, and the same bits. Ignored where there is a CUDA device, as
+            the option would act on it too.
         options: of Warp, for this module.
     """
     module = wp.get_module(f"warpfea.kernels.{name}")

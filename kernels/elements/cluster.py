@@ -1,9 +1,9 @@
 """Products H p by clusters of elements: a cluster reads each of its slots once and writes one sum of forces per slot.
 
-A cluster is a run of elements that one block of threads processes. The fields at its slots lie in shared memory, and so
-do the forces of its elements until they are summed, per slot and in a fixed order. The sums are about a third as many
-as the forces of the elements, and elements read their slots without an address in global memory. On the CPU one thread
-processes a cluster, and arrays take the place of the shared memory.
+A cluster is a run of elements that one block of threads processes. The fields at its slots and the forces of its
+elements lie in shared memory; the forces are summed per slot in a fixed order. The number of sums is about a third of
+that of element forces, and elements read their slots without global addresses. On the CPU one thread processes a
+cluster, and arrays replace the shared memory.
 """
 
 import functools
@@ -30,39 +30,39 @@ __all__ = [
 ]
 
 LARGEST = {"float64": 64, "float32": 128}
-"""Elements of a cluster and threads of its block: the size at which shared memory and registers let a GPU fill best."""
+"""Elements of a cluster and threads of its block: the size of best GPU occupancy given shared memory and registers."""
 CAPACITY = {32: 24, 64: 32, 128: 46}
-"""Slots that a cluster has room for, by its number of elements, as multiples of the slots of one element."""
+"""Slot capacity of a cluster, by its number of elements, in multiples of the slots of one element."""
 SHARED_BYTES = 48 * 1024
-"""Shared memory that a block may use without asking CUDA for more."""
+"""Largest static shared memory of a CUDA block."""
 THREADS = {"float64": 384, "float32": 640}
-"""Threads that must fit on a multiprocessor at once: this bounds the registers of a thread."""
+"""Threads that must fit on a multiprocessor at once: bounds the registers of a thread."""
 U, DIRECTION, V = 0, 1, 2
 """The fields at the slots of a cluster: displacement, direction p, velocity."""
 QUAD = 4
-"""32-bit words of a table that are copied at once."""
+"""32-bit words of a table copied at once."""
 
 
 def cluster_size(dtype: str, count: int, *, fit: bool) -> int:
-    """Elements of a cluster where an element block has `count` elements.
+    """Cluster size for an element block of `count` elements.
 
-    `fit`: small element blocks get small clusters, so that few threads idle where thousands of worlds run at once.
+    `fit`: small element blocks get small clusters, so that few threads idle when thousands of worlds run at once.
     """
     return min(n for n in CAPACITY if n == LARGEST[dtype] or (fit and count <= n < LARGEST[dtype]))
 
 
 def slot_capacity(size: int, slots: int) -> int:
-    """Most slots of a cluster of `size` elements that have `slots` slots each."""
+    """Maximum number of slots of a cluster of `size` elements with `slots` slots each."""
     return slots * CAPACITY[size]
 
 
 def pool_size(size: int, slots: int, fields: int) -> int:
-    """Numbers in the memory of a cluster: the fields at its slots, and the forces of its elements."""
+    """Size of a cluster's memory: the fields at its slots, and the forces of its elements."""
     return 3 * (fields * slot_capacity(size, slots) + slots * size)
 
 
 def table_layout(size: int, slots: int) -> tuple[int, int, int]:
-    """Layout of a cluster's table: where `place` and `sum_start` begin (16-bit numbers), and its 32-bit words."""
+    """Layout of a cluster's table: start of `place` and `sum_start` (16-bit numbers), and its 32-bit words."""
     place = slots * size
     words = place + slot_capacity(size, slots) // 2 + 1
     return place, 2 * place, QUAD * -(-words // QUAD)
@@ -70,18 +70,18 @@ def table_layout(size: int, slots: int) -> tuple[int, int, int]:
 
 @functools.cache
 def cluster_struct():
-    """The clusters of an element block.
+    """Clusters of an element block.
 
-    The table of a cluster holds three lists of 16-bit numbers: `sum_entry`, the forces local * size + element in the
-    order of the slots that they are added to; `place` [local, element], where the slot of an element lies among those
-    of the cluster; `sum_start` [slot + 1], where the forces on a slot begin in `sum_entry`.
+    The table of a cluster holds three lists of 16-bit numbers: `sum_entry`, force indices local * size + element in the
+    order of summation by slot; `place` [local, element], index of an element's slot among those of the cluster;
+    `sum_start` [slot + 1], start of the forces on a slot in `sum_entry`.
     """
 
     @wp.struct
     class Clusters:
         start: wp.array(dtype=wp.int32)  # [cluster + 1] first element
-        slot_start: wp.array(dtype=wp.int32)  # [cluster + 1] first sum, counted within the block
-        slot: wp.array2d(dtype=wp.int32)  # [cluster, place] slot; rows are filled up with their last slot
+        slot_start: wp.array(dtype=wp.int32)  # [cluster + 1] first sum, numbered within the block
+        slot: wp.array2d(dtype=wp.int32)  # [cluster, place] slot; rows are padded with their last slot
         table: wp.array(dtype=wp.int32)  # [cluster * words]
         offset: wp.int32  # of the block's sums among those of all blocks
 
@@ -90,7 +90,7 @@ def cluster_struct():
 
 @functools.cache
 def pool_struct(dtype: str):
-    """Arrays that take the place of shared memory on the CPU; on CUDA they have one element and are not used."""
+    """Arrays that replace shared memory on the CPU; on CUDA they have one element and are unused."""
     T = precision(dtype).T
 
     @wp.struct
@@ -102,10 +102,10 @@ def pool_struct(dtype: str):
 
 
 def _pool_access(dtype: str, size: int) -> Callable:
-    """The device function access: access(1, k, x, spare) stores x as number k, access(0, k, x, spare) returns it."""
+    """Device function access: access(1, k, x, spare) stores x as number k, access(0, k, x, spare) returns it."""
     T = precision(dtype).T
     scalar = {"float64": "double", "float32": "float"}[dtype]
-    # one function to store and to return: two functions would declare two separate shared arrays
+    # one function for both: two functions would declare two separate shared arrays
     snippet = f"""
     #if defined(__CUDA_ARCH__)
     __shared__ {scalar} pool[{size}];
@@ -124,7 +124,7 @@ def _pool_access(dtype: str, size: int) -> Callable:
 
 
 def _table_access(words: int) -> Callable:
-    """The device function access for the table of a cluster.
+    """Device function access for the table of a cluster.
 
     access(1, k, first, source, spare) copies its words QUAD k .. QUAD (k + 1) - 1 from the source, where the table
     begins at word `first`; access(0, k, first, source, spare) returns its 16-bit number k.
@@ -172,7 +172,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
     assert numbers * (8 if dtype == "float64" else 4) + 4 * WORDS < SHARED_BYTES, "a cluster exceeds shared memory"
     number = _pool_access(dtype, numbers)
     bits = _table_access(WORDS)
-    # a thread starts so many loads before it needs the first
+    # loads in flight per thread before the first use
     SLOTS_AT_ONCE, QUADS_AT_ONCE = -(-ROOM // ELEMENTS), -(-WORDS // (QUAD * ELEMENTS))
     Slots = wp.types.vector(length=SLOTS_AT_ONCE, dtype=wp.int32)
     Values = wp.types.matrix(shape=(SLOTS_AT_ONCE, 3), dtype=T)
@@ -185,7 +185,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
 
     @wp.func
     def get(first: int, stride: int, at: int, pool: Pool) -> vec3:
-        """The vector that `put` stored there."""
+        """Vector stored by `put`."""
         x = vec3()
         for k in range(3):
             x[k] = number(0, first + k * stride + at, T(0.0), pool.number)
@@ -193,12 +193,12 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
 
     @wp.func
     def entry(k: int, pool: Pool) -> int:
-        """The 16-bit number k of the cluster's table."""
+        """16-bit number k of the cluster's table."""
         return bits(0, k, 0, pool.table, pool.table)
 
     @wp.func
     def fetch(pool: Pool, field: int, i: int, at: int) -> vec3:
-        """A field at slot i of element `at` of the cluster."""
+        """Field value at slot i of element `at` of the cluster."""
         return get(3 * field * ROOM, ROOM, entry(PLACE + i * ELEMENTS + at, pool), pool)
 
     @wp.func
@@ -221,7 +221,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
 
     @wp.func
     def slots_from(clusters: Clusters, cluster: int, first: int, lanes: int) -> Slots:
-        """The next SLOTS_AT_ONCE slots of a lane: those at the places first, first + lanes, ... of the cluster."""
+        """Next SLOTS_AT_ONCE slots of a lane, at the indices first, first + lanes, ... of the cluster."""
         slot = Slots()
         for j in range(SLOTS_AT_ONCE):
             slot[j] = clusters.slot[cluster, wp.min(first + j * lanes, ROOM - 1)]
@@ -250,7 +250,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
                 put(3 * into * ROOM, ROOM, first + j * lanes, x[j], pool)
 
     def by_clusters(module: wp.Module, Block, product: wp.Function, bounded: bool) -> wp.Kernel:
-        """The kernel `with_mass_product`.
+        """Kernel `with_mass_product`.
 
         `product` is the device function that sets the forces of one element; `bounded`: registers per thread are
         limited so that THREADS threads fit on a multiprocessor.

@@ -1,14 +1,14 @@
-"""Stresses of the conserving mid-point scheme: S that does exactly the work W(E1) - W(E0) on E1 - E0.
+"""Stresses of the conserving midpoint scheme: S with exactly the work S : (E1 - E0) = W(E1) - W(E0).
 
-Arguments are G, the displacement gradient half-way between both ends of a step, and D, half of what it changes by; the
-ends are G - D and G + D. The mean of their strains is E(G) + D^T D / 2, their difference 2 sym(F^T D), without
-subtracting nearly equal numbers. Of laws whose S is linear in E, S at the mean strain does it (Simo and Tarnow 1992);
-of the others Gonzalez' discrete gradient (2000),
+Arguments are G, the displacement gradient at the midpoint of a step, and D, half of its change; the ends are G - D and
+G + D. The mean of their strains is E(G) + D^T D / 2, their difference 2 sym(F^T D), without cancellation. For laws with
+S linear in E, S at the mean strain has this work (Simo and Tarnow 1992); for the others Gonzalez' discrete gradient
+(2000),
 
     S = S(E_m) + (W(E1) - W(E0) - S(E_m) : dE) dE / |dE|^2.
 
-The dissipative scheme adds (chi/2) C0 : dE (Armero and Romero 2001), which takes (chi/2) dE : C0 : dE >= 0 from a step,
-nothing from a rigid motion, and leaves both momenta alone, as any S does.
+The dissipative scheme adds (chi/2) C0 : dE (Armero and Romero 2001), which dissipates (chi/2) dE : C0 : dE >= 0 in a
+step, nothing in a rigid motion, and conserves both momenta, as any S does.
 """
 
 import functools
@@ -22,7 +22,7 @@ from . import materials
 __all__ = ["conserving_law"]
 
 TINY = {"float64": 1.0e-60, "float32": 1.0e-30}
-"""|dE|^2 far below that of any rounding: a step without a change of strain has the stress at its mean."""
+"""|dE|^2 far below round-off: a step without a change of strain uses the stress at the mean strain."""
 
 
 @functools.cache
@@ -46,17 +46,17 @@ def conserving_law(name: str, dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def mean_increment(G: mat33, dE: mat33, c: coef) -> mat33:
-        """S is linear in E."""
+        """Twice dS/dE1 : dE, exact for S linear in E, Pa."""
         return m.stiffness(dE, c)
 
     return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment, rest_increment=m.stiffness)
 
 
 def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNamespace:
-    """Of Mooney-Rivlin or neo-Hookean; c = (mu10, k, mu01), Pa.
+    """Discrete gradient of Mooney-Rivlin or neo-Hookean; c = (mu10, k, mu01), Pa.
 
     S = C^-1 (2 mu10 J^-2/3 dev(2 E) + 2 mu01 J^-4/3 dev((2 + 4 t) E - 4 E^2) + k (J - 1) J I) with t = tr E: the
-    Kirchhoff form of `materials.mooney_rivlin` with E in the place of b.
+    Kirchhoff form of `materials.mooney_rivlin` with E instead of b.
     """
     p, t = precision(dtype), materials.tensors(dtype)
     T, mat33 = p.T, p.mat33
@@ -82,7 +82,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
 
     @wp.func
     def weighted(E: mat33, c: coef) -> mat33:
-        """C S of a strain, in the form that the docstring gives."""
+        """C S of a strain, in the form of the docstring above."""
         j1 = excess(E)
         J = T(1.0) + j1
         Jm = wp.pow(J, -two_thirds)
@@ -105,11 +105,11 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
 
     @wp.func
     def energy_change(E0: mat33, X: mat33, c: coef) -> T:
-        """W(E0 + X/2) - W(E0) with X the change of C, J/m^3; rounding of the size of eps W'' |E| |X|.
+        """W(E0 + X/2) - W(E0) with X the change of C, J/m^3; round-off of order eps W'' |E| |X|.
 
         With A = C0^-1 X and its invariants i1, i2, i3, J1^2/J0^2 = 1 + y, y = i1 + i2 + i3, and
-        d = (J1/J0)^(-2/3) - 1 = -i1/3 + rho. What is of first order in X is S(E0) : X/2; the rest follows without
-        subtracting nearly equal numbers.
+            d = (J1/J0)^(-2/3) - 1 = -i1/3 + rho.
+        The first-order part in X is S(E0) : X/2; the rest follows without cancellation.
         """
         Ci = inverse_stretch(E0)
         A = Ci * X
@@ -131,7 +131,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
         if wp.static(second_invariant):
             I2 = T(3.0) + T(4.0) * wp.trace(E0) + T(2.0) * (wp.trace(E0) * wp.trace(E0) - wp.ddot(E0, E0))
             second = T(0.5) * (tr * tr - wp.ddot(X, X))
-            # I1 I - C of the start
+            # I1 I - C at the start
             cofactor = (T(2.0) + T(2.0) * wp.trace(E0)) * t.identity() - T(2.0) * E0
             change_I2 = wp.ddot(cofactor, X) + second
             d2 = d * (T(2.0) + d)

@@ -39,15 +39,15 @@ def element_kernels(
         affine: straight elements with parent gradients and one J0 each; False: a table of h_i per element and point.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         framed: the law has axes of its own at each point, `block.frame`.
-        midpoint: of the conserving scheme, see `point_functions` and conserving.py; u is half-way through the step and
-            v half of what u changes by. Energies and J are those at its end.
-        dissipative: of its dissipative form.
+        midpoint: conserving scheme, see `point_functions` and kernels/elements/conserving.py; u is that at the
+            midpoint of the step and v half of the change of u. Energies and J are those at its end.
+        dissipative: its dissipative form.
     """
     fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint, dissipative)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     NS, needs_J = fn.slots, fn.needs_J
-    constant = affine and slots == 4  # F of a straight T4 is the same everywhere
+    constant = affine and slots == 4  # F of a straight T4 is constant
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
     viscous = materials.svk(dtype)
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
@@ -72,7 +72,7 @@ def element_kernels(
         """Internal force contributions (N), Eqs. (32) and (70), strain energy and viscous potential (J) by element.
 
         `lanes` threads share the quadrature points of an element. The smallest J goes to `min_J`, and for laws that
-        need J > 0 that of the points to `domain_J`: at the vertices, which count in `min_J`, they have no barrier.
+        need J > 0 that of the points to `domain_J`: the vertices, included in `min_J`, have no energy barrier.
         """
         world, index = wp.tid()
         if active[world] == 0:
@@ -179,7 +179,7 @@ def element_kernels(
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); of damping of the rate form only the symmetric part.
+        """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); only the symmetric part for damping of the rate form.
 
         `active` 2: see `point_increment`.
         """

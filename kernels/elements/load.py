@@ -11,13 +11,13 @@ __all__ = ["load_functions", "local_type"]
 
 @functools.cache
 def local_type(dtype: str, slots: int):
-    """The values of an element's slots: a matrix of so many rows."""
+    """Slot values of an element: a matrix with one row per slot."""
     return wp.types.matrix(shape=(slots, 3), dtype=precision(dtype).T)
 
 
 @functools.cache
 def load_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, wp.Function]:
-    """The functions load(block, field, world, elem) and store(block, values, world, elem, contribution).
+    """Functions load(block, field, world, elem) and store(block, values, world, elem, contribution).
 
     Args:
         Block: struct of the elements, with conn, is_position, contribution_offset and count.

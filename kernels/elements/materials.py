@@ -28,7 +28,7 @@ NCOEF = 11
 """Coefficients per material: up to nine of the law, then eta and lambda_v of Kelvin-Voigt damping."""
 ETA = NCOEF - 2
 LAMBDA_V = NCOEF - 1
-"""Places of eta and lambda_v (Pa s) among the coefficients."""
+"""Indices of eta and lambda_v (Pa s) among the coefficients."""
 
 
 @functools.cache
@@ -110,7 +110,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
-        """The tangent: dP = dF S + F dS. With dF = d h_j^T, dP h_i is the integrand of Eq. (35) times d."""
+        """Tangent dP = dF S + F dS. With dF = d h_j^T, dP h_i is the integrand of Eq. (35) times d."""
         F = t.identity() + G
         S = t.isotropic(t.green(G), c[0], c[1])
         dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[0], c[1])
@@ -141,7 +141,7 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
     p, t = precision(dtype), tensors(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
     coef = wp.types.vector(length=NCOEF, dtype=T)
-    # as constants of this precision: Warp would evaluate an expression of literals in float32
+    # constants of this precision: Warp would evaluate an expression of literals in float32
     third = T(1.0 / 3.0)
     two_thirds = T(2.0 / 3.0)
     four_thirds = T(4.0 / 3.0)
@@ -171,7 +171,7 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
 
     @wp.func
     def kirchhoff(G: mat33, c: coef) -> mat33:
-        """Kirchhoff stress tau = P F^T, in the form that the law's docstring gives."""
+        """Kirchhoff stress tau = P F^T, in the form of the law's docstring."""
         b = half_left_strain(G)
         j1 = t.volume_change(G)
         J = T(1.0) + j1
@@ -185,8 +185,8 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
     @wp.func
     def energy(G: mat33, c: coef) -> T:
         """Psi, Eq. (36)."""
-        # A = J^(-2/3) C - I has det(I + A) = 1, which gives its trace x = I1bar - 3 from terms of second order, without
-        # subtracting nearly equal numbers; then I2bar - 3 = x - det A
+        # det(I + A) = 1 for A = J^(-2/3) C - I: its trace x = I1bar - 3 follows from second-order terms, without
+        # cancellation; then I2bar - 3 = x - det A
         j1 = t.volume_change(G)
         d = power_change(j1)
         A = T(2.0) * (T(1.0) + d) * t.green(G) + d * t.identity()
@@ -265,7 +265,7 @@ def neo_hookean(dtype: str) -> _types.SimpleNamespace:
 
 @functools.cache
 def orthotropic(dtype: str) -> _types.SimpleNamespace:
-    """Psi = E : D : E / 2 with D orthotropic in the axes of G: a part of the SVK law with an integral of its own.
+    """Psi = E : D : E / 2 with D orthotropic in the axes of G: the remainder of an SVK law, integrated separately.
 
     c = (D11, D22, D33, D23, D13, D12, G23, G13, G12): S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
     """
@@ -310,8 +310,8 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def block(G: mat33, a: vec3, c: coef) -> mat33:
-        """F M F^T with M d = (D : sym(d a^T)) a, without the parts of D that may be indefinite."""
-        # the couplings D_ij alone may be indefinite, and so may the geometric stiffness: both are left out
+        """F M F^T with M d = (D : sym(d a^T)) a, without the possibly indefinite parts of D."""
+        # the couplings D_ij alone may be indefinite, and so may the geometric stiffness: both are omitted
         F = t.identity() + G
         x = a[0] * a[0]
         y = a[1] * a[1]
@@ -338,9 +338,9 @@ LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, 
 
 
 ANY_J = ("svk", "orthotropic", "assumed_strain")
-"""Laws that are defined for any F; the others are only where J > 0."""
+"""Laws defined for any F; the others need J > 0."""
 
 
 def law(name: str, dtype: str) -> _types.SimpleNamespace:
-    """The device functions of the law `name` in one precision."""
+    """Device functions of the law `name` in one precision."""
     return LAWS[name](dtype)

@@ -17,13 +17,13 @@ from .points import point_functions
 __all__ = ["UNROLL", "matrix_kernels", "panels_of", "row_of", "rows_type", "stage_name"]
 
 WIDEST = 8
-"""Most slots of a panel: eight 64-bit numbers fill the widest vector registers."""
+"""Maximum number of slots of a panel: eight 64-bit numbers fill the widest vector registers."""
 UNROLL = 9
 """`max_unroll` of modules that process panels: with the loops over components unrolled, those over slots vectorise."""
 
 
 def panels_of(slots: int) -> tuple[int, int, int]:
-    """Number of panels, slots per panel, and rows in all: a panel has a row for each slot up to its last one."""
+    """Number of panels, slots per panel, and total rows: a panel has a row for each slot up to its last one."""
     panels = -(-slots // WIDEST)
     width = -(-slots // panels)
     return panels, width, width * panels * (panels - 1) // 2 + slots
@@ -31,17 +31,17 @@ def panels_of(slots: int) -> tuple[int, int, int]:
 
 @wp.func
 def row_of(panel: int, width: int, a: int) -> int:
-    """Row of an element's matrix that holds K_ab of slot a for the slots b of a panel, `width` slots wide."""
+    """Row of an element's matrix with K_ab of slot a for the slots b of a panel, `width` slots wide."""
     return width * ((panel * (panel + 1)) / 2) + a
 
 
 def rows_type(dtype: str, slots: int):
-    """Type of such a row: component (i, j) of K_ab at [3 i + j, b], for the `slots` slots b of a panel."""
+    """Type of a row: component (i, j) of K_ab at [3 i + j, b], for the `slots` slots b of a panel."""
     return wp.types.matrix(shape=(9, slots), dtype=precision(dtype).T)
 
 
 def stage_name(midpoint: bool, dissipative: bool) -> str:
-    """End of the names of modules of a mid-point scheme."""
+    """Module name suffix of a midpoint scheme."""
     return "_dissipative" if dissipative else "_midpoint" if midpoint else ""
 
 
@@ -90,10 +90,11 @@ def matrix_kernels(
     ):
         """F with columns along the law's axes, and the second Piola-Kirchhoff stress S there, Pa.
 
-        `form` 0: S with its viscous part; 1: without it, and with compression removed. Of laws that need J > 0, S is
-        the viscous part alone; their elastic tangent comes whole from `increment` or `stand_in`. `mixed`: S is that of
-        the linear prediction (mixed integration points, Magisano, Leonetti and Garcea 2017), `step` the last change of
-        the slots, m; see `foreseen`. `mixed` 2: without compression, as with `form` 1, but with the viscous part.
+        `form` 0: S with its viscous part; 1: without it, and with compression removed. For laws that need J > 0, S is
+        the viscous part alone; their elastic tangent comes entirely from `increment` or `stand_in`. `mixed` 1: S is
+        that of the linear prediction (mixed integration points, Magisano, Leonetti and Garcea 2017), `step` the last
+        change of the slots, m; see `foreseen`. `mixed` 2: without compression, as with `form` 1, but with the viscous
+        part.
         """
         G = fn.gradient_of(block, U, point, elem)
         local = fn.into_axes(block, G, point, elem)
@@ -127,7 +128,7 @@ def matrix_kernels(
 
     @wp.func
     def elastic(block: Block, F: mat33, dF: mat33, c: coef) -> mat33:
-        """dP of a law that needs J > 0; `midpoint`: without the part of S, which `point_state` gives."""
+        """dP of a law that needs J > 0; `midpoint`: without the part of S, given by `point_state`."""
         if wp.static(midpoint):
             return F * fn.step_increment(block, F - t.identity(), t.sym(wp.transpose(F) * dF), c)
         else:
@@ -135,7 +136,7 @@ def matrix_kernels(
 
     @wp.func
     def velocities(block: Block, v: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
-        """Velocities of an element's slots where its damping needs them (form "rate") or `midpoint`, else zeros."""
+        """Velocities of an element's slots if needed by damping (form "rate") or `midpoint`, else zeros."""
         if wp.static(fn.uses_v):
             return fn.load(block, v, world, elem)
         else:
@@ -151,7 +152,7 @@ def matrix_kernels(
         world: int,
         elem: int,
     ) -> Local:
-        """Change of an element's slots by the last iteration, m; zeros where it is not wanted."""
+        """Change of an element's slots in the last iteration, m; zeros unless requested."""
         step = Local()
         if mixed == 1:
             step = T(dq_dv) * (fn.load(block, v, world, elem) - fn.load(block, base, world, elem))
@@ -170,10 +171,10 @@ def matrix_kernels(
         active: wp.array(dtype=wp.int32),
         lines: wp.array3d(dtype=vec3),
     ):
-        """F and S of `point_state`, which all columns of an element's matrix need: [world, 5 point + row, elem].
+        """F and S of `point_state`, common to all columns of an element's matrix: [world, 5 point + row, elem].
 
         Rows 0 to 2 are those of F, row 3 is the diagonal of S, row 4 its components (23, 13, 12). `form`: see
-        `element_matrix`; `base`: v at the iterate before, for worlds that are `mixed`.
+        `element_matrix`; `base`: v at the previous iterate, for worlds with `mixed`.
         """
         world, point, elem = wp.tid()
         if active[world] == 0:

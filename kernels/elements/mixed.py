@@ -1,4 +1,4 @@
-"""K p with the stress of the linear prediction in its geometric part, where no matrix is made; see `foreseen`."""
+"""K p with the stress of the linear prediction in its geometric part, without a matrix; see `foreseen`."""
 
 import functools
 import types as _types
@@ -13,7 +13,7 @@ __all__ = ["mixed_product"]
 
 @functools.cache
 def mixed_product(dtype: str, law: str, slots: int, points: int, affine: bool, framed: bool) -> wp.Kernel:
-    """The kernel for one kind of element block, without viscosity; arguments as those of `element_kernels`."""
+    """Kernel for one kind of element block, without viscosity; arguments as those of `element_kernels`."""
     fn: _types.SimpleNamespace = point_functions(dtype, law, slots, affine, None, framed)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     Block, t = fn.Block, fn.tensors
@@ -33,7 +33,8 @@ def mixed_product(dtype: str, law: str, slots: int, points: int, affine: bool, f
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """K p (N); `base`: v at the iterate before, for worlds that are `mixed`; 2: positive semi-definite instead."""
+        """K p (N); `base`: v at the previous iterate, for worlds with `mixed` 1; `mixed` 2: positive semi-definite
+        form."""
         world, elem = wp.tid()
         if active[world] == 0:
             return

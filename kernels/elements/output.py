@@ -1,4 +1,4 @@
-"""Kernels of table elements that only some scenes or outputs launch, each a module: history, viscous force, stress."""
+"""Kernels of table elements for particular scenes or outputs, one module each: history, viscous force, stress."""
 
 import types as _types
 
@@ -37,7 +37,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         active: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
     ):
-        """a0 E(u0) - a1 E(u1) per point in the law's axes: the strain that incremental strain rates start from."""
+        """a0 E(u0) - a1 E(u1) per point in the law's axes: reference of incremental strain rates."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
@@ -60,7 +60,8 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         active: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
     ):
-        """E + b dE/dt + q_a d2E/dt2 per point in the law's axes: the same, by schemes that take velocity and a."""
+        """E + b dE/dt + q_a d2E/dt2 per point in the law's axes: reference of strain rates for schemes with velocity
+        and a."""
         world, elem = wp.tid()
         if active[world] == 0:
             return

@@ -1,7 +1,7 @@
 """Device functions of a table element at its quadrature points: gradients, axes, strain rates, increments of stress.
 
-The device code knows of an element family only its number of slots and its tables. Straight ("affine") elements share
-one table of parent gradients and keep J0^-1 each; others keep h_i per element and point. Displacements are taken
+An element family enters the device code only by its number of slots and its tables. Straight ("affine") elements share
+one table of parent gradients and have one J0^-1 each; others have h_i per element and point. Displacements are taken
 relative to the first slot of the element, which is a position: a rigid translation then has exactly zero strain.
 """
 
@@ -20,7 +20,7 @@ __all__ = ["block_struct", "point_functions"]
 
 @functools.cache
 def block_struct(dtype: str, dissipative: bool = False):
-    """The constant data of one element block, in one precision; `dissipative`: see `point_functions`."""
+    """Constant data of one element block, in one precision; `dissipative`: see `point_functions`."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
 
@@ -29,7 +29,7 @@ def block_struct(dtype: str, dissipative: bool = False):
         conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
         is_position: wp.array(dtype=T)  # [local] 1 for a position slot, 0 for a gradient slot
         gradient: wp.array3d(dtype=vec3)  # [point, local, elem] h_i; affine: [point, local, 0] parent gradient
-        vertex_gradient: wp.array3d(dtype=vec3)  # the same at the vertices, where J is tested for laws that need J > 0
+        vertex_gradient: wp.array3d(dtype=vec3)  # h_i at the vertices, where J is tested for laws that need J > 0
         shape: wp.array3d(dtype=T)  # [point, local, elem or 0] s_i at the points of the mass rule (field loads)
         field_weight: wp.array2d(dtype=T)  # [point, elem] rho w at those points
         J0_inv: wp.array2d(dtype=T)  # [3 row + column, elem], affine only
@@ -47,7 +47,7 @@ def block_struct(dtype: str, dissipative: bool = False):
         history_offset: wp.int32
         count: wp.int32  # elements
         if dissipative:
-            dissipation: T  # chi of conserving.py
+            dissipation: T  # chi of kernels/elements/conserving.py
 
     return ElementBlock
 
@@ -65,10 +65,10 @@ def point_functions(
 ) -> _types.SimpleNamespace:
     """Device functions for one kind of element block; the arguments are those of `element_kernels`.
 
-    With `midpoint` the slots' values are those half-way between both ends of a step, and in the place of velocities
-    stands half of what they change by. Products K p are those of the derivative by the values at the end, of stresses
-    linear in E to the last digit: forces are taken along the strains' gradients half-way, strains change along those at
-    the end. Matrices take the former for both, and are symmetric.
+    With `midpoint` the slots' values are those at the midpoint of a step, and velocities are replaced by half of the
+    slots' change. Products K p are those of the derivative by the values at the end, for stresses linear in E to the
+    last digit: forces act along the strains' gradients at the midpoint, strains change along those at the end. Matrices
+    use the former for both, and are symmetric.
     """
     p = precision(dtype)
     T, mat33, sym6 = p.T, p.mat33, p.sym
@@ -96,7 +96,7 @@ def point_functions(
 
     @wp.func
     def damping_coefficients(c: coef, scale: T) -> coef:
-        """scale (lambda_v, eta) as the coefficients (lambda, mu) of `materials.svk`, which Eq. (62) has the form of."""
+        """scale (lambda_v, eta) as the coefficients (lambda, mu) of `materials.svk`, whose form Eq. (62) has."""
         d = coef()
         d[0] = c[LAMBDA_V] * scale
         d[1] = c[ETA] * scale
@@ -126,7 +126,7 @@ def point_functions(
 
     @wp.func
     def weight_of(block: Block, point: int, elem: int) -> T:
-        """w = W_q det J0 of a quadrature point, Eq. (11): the volume that it stands for, m^3."""
+        """w = W_q det J0 of a quadrature point, Eq. (11): its volume, m^3."""
         if wp.static(affine):
             return block.weight[point, 0] * block.det_J0[elem]
         else:
@@ -134,7 +134,7 @@ def point_functions(
 
     @wp.func
     def tangent_weight(block: Block, point: int, elem: int) -> T:
-        """w of a point in K: `midpoint`: half of what a force is taken at moves with the end of a step."""
+        """w of a point in K; `midpoint`: half of it, as midpoint values move by half of the end's change."""
         if wp.static(midpoint):
             return T(0.5) * weight_of(block, point, elem)
         else:
@@ -142,7 +142,7 @@ def point_functions(
 
     @wp.func
     def scatter(block: Block, f: Local, P: mat33, point: int, elem: int) -> Local:
-        """f_i += w P h_i: what a point adds to the forces of Eq. (32)."""
+        """f_i += w P h_i: contribution of a point to the forces of Eq. (32)."""
         Q = weight_of(block, point, elem) * P
         if wp.static(affine):
             Q = Q * wp.transpose(inverse_jacobian(block, elem))
@@ -161,12 +161,12 @@ def point_functions(
 
     @wp.func
     def unpack(a: sym6) -> mat33:
-        """The tensor whose components in Voigt order are a."""
+        """Tensor with the components a in Voigt order."""
         return mat33(a[0], a[5], a[4], a[5], a[1], a[3], a[4], a[3], a[2])
 
     @wp.func
     def into_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
-        """R^T A R: from the axes of the body into those of the law, if it has its own."""
+        """R^T A R: from the body's axes into those of the law, if framed."""
         if wp.static(framed):
             R = block.frame[point, elem]
             return wp.transpose(R) * A * R
@@ -175,7 +175,7 @@ def point_functions(
 
     @wp.func
     def out_of_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
-        """R A R^T: from the axes of the law back into those of the body."""
+        """R A R^T: from the law's axes into those of the body, if framed."""
         if wp.static(framed):
             R = block.frame[point, elem]
             return R * A * wp.transpose(R)
@@ -184,7 +184,7 @@ def point_functions(
 
     @wp.func
     def history_index(block: Block, point: int, elem: int) -> int:
-        """Place of a quadrature point in the `history` array of all blocks."""
+        """Index of a quadrature point in the `history` array of all blocks."""
         return block.history_offset + point * block.count + elem
 
     @wp.func
@@ -230,7 +230,7 @@ def point_functions(
 
     @wp.func
     def step_stress(block: Block, G: mat33, D: mat33, c: coef) -> mat33:
-        """S of a mid-point step, Pa: that of conserving.py with its dissipation."""
+        """S of a midpoint step, Pa: that of kernels/elements/conserving.py with its dissipation."""
         S = mean.mean_stress(G, D, c)
         if wp.static(dissipative):
             S += block.dissipation * mean.rest_increment(t.sym(D + wp.transpose(G) * D), c)
@@ -238,7 +238,7 @@ def point_functions(
 
     @wp.func
     def step_increment(block: Block, G: mat33, dE: mat33, c: coef) -> mat33:
-        """Change of S of a mid-point step, Pa, with twice a change dE of the strain at its end."""
+        """Twice the change of S of a midpoint step, Pa, by a change dE of the strain at its end."""
         dS = mean.mean_increment(G, dE, c)
         if wp.static(dissipative):
             dS += block.dissipation * mean.rest_increment(dE, c)
@@ -246,7 +246,7 @@ def point_functions(
 
     @wp.func
     def start_stress(G: mat33, c: coef) -> mat33:
-        """S at the start of a mid-point step, Pa, with G there."""
+        """S at the start of a midpoint step, Pa; G is the displacement gradient there."""
         if wp.static(needs_J):
             return t.sym(wp.inverse(t.identity() + G) * m.stress(G, c))
         else:
@@ -254,7 +254,7 @@ def point_functions(
 
     @wp.func
     def hardening(block: Block) -> T:
-        """Factor on moduli in a matrix: of a mid-point step what they are multiplied with by its dissipation."""
+        """Factor of the dissipation of a midpoint step on moduli in a matrix."""
         if wp.static(dissipative):
             return T(1.0) + block.dissipation
         else:
@@ -262,10 +262,10 @@ def point_functions(
 
     @wp.func
     def foreseen(G: mat33, dG: mat33, c: coef, dq: T) -> mat33:
-        """S of the linear prediction from the iterate before, G - dG, over S at G, Pa; both in the law's axes.
+        """Linear prediction of S from the previous iterate, G - dG, minus S at G, Pa; both in the law's axes.
 
-        With stresses linear in E it is -C : (dG^T dG)/2, what a linear step does not see; of other laws
-        S + dS - S(G) with dS = F^-1 (dP - dF S) at G - dG.
+        For stresses linear in E it is -C : (dG^T dG)/2, the neglected second-order strain; for other laws S + dS - S(G)
+        with dS = F^-1 (dP - dF S) at G - dG.
         """
         if wp.static(needs_J):
             past = G - dG
@@ -281,7 +281,7 @@ def point_functions(
 
     @wp.func
     def compression(S: mat33) -> T:
-        """An upper bound (Gershgorin) of the largest compressive principal value of S, Pa; 0 in tension."""
+        """Upper bound (Gershgorin) of the largest compressive principal value of S, Pa; 0 in tension."""
         low = T(0.0)
         for i in range(3):
             low = wp.max(low, wp.abs(S[i, 0]) + wp.abs(S[i, 1]) + wp.abs(S[i, 2]) - wp.abs(S[i, i]) - S[i, i])
@@ -289,7 +289,7 @@ def point_functions(
 
     @wp.func
     def stand_in(F: mat33, dF: mat33, c: coef) -> mat33:
-        """A positive dP for laws whose tangent is indefinite far from rest: A C0 : sym(A^T dF).
+        """Positive definite dP for laws with an indefinite tangent far from rest: A C0 : sym(A^T dF).
 
         C0 is the stiffness at rest, with c = (mu10, k, mu01), mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3; A is F
         scaled to A : A = 3, so that the stiffness turns and stretches with the material.
@@ -312,9 +312,9 @@ def point_functions(
         point: int,
         elem: int,
     ) -> mat33:
-        """dP of a change dG at a point in the body's axes, damping included: the integrand of the tangent product.
+        """dP by a change dG at a point in the body's axes, damping included: the integrand of the tangent product.
 
-        `form` 2, of mid-point schemes: with the stress at the start of the step in the geometric part.
+        `form` 2, for midpoint schemes: with the stress at the start of the step in the geometric part.
         """
         local = into_axes(block, G, point, elem)
         change = into_axes(block, dG, point, elem)

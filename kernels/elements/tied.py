@@ -34,10 +34,11 @@ def tied_kernels(
         dtype: precision.
         slots, ties: slots and tying points per element.
         width: A couples the ties of each run of `width`.
-        midpoint: of the conserving scheme: u is half-way through the step, v half of what u changes by; the shears in
-            forces and products are the mean of those at both ends, and the energy is that at the end.
-        dissipative: with (chi/2) of what they change by added to the mean, see conserving.py.
-        worlds: A of each world, those of one next to each other.
+        midpoint: conserving scheme: u is that at the midpoint of the step, v half of the change of u; the shears in
+        forces
+            and products are the mean of those at both ends, and the energy is that at the end.
+        dissipative: with (chi/2) of the shears' change added to the mean, see kernels/elements/conserving.py.
+        worlds: A differs between worlds, stored side by side.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
@@ -54,7 +55,7 @@ def tied_kernels(
     NS, NT, W = slots, ties, width
     PANELS, P, _ = panels_of(NS)
     Row = wp.types.vector(length=P, dtype=T)
-    GROUP = 4 if NT % 4 == 0 else 1  # ties added to a row of the matrix between loading and storing it
+    GROUP = 4 if NT % 4 == 0 else 1  # ties added to a row of the matrix between its load and its store
     Rows = rows_type(dtype, P)
     Slots = wp.types.matrix(shape=(NT * PANELS, P), dtype=T)
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
@@ -64,7 +65,7 @@ def tied_kernels(
 
     @wp.func
     def half(x: T) -> T:
-        """Of a stiffness: `midpoint`: what it is taken at moves by half of the end."""
+        """Half of a stiffness with `midpoint`: midpoint values move by half of the end's change."""
         if wp.static(midpoint):
             return T(0.5) * x
         else:
@@ -72,7 +73,7 @@ def tied_kernels(
 
     @wp.func
     def slope(block: Block, mu: T) -> T:
-        """Modulus in a matrix: `half`, and of a dissipative step (1 + chi) times that."""
+        """Modulus in a matrix: `half`, times (1 + chi) in a dissipative step."""
         if wp.static(dissipative):
             return (T(1.0) + block.dissipation) * half(mu)
         else:
@@ -97,7 +98,7 @@ def tied_kernels(
     ) -> Local:
         """Forces for a change P of the slots, with x_a, x_b and the shears e of the geometric part, N.
 
-        `midpoint`: shears change along x_a and x_b at the end of the step, which D leads to.
+        `midpoint`: shears change along x_a and x_b at the end of the step, given by D.
         """
         de = Ties()
         for t in range(NT):
@@ -257,7 +258,7 @@ def tied_kernels(
         active: wp.array(dtype=wp.int32),
         lines: wp.array3d(dtype=vec3),
     ):
-        """What all columns of an element's matrix need of a tie, [world, row, elem].
+        """Tie data common to all columns of an element's matrix, [world, row, elem].
 
         Row `tie` holds x_a, row NT + tie x_b, and row 2 NT + tie the shear e_t in its first component.
         """

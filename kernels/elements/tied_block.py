@@ -1,4 +1,4 @@
-"""The tables of elements with tied shears, see tied.py, and the shears at their tying points."""
+"""Tables of elements with tied shears, see tied.py, and the shears at their tying points."""
 
 import functools
 import types as _types
@@ -13,7 +13,7 @@ __all__ = ["coupling_function", "shear_functions", "tied_struct"]
 
 @functools.cache
 def tied_struct(dtype: str, dissipative: bool = False):
-    """The constant data of a block of tied elements, in one precision; `dissipative`: see `tied_kernels`."""
+    """Constant data of a block of tied elements, in one precision; `dissipative`: see `tied_kernels`."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
@@ -25,7 +25,7 @@ def tied_struct(dtype: str, dissipative: bool = False):
         second: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
         X_first: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
         X_second: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
-        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the run of ties that it couples; or world by world
+        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the tie's run of coupled ties; or world by world
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
         contribution_offset: wp.int32
@@ -33,19 +33,19 @@ def tied_struct(dtype: str, dissipative: bool = False):
         history_offset: wp.int32
         count: wp.int32
         if dissipative:
-            dissipation: T  # chi of conserving.py
+            dissipation: T  # chi of kernels/elements/conserving.py
 
     return TiedBlock
 
 
 @functools.cache
 def coupling_function(dtype: str, worlds: bool, dissipative: bool = False) -> wp.Function:
-    """The device function of an entry of A; `worlds`: of a world's own."""
+    """Device function of an entry of A; `worlds`: A differs between worlds."""
     T, Block = precision(dtype).T, tied_struct(dtype, dissipative)
 
     @wp.func
     def coupled(block: Block, tie: int, k: int, world: int, elem: int) -> T:
-        """Entry k of the run of ties that a tie is in."""
+        """Entry k of a tie's run."""
         if wp.static(worlds):
             return block.coupling[tie, k, world * block.count + elem]
         else:
@@ -66,7 +66,7 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
 
     @wp.func
     def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
-        """sum_i s_i,a u_i at a tie, with `table` the derivatives along one direction: what U adds to x_a, m."""
+        """sum_i s_i,a u_i at a tie, with `table` the derivatives along one direction: contribution of U to x_a, m."""
         out = vec3()
         for i in range(NS):
             out += table[tie, i, elem] * U[i]
@@ -74,7 +74,7 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
 
     @wp.func
     def kinematics(block: Block, U: Local, elem: int):
-        """x_a, x_b (m) and the shears e (m^2) at the ties; e is formed without subtracting nearly equal numbers."""
+        """x_a, x_b (m) and the shears e (m^2) at the ties; e is formed without cancellation."""
         first, second = TieVectors(), TieVectors()
         e = Ties()
         for t in range(NT):
@@ -87,7 +87,7 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
 
     @wp.func
     def foreseen(block: Block, step: Local, e: Ties, elem: int) -> Ties:
-        """The shears of the linear prediction from the iterate before, m^2; `step`: the last change of the slots, m."""
+        """Shears of the linear prediction from the previous iterate, m^2; `step`: the last change of the slots, m."""
         out = e
         for t in range(NT):
             out[t] = out[t] - wp.dot(line(block.first, step, t, elem), line(block.second, step, t, elem))
@@ -95,7 +95,7 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
 
     @wp.func
     def mean_shears(block: Block, D: Local, e: Ties, elem: int) -> Ties:
-        """The mean of the shears at both ends of a step, m^2: e half-way, and the slots' half change D."""
+        """Mean of the shears at both ends of a step, m^2, from the midpoint shears e and the slots' half change D."""
         out = e
         for t in range(NT):
             out[t] = out[t] + wp.dot(line(block.first, D, t, elem), line(block.second, D, t, elem))
@@ -103,7 +103,7 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
 
     @wp.func
     def step_shears(block: Block, x1: TieVectors, x2: TieVectors, D: Local, e: Ties, elem: int) -> Ties:
-        """The shears that the stresses of a step belong to, m^2: their mean, and chi/2 of what they change by."""
+        """Shears in the stresses of a step, m^2: the mean, plus chi/2 of their change."""
         out = mean_shears(block, D, e, elem)
         if wp.static(dissipative):
             for t in range(NT):

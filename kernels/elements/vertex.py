@@ -1,6 +1,6 @@
 """(c_M M + (dq/dv) K) p of straight T10 whose rule has a point on each line from the centroid to a vertex.
 
-A gradient is linear over such an element. With L_b the volume coordinates, e(v, b) the slot half-way from vertex v to
+A gradient is linear over such an element. With L_b the volume coordinates, e(v, b) the slot midway from vertex v to
 vertex b and e(v, v) = v, the gradient in parent coordinates is D_v at vertex v, S at the centroid, and D at the point
 that lies s of the way from the centroid to v:
 
@@ -39,16 +39,16 @@ SPOKES = tuple(
     #endif
 """)
 def forget():
-    """Keep no value in registers that was read before: with fewer registers more blocks run at once."""
+    """Discard values held in registers: fewer registers let more blocks run at once."""
 
 
 def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.SimpleNamespace) -> wp.Function:
-    """The device function `product`, which sets the forces of an element in this form.
+    """Device function `product`, which sets the forces of an element in this form.
 
     Args:
         points: 4, one for each vertex, or 5, the centroid before them.
         fn: functions of points.py.
-        shared: functions of cluster.py.
+        shared: functions of kernels/elements/cluster.py.
     """
     p, rate = fn.types, fn.uses_v
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
@@ -82,7 +82,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
 
     @wp.func
     def common(pool: Pool, field: int, at: int, s: T) -> mat33:
-        """H = (1 - s) S - s C of a field, which all four vertices have in common."""
+        """H = (1 - s) S - s C of a field, common to all four vertices."""
         S = central(pool, field, at)
         return S - s * (S + spokes(pool, field, at, wp.vec4i(0, 1, 2, 3)))
 
@@ -97,7 +97,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
     def finish(block: Block, pool: Pool, scale: T, B: mat33, R: mat33, at: int):
         """Add the forces of B and R, and scale M p.
 
-        M (over the parent) has one number for each way in which two slots can lie to each other: seven in all.
+        M (over the parent) has seven distinct entries, one for each relative position of two slots.
         """
         u = Local()
         for i in range(10):
@@ -111,7 +111,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
         of_corner = scale * block.mass[0, 0] - beside
         of_edge = scale * block.mass[4, 4] - joined
         across = scale * block.mass[4, 9] - joined
-        # first the part that all corners and all edges have in common, then the differences from it
+        # first the part common to all corners and edges, then the differences from it
         at_corner = beside * corners + far * edges
         at_edge = far * corners + joined * edges
         for i in range(4):
@@ -138,7 +138,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
     ):
         """Set the forces (scale M + dq K) p of element `at` of a cluster.
 
-        Slots are read again at each vertex and forces are kept in the pool, which takes fewer registers.
+        Slots are read again at each vertex and forces are stored in the pool, to save registers.
         """
         c = coefficients(block, world, elem)
         # the first function's gradient at the first vertex's point is 3 s dL_0

@@ -1,4 +1,4 @@
-"""The product (c_M M + (dq/dv) K) p of straight elements, mass included, by clusters of elements (cluster.py)."""
+"""Product (c_M M + (dq/dv) K) p of straight elements, mass included; see kernels/elements/cluster.py."""
 
 import functools
 
@@ -25,7 +25,7 @@ def with_mass_kernel(
     midpoint: bool = False,
     dissipative: bool = False,
 ) -> wp.Kernel:
-    """The kernel `with_mass_product` of one kind of straight elements.
+    """Kernel `with_mass_product` of one kind of straight elements.
 
     Args:
         dtype: precision.
@@ -87,6 +87,6 @@ def with_mass_kernel(
                     total += block.mass[i, j]
                 shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
 
-    # measured for this kind: the bound makes it spill few registers; for others the compiler chooses
+    # for this kind the bound spills few registers (measured); for others the compiler chooses
     bounded = vertex and law == "svk" and damping is None and not midpoint
     return shared.by_clusters(module, Block, product, bounded)

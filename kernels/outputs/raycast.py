@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 @wp.struct
 class Scene:
-    """What a picture shows: mesh, camera, light, ground plane and its shadow map."""
+    """Picture data: mesh, camera, light, ground plane and its shadow map."""
 
     mesh: wp.uint64
     corner_normals: wp.array(dtype=wp.vec3)  # [3 * face + corner]
@@ -19,7 +19,7 @@ class Scene:
     forward: wp.vec3
     right: wp.vec3  # half the picture's width at distance one
     up: wp.vec3  # half its height
-    center: wp.vec2  # where the axis `forward` meets the picture, in [-1, 1]
+    center: wp.vec2  # intersection of the axis `forward` with the picture, in [-1, 1]
     width: float  # pixels
     height: float
     light: wp.vec3  # towards the light
@@ -47,7 +47,7 @@ def backdrop(height: float):
 
 @wp.func
 def line(x: float, step: float, half_width: float, footprint: float):
-    """Part of a pixel of size `footprint` at x that is covered by lines at the multiples of `step`."""
+    """Fraction of a pixel of size `footprint` at x covered by lines at the multiples of `step`."""
     d = wp.abs(x / step - wp.round(x / step)) * step
     w = wp.max(half_width, 0.5 * footprint)
     strength = half_width / w
@@ -72,7 +72,7 @@ def ground_light(scene: Scene, x: float, y: float):
 
 @wp.func
 def shade_ground(scene: Scene, p: wp.vec3, distance: float, slope: float, behind: wp.vec3):
-    """Colour of the ground at p: a light plane with a grid and the shadow, which fades into the colour `behind` it."""
+    """Colour of the ground at p: a light plane with a grid and the shadow, fading into the colour `behind` it."""
     base = wp.vec3(0.80, 0.81, 0.83)
     pixel = distance * wp.length(scene.up) * 2.0 / scene.height
     footprint = pixel / wp.max(slope, 0.05)
@@ -136,7 +136,7 @@ def cast(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.
 
 @wp.kernel
 def cast_shadow(scene: Scene, lights: wp.array(dtype=wp.vec3), shadow: wp.array2d(dtype=float)):
-    """The shadow map: share of the directions `lights` in which a cell of the ground sees no surface."""
+    """Shadow map: fraction of the directions `lights` in which a cell of the ground meets no surface."""
     i, j = wp.tid()
     x = scene.shadow_low[0] + (float(i) + 0.5) * scene.shadow_cell
     y = scene.shadow_low[1] + (float(j) + 0.5) * scene.shadow_cell

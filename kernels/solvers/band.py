@@ -1,7 +1,7 @@
 """Cholesky factors of a banded matrix in 4 x 4 blocks, one thread per world: for the CPU.
 
-Block row I of L holds the blocks J = I - width .. I one after the other, each stored by columns, and of L_II its
-inverse. One core works through the rows in turn, and its vector units process a column of a block at once.
+Block row I of L holds the blocks J = I - width .. I contiguously, each stored by columns, and the inverse of L_II. One
+core processes the rows in turn; its vector units process a column of a block at once.
 """
 
 import functools
@@ -16,7 +16,7 @@ __all__ = ["BLOCK", "band_kernels", "column_type"]
 
 BLOCK = 4
 SHIFT_GROWTH = 100.0
-"""Factor by which the shift of the diagonal grows when a factorisation has failed again."""
+"""Growth factor of the diagonal shift after each failed factorisation."""
 
 
 def column_type(dtype: str):
@@ -32,9 +32,9 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     Pattern = pattern_struct()
     Column = column_type(dtype)
     Block = wp.types.matrix(shape=(BLOCK, BLOCK), dtype=T)
-    # a pivot below this share of its diagonal entry is rounding, or the matrix is indefinite there
+    # a pivot below this fraction of its diagonal entry is round-off, or the matrix is indefinite there
     NEGLIGIBLE = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
-    # the first shift where such a pivot comes up, as a share of the diagonal
+    # first shift after such a pivot, as a fraction of the diagonal
     FIRST_SHIFT = {"float64": 1.0e-4, "float32": 1.0e-6}[dtype]
     module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
 
@@ -60,9 +60,9 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         band: wp.array3d(dtype=Column),
     ):
-        """The lower half of A + shift |D|, D = diag A, with slots in the order of `place_of`; one thread per slot.
+        """Lower half of A + shift |D|, D = diag A, with slots in the order of `place_of`; one thread per slot.
 
-        A negative number on the diagonal, as of an unknown under strong compression, is made positive.
+        Negative diagonal entries, as under strong compression, are made positive.
         """
         world, slot = wp.tid()
         if active[world] == 0:
@@ -87,9 +87,9 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     def inverse_factor(A: Block, given: Column) -> Block:
         """Columns of L^-1, with A = L L^T.
 
-        Where a pivot is not safely positive against the `given` diagonal, that takes its place and the rest of the
-        column of L is zero, so that L L^T is positive definite whatever A is. The entry of L^-1 on the diagonal is
-        negative then, which tells the blocks below.
+        A pivot that is not safely positive against the `given` diagonal is replaced by that diagonal and the rest of
+        the column of L is zero, so that L L^T is positive definite for any A. The diagonal entry of L^-1 is then
+        negative, as a flag for the blocks below.
         """
         S = Block()
         for c in range(BLOCK):
@@ -102,7 +102,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
             if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
                 scale = T(1.0) / wp.sqrt(pivot)
                 column = scale * S[j]
-                # row j of L^-1: what the rows above leave of e_j, over the root of the pivot
+                # row j of L^-1: remainder of e_j after the rows above, over the root of the pivot
                 own = scale * rows[j]
                 own[j] = scale
                 for c in range(j + 1, BLOCK):
@@ -117,7 +117,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     def factor(
         width: int, active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)
     ):
-        """Factor A into L, in place; `bad`: number of unknowns whose pivot had to be replaced."""
+        """Factor A into L, in place; `bad`: number of unknowns whose pivot was replaced."""
         world = wp.tid()
         if active[world] == 0:
             return
@@ -159,7 +159,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin(flags: wp.array(dtype=wp.int32), doing: wp.array(dtype=wp.int32), shift: wp.array(dtype=T)):
-        """Start with the flagged worlds, and no shift."""
+        """Initialise the flagged worlds without shift."""
         world = wp.tid()
         doing[world] = flags[world]
         if flags[world] != 0:
@@ -173,7 +173,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         again: wp.array(dtype=wp.int32),
         exact: wp.array(dtype=wp.int32),
     ):
-        """Where A was not positive definite, raise the shift, up to 1, and ask for another factorisation.
+        """If A was not positive definite, raise the shift, up to 1, and request another factorisation.
 
         `exact`: the factors are those of A.
         """

@@ -2,13 +2,13 @@
 
 A = D U U^T D^T with D the lower triangular 4 x 4 blocks on the diagonal of the Cholesky factor and U of unit diagonal.
 Block row I of the factors holds U_IJ, J = I - width .. I - 1, each by columns, and the inverse of D_II. In a solution
-products with U alone go from row to row. The factorisation looks to the right: the (width + 1)^2 blocks that a column
-still changes are in memory of the block of threads, and rows enter as this window moves. Solutions load rows of the
-factors by chunks, many numbers at a time. On the CPU one thread does the same.
+only products with U depend on previous rows. The factorisation is right-looking: the (width + 1)^2 blocks that a column
+still changes are in the shared memory of the block of threads, and rows enter as this window moves. Solutions load rows
+of the factors in chunks, many numbers at a time. On the CPU one thread does the same.
 
-Measured on an H200, world-steps per second of 4096 worlds and of one, and bytes per world, beside the dense inverses of
+Measured on an H200, world-steps per second of 4096 worlds and of one, and bytes per world, versus the dense inverses of
 "two-level": a pendulum of 201 unknowns 414 000 for 281 000, 841 for 1111, 0.35 MB for 0.97; a slider-crank of 225
-unknowns 45 600 for 18 500, 119 for 166, 0.44 MB for 0.98. One world waits for its rows one after the other.
+unknowns 45 600 for 18 500, 119 for 166, 0.44 MB for 0.98. A single world is limited by the sequence of its rows.
 """
 
 import functools
@@ -25,36 +25,36 @@ __all__ = ["band_block_kernels", "solution_numbers", "window_numbers"]
 
 SIZE = BLOCK * BLOCK
 PITCH = SIZE + 1
-"""Numbers from a block of the window to the next: odd, too."""
+"""Stride of the window's blocks: odd, to avoid bank conflicts."""
 NARROW = 7
-"""Bands of up to so many blocks beside the diagonal are the work of one warp, wider ones of four."""
+"""Largest number of off-diagonal blocks factored by one warp; wider bands use four."""
 CHUNK_NUMBERS = 3072
-"""Numbers of the rows that a solution takes over at once, about."""
+"""Approximate size of a chunk of rows in a solution."""
 
 
 def window_numbers(width: int) -> int:
-    """Numbers of the window, and of the diagonals that its rows began with."""
+    """Size of the window and of the original diagonals of its rows."""
     return (width + 1) * (_row_numbers(width) + BLOCK)
 
 
 def _row_numbers(width: int) -> int:
-    """Numbers of a row of the window: odd, so that threads of a warp find the blocks of a column in different banks."""
+    """Stride of the window's rows: odd, so that threads of a warp read the blocks of a column from different banks."""
     return (width + 1) * PITCH | 1
 
 
 def _chunk(width: int) -> int:
-    """Rows of a chunk."""
+    """Number of rows of a chunk."""
     return max(1, CHUNK_NUMBERS // (SIZE * width)) if width else 1
 
 
 def solution_numbers(rows: int, width: int) -> int:
-    """Numbers of a solution and of a chunk of rows."""
+    """Size of a solution and of a chunk of rows."""
     return BLOCK * rows + _chunk(width) * SIZE * max(width, 1)
 
 
 @functools.cache
 def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamespace:
-    """Kernels in one precision, for so many block rows and blocks beside the diagonal."""
+    """Kernels in one precision for a given number of block rows and off-diagonal blocks."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f = lane_functions(dtype)
@@ -66,14 +66,14 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
     M, CHUNK = width + 1, _chunk(width)
     ROW = _row_numbers(width)
     GIVEN = M * ROW
-    BESIDE = BLOCK * width  # columns of a block row beside the diagonal
+    BESIDE = BLOCK * width  # off-diagonal columns of a block row
     Y = BLOCK * rows
     module = kernel_module(f"band_block_{dtype}_{rows}_{width}", max_unroll=BLOCK)
     window, vector = block_memory(dtype, window_numbers(width)), block_memory(dtype, solution_numbers(rows, width))
 
     @wp.func
     def place(row: int, other: int) -> int:
-        """Of a block in the window."""
+        """Index of a block in the window."""
         return (row % M) * ROW + (other % M) * PITCH
 
     @wp.func
@@ -81,7 +81,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         at: wp.uint64, pattern: Pattern, value: wp.array2d(dtype=mat33), slot_at: wp.array(dtype=wp.int32),
         place_of: wp.array(dtype=wp.int32), shift: T, world: int, row: int, lane: int, lanes: int,
     ):  # fmt: skip
-        """Take a block row of A + shift |diag A| into the window; ones on the diagonal beyond the unknowns."""
+        """Load a block row of A + shift |diag A| into the window; ones on the diagonal beyond the unknowns."""
         for k in range(lane, ROW, lanes):
             window.store(at, (row % M) * ROW + k, T(0.0))
         sync()
@@ -132,7 +132,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
 
     @wp.func
     def eliminate(at: wp.uint64, row: int, below: int, lane: int, lanes: int):
-        """What column `row` changes to its right."""
+        """Right-looking update by column `row`."""
         for task in range(lane, BLOCK * (below * (below + 1) / 2), lanes):
             pair = task / BLOCK
             i = wp.int32((wp.sqrt(wp.float32(8 * pair + 1)) - wp.float32(1.0)) * wp.float32(0.5))
@@ -151,7 +151,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         slot_at: wp.array(dtype=wp.int32), place_of: wp.array(dtype=wp.int32), shift: wp.array(dtype=T),
         active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column),
     ):  # fmt: skip
-        """The factors of A; `bad`: number of unknowns whose pivot had to be replaced."""
+        """Factors of A; `bad`: number of unknowns whose pivot was replaced."""
         thread = wp.tid()
         world = thread / lanes
         lane = thread % lanes
@@ -187,7 +187,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
                         count += 1
             sync()
             eliminate(at, row, below, lane, lanes)
-            if row + M < rows:  # in the place of `row`, which is no longer needed
+            if row + M < rows:  # replaces `row`, which is no longer needed
                 enter(at, pattern, value, slot_at, place_of, shift[world], world, row + M, lane, lanes)
             sync()
         if lane == 0:
@@ -195,7 +195,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
 
     @wp.func
     def take_rows(at: wp.uint64, band: wp.array3d(dtype=Column), world: int, first: int, lane: int, lanes: int):
-        """Copy a chunk of block rows beside the diagonal, row by row."""
+        """Copy the off-diagonal blocks of a chunk of block rows, row by row."""
         for task in range(lane, wp.min(CHUNK, rows - first) * BESIDE, lanes):
             column = band[world, first + task / BESIDE, task % BESIDE]
             for r in range(BLOCK):
@@ -255,7 +255,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
                 sync()
         for back in range(chunks):
             chunk = chunks - 1 - back
-            if back > 0:  # the last one is still there
+            if back > 0:  # the last chunk is still loaded
                 sync()
                 take_rows(at, band, world, CHUNK * chunk, lane, lanes)
             sync()

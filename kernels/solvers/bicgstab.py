@@ -1,9 +1,9 @@
-"""BiCGStab (van der Vorst 1992) on H p = -g with an unsymmetric H, preconditioned from the right, per world.
+"""BiCGStab (van der Vorst 1992) on H p = -g with an unsymmetric H, right-preconditioned, per world.
 
-With r^ = B r_0 its first half is a step of conjugate gradients where H is symmetric; the second takes the least D^-1
-norm of the residual, which Newton's method judges by. Vector kernels run over [world, slot]; scalar logic runs with one
-thread per world. The conjugate gradients' control serves: sums[0] is r.B r of the vector last preconditioned, sums[1]
-r.D^-1 r; `active` is 2 where products take the stress at the start of the step.
+With r^ = B r_0 its first half is a step of conjugate gradients if H is symmetric; the second minimises the D^-1 norm of
+the residual, the norm of Newton's convergence test. Vector kernels run over [world, slot]; scalar logic runs with one
+thread per world. The control of the conjugate gradients is shared: sums[0] is r.B r of the vector last preconditioned,
+sums[1] r.D^-1 r; `active` is 2 where products use the stress at the start of the step.
 """
 
 import functools
@@ -20,20 +20,20 @@ __all__ = ["BICGSTAB_ROWS", "bicgstab_kernels", "bicgstab_struct"]
 BICGSTAB_ROWS = 4
 """Rows of `second_rows`."""
 FAR, CLOSE = 0.1, 1.0e-8
-"""Relative residual above which the stress of an iterate is no guide: a rotation that is off by delta strains a stiff
-body by delta^2, and E delta^2 in the geometric part would lead astray. Products have the stress at the start of the
-step there, and solves go to CLOSE, as the residual of a rotation is small beside that of strains."""
+"""Relative residual above which the stress of an iterate is unreliable: a rotation error delta strains a stiff body by
+delta^2, and E delta^2 spoils the geometric stiffness. Products then use the stress at the start of the step, and solves
+go to CLOSE, as the residual of a rotation is small beside that of strains."""
 STALLED = 50
-"""Iterations without half of the best residual after which a solve ends, with the best: from then on it may grow."""
+"""Iterations without halving the best residual after which a solve ends with the best: later residuals may grow."""
 FOUND = 0.1
-"""Relative residual to which a solve that tells an error has to come, or it tells none."""
+"""Largest final relative residual of a solve that yields an error estimate."""
 STRICT = 1.0e-6
-"""Relative residual of solves that tell an error."""
+"""Relative residual of solves for error estimates."""
 
 
 @functools.cache
 def bicgstab_struct():
-    """The recursion's scalars of each world."""
+    """Scalars of the recursion, per world."""
 
     @wp.struct
     class BiCGStab:
@@ -41,12 +41,12 @@ def bicgstab_struct():
         alpha: wp.array(dtype=wp.float64)
         beta: wp.array(dtype=wp.float64)
         omega: wp.array(dtype=wp.float64)
-        best: wp.array(dtype=wp.float64)  # least D^-1 norm of the residual so far
-        mark: wp.array(dtype=wp.float64)  # when it last halved, and the iterations since
+        best: wp.array(dtype=wp.float64)  # smallest D^-1 norm of the residual so far
+        mark: wp.array(dtype=wp.float64)  # norm at its last halving, and the iterations since
         since: wp.array(dtype=wp.int32)
-        again: wp.array(dtype=wp.int32)  # the solve stalled, and begins once more from its best
+        again: wp.array(dtype=wp.int32)  # 1: the solve stalled and restarts once from its best iterate
         any_again: wp.array(dtype=wp.int32)  # [1]
-        going: wp.array(dtype=wp.int32)  # the solve goes on after this iteration
+        going: wp.array(dtype=wp.int32)  # 1: the solve continues after this iteration
         sums: wp.array2d(dtype=wp.float64)  # [BICGSTAB_ROWS, world]; after the first product r^.v alone
 
     return BiCGStab
@@ -65,12 +65,12 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.func
     def has_work(ctl: Control, world: int) -> bool:
-        """Iterations are left, of the solve and of the step."""
+        """True if iterations are left, of the solve and of the step."""
         return ctl.iterations[world] < ctl.max_iterations and ctl.total[world] < ctl.max_work
 
     @wp.kernel(module=module)
     def begin(newton: Newton, ctl: Control, bi: Recursion):
-        """Set the norm at which the solve ends: by Eisenstat and Walker, but no tighter than Newton's method needs."""
+        """Set the target norm of the solve: Eisenstat and Walker, but no tighter than Newton's method needs."""
         world = wp.tid()
         ctl.active[world] = 0
         if newton.active[world] == 0:
@@ -93,7 +93,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             ctl.active[world] = wp.where(newton.relative[world] > f64(FAR), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
         elif newton.strict[world] != 0:
-            ctl.negative[world] = 1  # no error was found
+            ctl.negative[world] = 1  # no error estimate
 
     @wp.kernel(module=module)
     def first_direction(
@@ -106,7 +106,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         best_x: wp.array2d(dtype=vec3),
         best_r: wp.array2d(dtype=vec3),
     ):
-        """r^ = B r, p = r; the best so far is the start."""
+        """r^ = B r, p = r; the start is the initial best."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             shadow[world, slot] = z[world, slot]
@@ -116,7 +116,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def first_length(ctl: Control, bi: Recursion):
-        """alpha = rho / r^.v, v = H y; where that is none the solve ends."""
+        """alpha = rho / r^.v, v = H y; the solve ends on breakdown."""
         world = wp.tid()
         if world == 0:
             ctl.any_active[0] = 0
@@ -149,7 +149,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def look(ctl: Control, bi: Recursion):
-        """End the solve where half of the iteration was enough."""
+        """End the solve if the half step has reached the target."""
         world = wp.tid()
         if ctl.active[world] != 0:
             norm = wp.sqrt(ctl.sums[1, world])
@@ -179,7 +179,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def second_length(ctl: Control, bi: Recursion):
-        """omega of the least |r - omega t|, beta of the next direction, and whether to go on."""
+        """omega = argmin |r - omega t|, beta of the next direction, and the decision to continue."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -221,7 +221,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         best_x: wp.array2d(dtype=vec3),
         best_r: wp.array2d(dtype=vec3),
     ):
-        """x += omega z, r -= omega t, p = r + beta (p - omega v) where the solve goes on."""
+        """x += omega z, r -= omega t, p = r + beta (p - omega v) while the solve continues."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -238,14 +238,14 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def close(ctl: Control, bi: Recursion):
-        """Worlds that are done are no longer active."""
+        """Deactivate finished worlds."""
         world = wp.tid()
         if bi.going[world] == 0:
             ctl.active[world] = 0
 
     @wp.kernel(module=module)
     def finish(newton: Newton, ctl: Control, bi: Recursion, first: int):
-        """Mark the worlds that begin once more; `first`: they may."""
+        """Mark the worlds that restart; `first`: a restart is allowed."""
         world = wp.tid()
         bi.again[world] = 0
         if newton.active[world] == 0 or ctl.iterations[world] == 0:
@@ -260,7 +260,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin_again(newton: Newton, ctl: Control, bi: Recursion):
-        """r^ = B r with r of the best."""
+        """Restart: r^ = B r with r of the best iterate."""
         world = wp.tid()
         if bi.again[world] != 0 and ctl.sums[0, world] != f64(0.0) and wp.isfinite(ctl.sums[0, world]):
             bi.rho[world] = ctl.sums[0, world]
@@ -279,10 +279,10 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         x: wp.array2d(dtype=vec3),
         r: wp.array2d(dtype=vec3),
     ):
-        """x and r of the least residual."""
+        """x and r of the smallest residual."""
         world, slot = wp.tid()
         if newton.active[world] == 0 or ctl.iterations[world] == 0:
-            return  # there is no best
+            return  # no best iterate yet
         if not ctl.norm[world] <= bi.best[world]:
             x[world, slot] = best_x[world, slot]
             r[world, slot] = best_r[world, slot]

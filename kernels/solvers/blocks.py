@@ -1,6 +1,6 @@
 """Matrices of 3x3 blocks: H assembled from element matrices, its product, and Galerkin products with affine functions.
 
-A pattern is symmetric and full; values are [world, entry]. An entry and its mirror are made by one thread.
+A pattern is symmetric and full; values are [world, entry]. One thread computes an entry and its mirror.
 """
 
 import functools
@@ -18,8 +18,8 @@ __all__ = ["assembly_kernels", "block_kernels"]
 
 @functools.cache
 def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespace:
-    """Assembly from the matrices of elements with so many slots, as `element_matrix` or, `rows`, `element_rows` leave
-    them."""
+    """Assembly from the matrices of elements with a given number of slots, in the layout of `element_matrix` or,
+    `rows`, of `element_rows`."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
@@ -33,7 +33,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
 
     @wp.func
     def place(low: int, high: int) -> int:
-        """Of the block of two slots in an element's matrix."""
+        """Index of the block of two slots in an element's matrix."""
         if wp.static(rows):
             return P * row_of(high / P, P, low) + high % P
         else:
@@ -41,7 +41,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
 
     @wp.func
     def block_at(matrix: wp.array3d(dtype=Number), world: int, elem: int, where: int) -> mat33:
-        """The 3x3 block at a place of an element's matrix."""
+        """3x3 block at an index of an element's matrix."""
         if wp.static(rows):
             first = 9 * P * (where / P) + where % P
             A = mat33()
@@ -64,8 +64,8 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         start: wp.array(dtype=wp.int32),
         source: wp.array(dtype=wp.int32),
     ):
-        """What of which element adds to an entry of Pattern.upper: start[index + 1] = how many, or with `listing` the
-        `source`s from start[index] on, 2 (PLACES elem + place) + 1 where the block is to be transposed."""
+        """Contributions of elements to an entry of Pattern.upper: start[index + 1] = their number, or with `listing`
+        the `source`s from start[index] on, 2 (PLACES elem + place) + 1 for a transposed block."""
         index = wp.tid()
         at = pattern.upper[index]
         found = wp.int32(0)
@@ -97,9 +97,9 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=mat33),
     ):
-        """value += (dq/dv) K of a block's elements; `first`: = c_M M + (dq/dv) K.
+        """value += (dq/dv) K of an element block; `first`: = c_M M + (dq/dv) K.
 
-        Prescribed components keep their diagonal and nothing else.
+        Prescribed components keep their diagonal only.
         """
         world, index = wp.tid()
         if active[world] == 0:
@@ -137,7 +137,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
 
 @functools.cache
 def block_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels on matrices of 3x3 blocks, whatever they came from."""
+    """Kernels on matrices of 3x3 blocks of any origin."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     vec4 = wp.types.vector(length=4, dtype=T)
@@ -155,7 +155,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
         diagonal: wp.array2d(dtype=vec3),
         inverse: wp.array2d(dtype=mat33),
     ):
-        """The diagonal D and the inverses of the diagonal blocks on the free components."""
+        """Diagonal D and inverses of the diagonal blocks on the free components."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -181,7 +181,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """P^T A P: for two groups and two of their functions the sum of w w' A over the entries between them.
 
-        `pair`: first coarse entry of the group's rows, width of its rows, place of the other in them;
+        `pair`: first coarse entry of the group's rows, width of its rows, index of the other in them;
         `fine_entry`: an entry, its row, its column.
         """
         world, index = wp.tid()

@@ -1,4 +1,4 @@
-"""What Newton's method knows of each world, and why it may fail."""
+"""Newton control data of each world, and failure codes."""
 
 import functools
 
@@ -40,17 +40,17 @@ FAIL_WORK = 11
 FAIL_ERROR = 12
 FAIL_ENERGY = 13
 
-GROUP_ROWS = 6  # squared norms of g, f_int, loads, inertia, rounding; strain energy
+GROUP_ROWS = 6  # squared norms of g, f_int, loads, inertia, round-off; strain energy
 FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|
 LANES, FLOOR_LANES = 32, 16
 TERM_ROWS = 3
-"""Rows summed per world of what terms store: the potential with what is held in a line search (multipliers, caps), the
-potential with what they would hold next, and its magnitude."""
+"""Rows summed per world over terms with stored energy: the potential with the quantities frozen in a line search
+(multipliers, friction limits), the potential with their next values, and its magnitude."""
 
 
 @functools.cache
 def control_struct():
-    """What Newton's method knows of each world."""
+    """Newton control data of each world."""
 
     @wp.struct
     class NewtonControl:
@@ -59,7 +59,7 @@ def control_struct():
         failed: wp.array(dtype=wp.int32)  # 0 or a FAIL_ code
         iterations: wp.array(dtype=wp.int32)  # of this attempt
         searches: wp.array(dtype=wp.int32)
-        grown: wp.array(dtype=wp.int32)  # doublings of the step along a concave Phi; -1: no more
+        grown: wp.array(dtype=wp.int32)  # doublings of the step along a concave Phi; -1: exhausted
         total_iterations: wp.array(dtype=wp.int32)  # of this step
         alpha: wp.array(dtype=wp.float64)
         phi: wp.array(dtype=wp.float64)
@@ -67,90 +67,90 @@ def control_struct():
         slope: wp.array(dtype=wp.float64)  # g.p at the iterate
         norm: wp.array(dtype=wp.float64)  # |g| in the D^-1 norm
         relative: wp.array(dtype=wp.float64)  # |g| over the largest force, of the worst group
-        excess: wp.array(dtype=wp.float64)  # the same over what is accepted, violations of constraints as well
-        floor_excess: wp.array(dtype=wp.float64)  # the same over what rounding of positions alone may cause
-        solve_norm: wp.array(dtype=wp.float64)  # |g| of the groups that are not converged
+        excess: wp.array(dtype=wp.float64)  # largest norm over accepted norm, constraint violations included
+        floor_excess: wp.array(dtype=wp.float64)  # residual over that of rounded positions
+        solve_norm: wp.array(dtype=wp.float64)  # |g| of the unconverged groups
         solve_accept: wp.array(dtype=wp.float64)  # smallest accepted norm among them
         group_sums: wp.array3d(dtype=wp.float64)  # [GROUP_ROWS, world, residual group], with several groups
         component_of_group: wp.array(dtype=wp.int32)  # [residual group]
-        worst: wp.array(dtype=wp.float64)  # largest norm over accepted norm of the groups, constraints not counted
+        worst: wp.array(dtype=wp.float64)  # largest norm over accepted norm of the groups, without constraints
         quiet: wp.array2d(dtype=wp.int32)  # [world, component] converged
-        reduction: wp.array(dtype=wp.float64)  # norm over that of the iterate before
+        reduction: wp.array(dtype=wp.float64)  # norm over that of the previous iterate
         forcing: wp.array(dtype=wp.float64)  # Eisenstat-Walker eta
         predicted: wp.array(dtype=wp.int32)  # the first iterate is extrapolated
-        reused: wp.array(dtype=wp.int32)  # the operator is of an earlier iterate; 2: and led nowhere
+        reused: wp.array(dtype=wp.int32)  # 1: the operator is of an earlier iterate; 2: and its search failed
         min_J: wp.array(dtype=wp.float64)
         domain_J: wp.array(dtype=wp.float64)  # smallest J of the laws that need J > 0
-        history: wp.array2d(dtype=wp.float64)  # [world, iteration] norm / scale
+        history: wp.array2d(dtype=wp.float64)  # [world, iteration] relative residual
         slot_sums: wp.array2d(dtype=wp.float64)  # gather.RESIDUAL_ROWS
         elem_sums: wp.array2d(dtype=wp.float64)  # strain energy, viscous potential
         slope_sum: wp.array2d(dtype=wp.float64)
-        tangent_sum: wp.array2d(dtype=wp.float64)  # p.K p of the forces without a potential, 0 without
+        tangent_sum: wp.array2d(dtype=wp.float64)  # p.K p of the non-conservative forces, else 0
         dq_dv: wp.array(dtype=wp.float64)
         violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m; with constraints
         term_sums: wp.array2d(dtype=wp.float64)  # [TERM_ROWS, world], with terms that have a potential of their own
-        limit: wp.array(dtype=wp.float64)  # largest step along the direction; with terms that limit it
+        limit: wp.array(dtype=wp.float64)  # largest step along the direction; with terms that limit steps
         stepped: wp.array(dtype=wp.int32)  # the trial was accepted
         outer: wp.array(dtype=wp.int32)  # multiplier updates of this step
         constraint_tol: wp.float64  # m
-        constraint_pace: wp.float64  # m/s^2: it also is this times (dq/dv)^2, but not below `constraint_least`; 0: not
+        constraint_pace: wp.float64  # m/s^2: tolerance also this times (dq/dv)^2, at least `constraint_least`; 0: off
         constraint_least: wp.float64  # m
         open: wp.array(dtype=wp.float64)  # largest violation over its tolerance; with constraints
-        slack: wp.float64  # norm of PCG over the norm that is judged, across constraints
+        slack: wp.float64  # norm of PCG over the norm of the convergence test, across constraints
         classical: wp.int32  # multipliers change in an outer loop
         force: wp.array(dtype=wp.float64)  # |g| over the free components, N
-        force_tol: wp.float64  # N; accepted without regard to the size of the forces; 0: never
+        force_tol: wp.float64  # N; absolute tolerance of the force; 0: off
         first_forcing: wp.float64
-        fixed_forcing: wp.int32  # all solves go as far as the first, whatever Newton's method needs
+        fixed_forcing: wp.int32  # 1: all solves use the first forcing term
         tol: wp.float64
         eps: wp.float64
-        any_hard: wp.array(dtype=wp.int32)  # a world needs what most steps do not: any of the flags below
-        # where full steps are taken although Phi rises, see judging.py
-        leaps: wp.array(dtype=wp.int32)  # such steps since the best iterate
-        mixed: wp.array(dtype=wp.int32)  # H has the stress of the linear prediction
-        wish: wp.array(dtype=wp.int32)  # 1: such a step is wanted, how long may it be? 2: the trial is one
+        any_hard: wp.array(dtype=wp.int32)  # 1 if any world needs a rare branch: any of the flags below
+        # nonmonotone steps, see kernels/solvers/searching.py
+        leaps: wp.array(dtype=wp.int32)  # nonmonotone steps since the best iterate
+        mixed: wp.array(dtype=wp.int32)  # 1: H has the predicted stress; 2: positive semi-definite
+        wish: wp.array(dtype=wp.int32)  # 1: a nonmonotone trial is requested, its length is due; 2: the trial is one
         turn: wp.array(dtype=wp.float64)  # largest gradient of the direction
-        radius: wp.array(dtype=wp.float64)  # most that such a step may turn or stretch an element
+        radius: wp.array(dtype=wp.float64)  # trust radius: largest rotation or stretch of an element in such a step
         tame: wp.array(dtype=wp.int32)  # the next step must satisfy Armijo
-        mark: wp.array(dtype=wp.int32)  # the base of the last step is the best iterate
+        mark: wp.array(dtype=wp.int32)  # store the base of the last step as the best iterate
         restoring: wp.array(dtype=wp.int32)  # the trial is the best iterate
         best_phi: wp.array(dtype=wp.float64)
         best_norm: wp.array(dtype=wp.float64)
-        refreshed: wp.array(dtype=wp.int32)  # terms have taken anew what they hold; with walls
-        unsettled: wp.array(dtype=wp.int32)  # they have taken but a part of it: the residual is not that of the iterate
-        touching: wp.array(dtype=wp.int32)  # they act at the iterate
-        excursions: wp.array(dtype=wp.int32)  # leaps into obstacles of this attempt
-        lower: wp.array(dtype=wp.vec2d)  # a length of the search where Phi falls, and its slope there
-        upper: wp.array(dtype=wp.vec2d)  # one beyond which Phi rises; with walls
-        new_walls: wp.array(dtype=wp.int32)  # what they hold now may set in suddenly again
-        # where rounding stops the residual
-        strict: wp.array(dtype=wp.int32)  # the next solve tells the error that is left; 2: it has been done
-        any_strict: wp.array(dtype=wp.int32)  # a world's next solve does
+        refreshed: wp.array(dtype=wp.int32)  # frozen quantities of terms were updated; with walls
+        unsettled: wp.array(dtype=wp.int32)  # they were updated only partly: the residual is not that of the iterate
+        touching: wp.array(dtype=wp.int32)  # unilateral forces act at the iterate
+        excursions: wp.array(dtype=wp.int32)  # nonmonotone steps into obstacles in this attempt
+        lower: wp.array(dtype=wp.vec2d)  # bracket: step length where Phi falls, and its slope there
+        upper: wp.array(dtype=wp.vec2d)  # bracket: step length beyond which Phi rises; with walls
+        new_walls: wp.array(dtype=wp.int32)  # the updated quantities may activate unilateral forces again
+        # round-off floor of the residual
+        strict: wp.array(dtype=wp.int32)  # 1: the next solve estimates the error; 2: done
+        any_strict: wp.array(dtype=wp.int32)  # 1 if any world's next solve does
         rounds: wp.array(dtype=wp.int32)  # linear solves of this attempt
         strict_count: wp.array(dtype=wp.int32)
-        eta: wp.array(dtype=wp.float64)  # that error, over the size of the solution; of the last such solve
+        eta: wp.array(dtype=wp.float64)  # error estimate relative to the solution, of the last such solve
         last_eta: wp.array(dtype=wp.float64)
-        floor: wp.array(dtype=wp.float64)  # the eta that was accepted in this attempt, 0: none
-        floor_bound: wp.float64  # largest that is
+        floor: wp.array(dtype=wp.float64)  # largest error estimate accepted in this attempt, 0: none
+        floor_bound: wp.float64  # largest acceptable one
         floor_sums: wp.array4d(dtype=wp.float64)  # [FLOOR_ROWS, world, residual part, lane]
         negative: wp.array(dtype=wp.int32)  # the last solve met a direction without positive curvature
         unsolved: wp.array(dtype=wp.int32)  # the last solve for a step ended at `max_iterations`
         # the first iterate
-        bent: wp.array(dtype=wp.int32)  # a solve of this attempt did
+        bent: wp.array(dtype=wp.int32)  # a solve of this attempt met negative curvature
         potential: wp.array(dtype=wp.float64)  # strain energy of the state, J
         potential_start: wp.array(dtype=wp.float64)  # of the state that the step began from
         step_floor: wp.array(dtype=wp.float64)  # the largest floor of the accepted substeps
-        choose: wp.array(dtype=wp.int32)  # it is to be chosen among others
+        choose: wp.array(dtype=wp.int32)  # 1: choose it among candidates
         suspect: wp.array(dtype=wp.int32)  # the accepted iterate has J <= 0 somewhere
-        turned: wp.array(dtype=wp.int32)  # it turned an element inside out
+        turned: wp.array(dtype=wp.int32)  # it inverted an element
         refuse_inversion: wp.int32
         linear_stress: wp.int32  # all stresses are linear in the Green-Lagrange strain
         rough: wp.array(dtype=wp.int32)  # a substep of this step was accepted short of the tolerance
         max_iterations: wp.int32
         components: wp.int32
-        groups: wp.int32  # components, and materials of like stiffness in each
+        groups: wp.int32  # components, subdivided by materials of similar stiffness
         nonpotential: wp.int32
         equilibrium: wp.int32  # statics
-        length: wp.float64  # of the model, m
+        length: wp.float64  # model size, m
 
     return NewtonControl

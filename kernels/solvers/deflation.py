@@ -1,9 +1,9 @@
 """Deflation of the directions of constraints: the preconditioner (D + (dq/dv) J^T rho J)^-1 by Woodbury's identity.
 
-    z = D^-1 r - D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J D^-1 r
+z = D^-1 r - D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J D^-1 r
 
-D stands for the 3x3 diagonal blocks of H. The rows of J are grouped into clusters, whose matrices are inverted densely;
-where clusters are coupled, symmetric Gauss-Seidel sweeps go over them colour by colour.
+D are the 3x3 diagonal blocks of H. The rows of J are grouped into clusters, whose matrices are inverted densely;
+coupled clusters are swept by symmetric Gauss-Seidel, colour by colour.
 """
 
 import functools
@@ -20,7 +20,8 @@ __all__ = ["deflation_kernels"]
 
 @functools.cache
 def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels of the deflation for one precision of the slots, and of the penalty rho, which the same matrices set."""
+    """Kernels of the deflation for one precision of the slots, and of the penalty rho derived from the same
+    matrices."""
     p = precision(dtype)
     vec3, mat33 = p.vec3, p.mat33
     f64, vec3d = wp.float64, wp.vec3d
@@ -33,7 +34,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     def pair_blocks(
         con: Constraints, inverse: wp.array2d(dtype=mat33), active: wp.array(dtype=wp.int32), mul: Multipliers
     ):
-        """sum w w' D^-1 over the slots that two vectors of constraints share, with their weights w and w' there."""
+        """sum w w' D^-1 over the common slots of two constraint vectors, with their weights w and w' there."""
         world, block = wp.tid()
         if active[world] == 0:
             return
@@ -44,7 +45,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def pair_sum(con: Constraints, mul: Multipliers, world: int, row: int, column: int, first: int, last: int) -> f64:
-        """The entry of J D^-1 J^T for two rows: the sum over the pairs of their vectors that share slots."""
+        """Entry of J D^-1 J^T for two rows: sum over the pairs of their vectors with common slots."""
         s = f64(0.0)
         for k in range(first, last):
             side = con.pair_side[k]
@@ -76,9 +77,9 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def penalty(con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers):
-        """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii), N/m, kept during a step.
+        """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii), N/m, constant during a step.
 
-        kappa is its ratio to the stiffness of what the constraint ties: free of units, of the mesh and of E.
+        kappa is the ratio of rho to the stiffness of the constrained slots: independent of units, of the mesh and of E.
         """
         world, row = wp.tid()
         if active[world] == 0:
@@ -143,7 +144,8 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """One pivot of Gauss-Jordan in every large cluster, a thread per row; `scale_row` does the row of the pivot."""
+        """One pivot of Gauss-Jordan in every large cluster, a thread per row; `scale_row` handles the row of the
+        pivot."""
         world, k, i = wp.tid()
         cluster = large[k]
         n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
@@ -211,7 +213,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         """One colour of a symmetric block Gauss-Seidel sweep over coupled clusters.
 
         Both sweeps together invert (G + L) G^-1 (G + L^T), with G the clusters' own matrices and L the couplings to
-        colours before. It is no less than J D^-1 J^T + 1/((dq/dv) rho), so the preconditioner stays positive definite.
+        preceding colours, an upper bound of J D^-1 J^T + 1/((dq/dv) rho): the preconditioner stays positive definite.
         """
         world, k = wp.tid()
         if active[world] == 0:
@@ -252,7 +254,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         z: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """z = y - D^-1 J^T s on slots that constraints touch, y = D^-1 r; with `add` added to z. Rows: r.z per warp."""
+        """z = y - D^-1 J^T s on slots with constraints, y = D^-1 r; with `add` added to z. Rows: r.z per warp."""
         world, slot = wp.tid()
         if active[world] == 0:
             return

@@ -1,4 +1,4 @@
-"""What a direct solver adds to the elements' matrix so that it is all of H, and what surrounds its solution."""
+"""Additions to the elements' matrix that complete H for direct solvers, and the vector operations of a solve."""
 
 import functools
 import types as _types
@@ -15,7 +15,7 @@ __all__ = ["direct_kernels", "followed_struct"]
 
 @functools.cache
 def followed_struct():
-    """Where the matrices of follower loads enter the pattern."""
+    """Positions of the matrices of follower loads in the pattern."""
 
     @wp.struct
     class Followed:
@@ -45,7 +45,7 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         out: wp.array2d(dtype=vec3),
     ):
-        """Values at the slots of each item, local * count + item."""
+        """Gather values at the slots of each item, local * count + item."""
         world, local, item = wp.tid()
         if active[world] != 0:
             out[world, local * conn.shape[1] + item] = u[world, conn[local, item]]

@@ -1,7 +1,7 @@
-"""Accelerated descent with a fixed preconditioner B: v += p, where p is made of B r and of the last few moves.
+"""Accelerated descent with a fixed preconditioner B: v += p, with p a combination of B r and of the last moves.
 
-Of the last moves the pairs (s, y) are kept: s = v' - v and the change y = r - r' of the residual r = -g, which is H s
-where H is constant. One thread per slot, or one per world for the small systems. See warpfea/solvers/jacobi.py.
+Pairs (s, y) of the last moves are stored: s = v' - v and the change y = r - r' of the residual r = -g, equal to H s for
+constant H. One thread per slot, or one per world for the small systems. See warpfea/solvers/jacobi.py.
 """
 
 import functools
@@ -19,28 +19,28 @@ from .pcg import pcg_struct
 __all__ = ["PAIRS", "jacobi_kernels", "jacobi_struct"]
 
 PAIRS = 4
-"""Moves that are kept: 1 and 3 to 5 were tried, and beyond 3 the number hardly matters."""
-DEPENDENT = 1.0e-10  # a pivot below this share of its diagonal: the move depends linearly on the others
+"""Stored moves: 1 and 3 to 5 were tried, and beyond 3 the number hardly matters."""
+DEPENDENT = 1.0e-10  # a pivot below this fraction of its diagonal: the move depends linearly on the others
 
 
 @functools.cache
 def jacobi_struct():
-    """The acceleration's numbers of each world."""
+    """Scalars of the acceleration, per world."""
 
     @wp.struct
     class JacobiControl:
         gram: wp.array3d(dtype=wp.float64)  # [world, pair, pair] s_i . y_j
         factor: wp.array3d(dtype=wp.float64)  # its Cholesky factor, newest pair first
         right: wp.array2d(dtype=wp.float64)  # [world, pair] right side, newest first
-        gamma: wp.array2d(dtype=wp.float64)  # [world, pair] share of each pair in the move
+        gamma: wp.array2d(dtype=wp.float64)  # [world, pair] coefficient of each pair in the move
         sums: wp.array2d(dtype=wp.float64)  # [2 PAIRS, world]
         first_norm: wp.array(dtype=wp.float64)  # |g| at the start of the attempt
         rho: wp.array(dtype=wp.float64)  # of the Chebyshev recursion
-        growth: wp.float64  # |g| over that of the start beyond which a step is rejected
-        gap: wp.float64  # m, violation of a constraint beyond which a step is rejected
+        growth: wp.float64  # largest |g| over that of the start; beyond it a step is rejected
+        gap: wp.float64  # m, largest constraint violation; beyond it a step is rejected
         step: wp.float64  # factor of B r
-        centre: wp.float64  # of the interval of eigenvalues of B H that the Chebyshev recursion is for
-        half: wp.float64  # its half width
+        centre: wp.float64  # of the interval of eigenvalues of B H in the Chebyshev recursion
+        half: wp.float64  # half width of the interval
 
     return JacobiControl
 
@@ -60,7 +60,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.func
     def settle(ctl: Newton, jac: Jacobi, world: int):
-        """End a world's iterations where it has converged or failed, or where they are used up."""
+        """End a world's iterations on convergence, failure or at the iteration limit."""
         record(ctl, world)
         finite = wp.isfinite(ctl.norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
         if wp.static(traits.stored):
@@ -92,7 +92,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.kernel(module=module)
     def begin(ctl: Newton, jac: Jacobi):
-        """Measure the residual of the first iterate, and see whether it will do."""
+        """Evaluate the norms of the first iterate and test convergence."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -103,7 +103,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.kernel(module=module)
     def judge(ctl: Newton, jac: Jacobi):
-        """Measure the residual of an iterate, count it, and see whether it will do."""
+        """Evaluate the norms of an iterate, count it, and test convergence."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -114,7 +114,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.func
     def pair_of(k: int, age: int) -> int:
-        """Index of the pair that is `age` moves old at iteration k; the pairs lie in a ring."""
+        """Index of the pair of `age` moves ago at iteration k, in a ring buffer."""
         return (k - 1 - age) % PAIRS
 
     @wp.kernel(module=module)
@@ -154,7 +154,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.func
     def substitute(jac: Jacobi, world: int, k: int, count: int, add: f64):
-        """gamma = add gamma + G^-1 right with the Cholesky factor of G; dependent pairs, of pivot 0, are left out."""
+        """gamma = add gamma + G^-1 right with the Cholesky factor of G; dependent pairs, of pivot 0, are omitted."""
         for i in range(count):
             v = jac.right[world, i]
             for j in range(i):
@@ -195,7 +195,8 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.kernel(module=module)
     def shares(ctl: Newton, jac: Jacobi):
-        """Share gamma of each pair in the move: G gamma = S^T r, G = S^T Y, by Cholesky with the newest pair first."""
+        """Coefficient gamma of each pair in the move: G gamma = S^T r, G = S^T Y, by Cholesky with the newest pair
+        first."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -229,7 +230,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.kernel(module=module)
     def project(ctl: Newton, jac: Jacobi, y: wp.array3d(dtype=vec3), r: wp.array2d(dtype=vec3)):
-        """r -= Y gamma: the residual that the pairs leave."""
+        """Residual after the projection on the pairs, r -= Y gamma."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -251,7 +252,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.kernel(module=module)
     def conjugate(ctl: Newton, jac: Jacobi):
-        """gamma -= step G^-1 Y^T z, which makes the move conjugate to the pairs."""
+        """gamma -= step G^-1 Y^T z: makes the move conjugate to the pairs."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -269,7 +270,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         z: wp.array2d(dtype=vec3),
         move: wp.array2d(dtype=vec3),
     ):
-        """The move p = S gamma + step z; of the Chebyshev iteration, gamma_0 times the last move + gamma_1 z."""
+        """Move p = S gamma + step z; in the Chebyshev iteration gamma_0 times the last move + gamma_1 z."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -295,7 +296,8 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         move: wp.array2d(dtype=vec3),
         r: wp.array2d(dtype=vec3),
     ):
-        """r = -g - c_M M p with the lumped mass, whose sum over a body is exact: the force left on its translation."""
+        """r = -g - c_M M p with the lumped mass, exact for the sum over a body: the remaining force on its
+        translation."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             m = T(mass_factor[world]) * lumped[world % lumped.shape[0], slot]
@@ -303,7 +305,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.kernel(module=module)
     def advance(ctl: Newton, move: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3)):
-        """v += p, shortened where a term limits it."""
+        """v += p, shortened by step limits of terms."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             if wp.static(traits.limited):
@@ -313,7 +315,8 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
 
     @wp.kernel(module=module)
     def tell(ctl: Newton, jac: Jacobi, pcg: PCG, running: wp.array(dtype=wp.int32)):
-        """Tell the rule of kernels/solvers/reuse.py what the attempt cost and gained; flag the worlds that iterated."""
+        """Report cost and gain of the attempt to the rule of kernels/solvers/reuse.py; flag the worlds that
+        iterated."""
         world = wp.tid()
         ctl.active[world] = 0
         if running[world] != 0 and ctl.failed[world] == 0 and ctl.iterations[world] > 0:

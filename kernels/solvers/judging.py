@@ -1,4 +1,4 @@
-"""How an iterate of Newton's method is judged: Phi, norms, convergence, failure. Functions of one world."""
+"""Objective Phi, residual norms, convergence and failure of a Newton iterate. Functions of one world."""
 
 import functools
 import types as _types
@@ -22,37 +22,37 @@ __all__ = ["COARSE", "SWIFT", "TRIES", "judging_functions"]
 FLOOR = 16.0
 PREDICTED = 1.0e-3
 STALLED = 0.5
-"""A reduction of the residual that is no better than this is none."""
+"""Residual ratio above which an iteration counts as stalled."""
 CLOSING = 4
-"""Iterations in which constraints are closed to what accelerations need, where `constraint_tol` asks for less."""
+"""Iterations in which constraints are closed to the tolerance of accelerations, if `constraint_tol` is looser."""
 NEAR = 1.0e3
-"""Roundings of the positions, as they change the residual, within which a stall may be put down to rounding."""
+"""Multiple of the residual of rounded positions below which a stall may be due to round-off."""
 NEAR_MIDPOINT = 4.0
-"""The same of mid-point schemes, whose unsymmetric linear solves may stall long before rounding does."""
+"""`NEAR` for midpoint schemes, whose unsymmetric linear solves may stall long before round-off."""
 SETTLING = 10.0
-"""A residual can only be at its floor when the last step was below this many accepted errors."""
+"""Largest last step, in accepted errors, of a residual at its round-off floor."""
 FAR = 3
-"""An attempt may take so many times more iterations where `patience` says so."""
+"""Multiple of the iteration limit added by `patience`."""
 ALIKE = 64.0
-"""A stall may be put down to rounding too where the last step was below this many roundings in the norm of energy: of
-laws that are steep at small J the stress rounds far more than the positions."""
+"""Last step in the energy norm, over the round-off unit, below which a stall may also be due to round-off: laws that
+are steep at small J amplify round-off of the positions in the stress."""
 DROWNED = 32.0
-"""Roundings of the positions up to which a residual as large as the forces says nothing of the equilibrium."""
+"""Roundings of the positions below which, for a residual as large as the forces, round-off dominates the residual."""
 COARSE = 1.0e-10
-"""Rounding above which the precision is single."""
+"""Round-off unit above which the precision is single."""
 SWIFT = 1.0e4
-"""Roundings of its speed below which, in double precision, an error of a body's velocities is none."""
+"""Roundings of a body's speed below which, in double precision, a velocity error is negligible."""
 REACTION = 1.0e-6
-"""Share of twice the strain energy in the squared scale of a residual group."""
+"""Fraction of twice the strain energy in the squared scale of a residual group."""
 ROUNDED = 8.0
-"""Roundings of the positions up to which, in double precision, the residual of a group among others is none."""
+"""Roundings of the positions below which, in double precision, the residual of one group of several is negligible."""
 TRIES = 3
-"""Solves that may find the error of a stalled iterate too large before the step is given up."""
+"""Maximum number of error estimates of a stalled iterate before the step is given up."""
 
 
 @functools.cache
 def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """The functions; of the traits "stored", "gated", "midpoint" and "walls" count."""
+    """Functions; they depend on the traits "stored", "gated", "midpoint" and "walls"."""
     f64 = wp.float64
     Control = control_struct()
     stored, gated, midpoint, walls = traits.stored, traits.gated, traits.midpoint, traits.walls
@@ -60,13 +60,14 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
-        """Phi of Eq. (18) at the trial, over dq/dv, with what terms hold in the search.
+        """Phi of Eq. (18) at the trial, over dq/dv, with the quantities frozen during the line search.
 
-        Phi = 1/2 (v - v~).M (v - v~) c_M - f_held.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv), whose derivative by v
-        is the residual, Eq. (17). Of the sums over a world: inertia and the forces held, f_held (dead loads, and forces
-        without a potential as the search began), are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc, J, are
-        elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is term_sums[0].
-        With the trait "midpoint" there is no Phi: half of the squared D^-1 norm of the residual stands in its place.
+        Phi = 1/2 (v - v~).M (v - v~) c_M - f_held.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv); its derivative by v is
+        the residual, Eq. (17). Sums over a world: inertia and the frozen forces f_held (dead loads, and
+        non-conservative forces at the start of the search) are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc,
+        J, are elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is
+        term_sums[0]. With the trait "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual
+        replaces it.
         """
         if wp.static(midpoint):
             return ctl.slot_sums[4, world]
@@ -77,7 +78,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def magnitude(ctl: Control, world: int) -> f64:
-        """Sum of the magnitudes of Phi's parts: its rounding is a few eps of it."""
+        """Sum of the magnitudes of Phi's parts; the round-off of Phi is a few eps of it."""
         energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
         if wp.static(stored):
             energy += ctl.term_sums[2, world]
@@ -85,9 +86,9 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def closure(ctl: Control, world: int, tol: f64) -> f64:
-        """Violation that is allowed, m: accelerations in the state are off by it over (dq/dv)^2.
+        """Allowed violation, m; violation/(dq/dv)^2 is the error of the accelerations in the state.
 
-        Far from the reference, where places are rounded by more, a few iterations look for it in vain.
+        Only in the first iterations: far from the reference the round-off of positions prevents tighter values.
         """
         if ctl.constraint_pace > f64(0.0) and tol < f64(1.0e200) and ctl.iterations[world] < CLOSING:
             pace = ctl.constraint_pace * ctl.dq_dv[world] * ctl.dq_dv[world]
@@ -96,7 +97,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def largest_violation(ctl: Control, world: int) -> f64:
-        """Of the constraints of all components, m."""
+        """Largest constraint violation over all components, m."""
         largest = f64(0.0)
         for c in range(ctl.components):
             largest = wp.max(largest, ctl.violation[world, c])
@@ -104,9 +105,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def squared_sums(ctl: Control, world: int, group: int):
-        """Squared norms of g, of the largest forces, and of the rounding of the positions, of a residual group.
+        """Squared norms of g, of the largest forces, and of the position round-off, of a residual group.
 
-        Of its stress forces a small part counts, as of reactions: a group between others may bear no load of its own.
+        A small fraction of the strain energy is included as reactions: a group between others may carry no load of its
+        own.
         """
         if ctl.groups == 1:
             f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
@@ -119,8 +121,8 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def rounded(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
-        """True where, in float64, a group's residual is that of rounded positions, and within the tolerance of all
-        groups of its component: solving on would not make it smaller."""
+        """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
+        component: further iterations would not reduce it."""
         if ctl.groups == ctl.components or ctl.eps > f64(COARSE) or norm > f64(ROUNDED) * rounding:
             return False
         internal, loads, inertia = f64(0.0), f64(0.0), f64(0.0)
@@ -133,10 +135,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def measure(ctl: Control, world: int):
-        """Norms and acceptance of the residual just evaluated, for each residual group apart where there are several.
+        """Norms and acceptance of the current residual, separately for each residual group.
 
-        Components, and materials of unlike stiffness in each, must not hide behind each other's forces, and a component
-        of the model all of whose groups have converged is left alone.
+        The forces of one component or stiff material must not hide the residual of another; a component of the model
+        whose groups have all converged is excluded from further solves.
         """
         force = wp.sqrt(ctl.slot_sums[9, world])
         ctl.force[world] = force
@@ -155,10 +157,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             scale = wp.sqrt(sums[1])
             accept = (ctl.tol + f64(FLOOR) * ctl.eps) * scale
             if force > f64(0.0):
-                # the force's tolerance in this norm, as they compare at this iterate
+                # the force tolerance in this norm, by their ratio at this iterate
                 accept = wp.max(accept, norm * (ctl.force_tol / force))
             if ctl.predicted[world] != 0:
-                accept = f64(PREDICTED) * accept  # what is left would add up over steps that none solves for
+                accept = f64(PREDICTED) * accept  # unsolved remainders would accumulate over steps without iterations
             rounding = f64(2.0) * ctl.eps * wp.sqrt(sums[2])
             if norm > accept and rounded(ctl, world, group, norm, rounding):
                 accept = norm
@@ -175,7 +177,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 solve += g2
                 solve_accept = wp.min(solve_accept, accept)
                 if wp.static(gated):
-                    if ctl.classical != 0:  # the residual holds rho c, and so kappa times the rounding of places
+                    if ctl.classical != 0:  # the residual contains rho c: position round-off times kappa
                         rounding = rounding / (ctl.slack * ctl.slack)
                 floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
             largest = wp.max(largest, norm / wp.max(scale, f64(1.0e-300)))
@@ -192,20 +194,20 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def record(ctl: Control, world: int):
-        """Keep the relative residual of the iterate, for messages."""
+        """Store the relative residual of the iterate, for messages."""
         k = ctl.iterations[world]
         if k < ctl.history.shape[1]:
             ctl.history[world, k] = ctl.relative[world]
 
     @wp.func
     def unsatisfied(ctl: Control, world: int) -> bool:
-        """Whether forces balance but constraints do not hold: more iterations only raise the multipliers."""
+        """True if forces balance but constraints are violated: more iterations only raise the multipliers."""
         balanced = wp.max(ctl.tol, wp.min(f64(1.0e3) * ctl.tol, f64(1.0e-4)))
         return ctl.relative[world] <= balanced and ctl.open[world] > f64(1.0)
 
     @wp.func
     def accept(ctl: Control, world: int):
-        """End the iteration with this iterate; where J <= 0 it is looked at once more."""
+        """End the iteration with this iterate; with J <= 0 it is checked again."""
         ctl.active[world] = 0
         ctl.searching[world] = 0
         if ctl.refuse_inversion != 0 and ctl.min_J[world] <= f64(0.0):
@@ -214,22 +216,22 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def ask(ctl: Control, world: int):
-        """Let the next solve tell how large an error the residual stands for; see `judge_floor`."""
+        """Request an error estimate from the next solve, see `judge_floor`."""
         ctl.strict[world] = 1
         wp.atomic_max(ctl.any_strict, 0, 1)
         ctl.mixed[world] = 0
 
     @wp.func
     def patience(ctl: Control, world: int) -> int:
-        """How many times `max_iterations` an attempt may take: more where it begins far from its end, or where a law
-        that keeps its own tangent left a state without positive curvature, which shorter steps meet again."""
+        """Factor on `max_iterations` of an attempt: larger for a start far from the solution, or after negative
+        curvature with a law that has its own tangent, since shorter steps meet it again."""
         far = wp.max(ctl.choose[world], ctl.bent[world] * (1 - ctl.linear_stress))
         return 1 + FAR * far
 
     @wp.func
     def give_up(ctl: Control, world: int, why: int):
-        """End without convergence. In single precision a residual as large as the forces, of no more than `DROWNED`
-        roundings, is put down to those in statics, whatever it ends by: a smaller load has smaller forces in the same
+        """End without convergence. A residual as large as the forces but below `DROWNED` roundings is reported as
+        round-off in single-precision statics, whatever the failure: a smaller load has smaller forces with the same
         noise."""
         ctl.active[world] = 0
         ctl.searching[world] = 0
@@ -244,10 +246,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def settle(ctl: Control, world: int):
-        """End the iteration where it has converged or used up its iterations; where it stands still within rounding,
-        ask for the error that is left."""
+        """End the iteration if it has converged or used up its iterations; if it stalls within round-off, request an
+        error estimate."""
         record(ctl, world)
-        # the energy that the last step promised, over what there is
+        # predicted energy change of the last step, relative to the energy
         energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
         step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
         most = f64(SETTLING) * ctl.floor_bound
@@ -255,10 +257,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
         alike = f64(ALIKE) * ctl.eps
         near = ctl.floor_excess[world] <= f64(BOUND)
-        if wp.static(not midpoint) and not near and ctl.floor_excess[world] < f64(1.0e300):  # there g.p is no energy
+        if wp.static(not midpoint) and not near and ctl.floor_excess[world] < f64(1.0e300):  # g.p: no energy
             near = step <= alike * alike * energy
         if wp.static(walls):
-            # gaps of bodies that glide are rounded as places are, and there may be no other force
+            # gaps of gliding bodies have position round-off, possibly without any other force
             fine = f64(SWIFT) * ctl.eps
             if ctl.eps < f64(COARSE) and step <= fine * fine * ctl.dq_dv[world] * ctl.slot_sums[10, world]:
                 near = True
@@ -274,10 +276,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def fail(ctl: Control, world: int, why: int):
-        """No step was found. Where rounding alone may explain that, stand still and ask for the error that is left."""
+        """Handle a failed search: if round-off may explain it, keep the iterate and request an error estimate."""
         near = ctl.floor_excess[world] <= f64(BOUND) and ctl.strict_count[world] < TRIES
         enough = False
-        if wp.static(gated):  # only accelerations ask for more, and rounding does not give it
+        if wp.static(gated):  # only accelerations need the tighter tolerance, which round-off prevents
             if ctl.constraint_pace > f64(0.0) and ctl.relative[world] <= ctl.tol + f64(FLOOR) * ctl.eps:
                 enough = largest_violation(ctl, world) <= ctl.constraint_tol
         if enough and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):

@@ -1,8 +1,8 @@
 """Application of the two-level preconditioner: tile inverses, a coarse space of affine motions, a dense inverse.
 
-A level has slots of 3-vectors, which lie in tiles of up to TILE_SLOTS slots and in groups. The four affine functions
-1, x, y, z of each group are the slots of the next, coarser level; P interpolates from them (prolongation) and P^T sums
-onto them (restriction). levels_build.py makes the inverses.
+A level has slots of 3-vectors, in tiles of up to TILE_SLOTS slots and in groups. The four affine functions 1, x, y, z
+of each group are the slots of the next, coarser level; P interpolates from them (prolongation) and P^T sums onto them
+(restriction). levels_build.py computes the inverses.
 """
 
 import functools
@@ -25,7 +25,7 @@ LANES = 64
 
 @functools.cache
 def level_struct(dtype: str):
-    """The constant data of a level."""
+    """Constant data of a level."""
     T = precision(dtype).T
     vec4 = wp.types.vector(length=4, dtype=T)
 
@@ -75,8 +75,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """z = tile inverse times r, `share` lanes per slot; threads from `first_group` on: P^T r, `lanes` per group.
 
-        The inverse is symmetric. By columns, neighbouring threads read neighbouring numbers, which is fast on CUDA; by
-        rows, each thread does, which is fast on the CPU.
+        The inverse is symmetric: access by columns is coalesced on CUDA, access by rows is contiguous on the CPU.
         """
         world, index = wp.tid()
         if active[world] == 0:
@@ -141,7 +140,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def prolonged(level: Level, x: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
-        """(P x) at a slot: the affine motion that the coarse unknowns x give its group."""
+        """(P x) at a slot: the affine motion given by its group's coarse unknowns x."""
         first = 4 * level.group_of[slot]
         w = level.weight[slot]
         s = vec3()
@@ -235,7 +234,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def part_of(root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, k: int) -> T:
-        """Number k of r, scaled by `root` where the stored inverse is."""
+        """Entry k of r, scaled by `root` for a scaled inverse."""
         if wp.static(scaled):
             return r[world, k] * root[world, k]
         else:
@@ -247,7 +246,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         first: int, n: int, lanes: int,
     ) -> T:  # fmt: skip
         """A lane's part of a row times r, from `first` to n."""
-        # four independent sums, so that enough loads are under way at a time
+        # four independent sums keep enough loads in flight
         s0 = T(0.0)
         s1 = T(0.0)
         s2 = T(0.0)
@@ -267,7 +266,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def put_row(root: wp.array2d(dtype=T), s: T, world: int, row: int, x: wp.array2d(dtype=T)):
-        """x[row] = s, scaled back where the stored inverse is."""
+        """x[row] = s, scaled back for a scaled inverse."""
         if wp.static(scaled):
             x[world, row] = s * root[world, row]
         else:
@@ -302,7 +301,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         active: wp.array(dtype=wp.int32),
         x: wp.array2d(dtype=T),
     ):
-        """The same with the lower triangle of a matrix or, `upper`, with its upper one, diagonal included."""
+        """`apply_dense` with the lower triangle of a matrix or, `upper`, its upper one, diagonal included."""
         world, index = wp.tid()
         if active[world] == 0:
             return

@@ -1,4 +1,4 @@
-"""Making of the two-level preconditioner: tiles and dense matrices are filled, inverted by Gauss-Jordan, and stored.
+"""Construction of the two-level preconditioner: tiles and dense matrices are filled, inverted by Gauss-Jordan, stored.
 
 On CUDA the threads (lanes) of a block share the work on a tile; on the CPU one thread does it.
 """
@@ -18,15 +18,15 @@ __all__ = ["FACTOR_LANES", "build_kernels"]
 FACTOR_LANES = 512
 """Threads that factor a dense matrix on CUDA."""
 ACROSS = 128
-"""Of these, in a row of the matrix."""
+"""Threads among these along a row of the matrix."""
 
 
 @functools.cache
 def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamespace:
-    """Kernels that make the levels in one precision.
+    """Kernels that build the levels in one precision.
 
-    `storage`: precision in which inverses are kept, by default the same. In another one an inverse B of A is kept as
-    R B R with R^2 = diag A, and enough is added to its diagonal to stay positive definite after rounding.
+    `storage`: precision of the stored inverses, by default the same. In another one an inverse B of A is stored as
+    R B R with R^2 = diag A, with a diagonal shift that keeps it positive definite after rounding.
     """
     storage = storage or dtype
     S = precision(storage).T
@@ -40,9 +40,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     sync = lane_functions(dtype).sync
     ROW_BYTES = TILE * wp.types.type_size_in_bytes(T)
     memory, line = block_memory(dtype, TILE * TILE), block_memory(dtype, TILE)
-    # a pivot below this share of its diagonal entry is rounding: the functions are linearly dependent
+    # a pivot below this fraction of its diagonal entry is round-off: the functions are linearly dependent
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
-    # the same of a factorisation, which also takes what is almost a mechanism
+    # the fraction for a factorisation, which also accepts near-mechanisms
     LEAST_PIVOT = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
     module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SMALL)
 
@@ -55,7 +55,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         diagonal: wp.array3d(dtype=T),
         matrix: wp.array4d(dtype=T),
     ):
-        """The block of A for each tile, and its diagonal; one thread per slot, rows without an unknown are zero."""
+        """Block of A for each tile, and its diagonal; one thread per slot, rows without an unknown are zero."""
         world, tile, place = wp.tid()
         if active[world] == 0:
             return
@@ -87,7 +87,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         column: wp.array3d(dtype=T),
         matrix: wp.array4d(dtype=T),
     ):
-        """Inverse of each tile in place, by Gauss-Jordan; a block of threads has the tile in memory of its own.
+        """Inverse of each tile in place, by Gauss-Jordan; a block of threads works in its shared memory.
 
         A row whose pivot is not safely positive against the diagonal of A is dropped: zeros, or with `keep` the inverse
         of that diagonal. The result is therefore always positive semi-definite, with `keep` definite.
@@ -135,7 +135,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
                     memory.store(at, TILE * j + k, T(0.0))
                 sync()
                 if lane == 0 and keep != 0 and wp.abs(size) > T(0.0):
-                    # the sign marks the row, which stays zero for the pivots to come and is filled in at the end
+                    # the sign marks the row: it stays zero for later pivots and is filled in at the end
                     diagonal[world, tile, k] = -wp.abs(size)
         sync()
         for j in range(lane, TILE, lanes):
@@ -184,7 +184,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         diagonal: wp.array3d(dtype=T),
         pivot: wp.array4d(dtype=T),
     ):
-        """Copy the pivot block, and the diagonal that A has there."""
+        """Copy of the pivot block and of the diagonal of A there."""
         world, i, j = wp.tid()
         if active[world] != 0:
             pivot[world, 0, i, j] = matrix[world, first + i, first + j]
@@ -200,13 +200,13 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         left: wp.array3d(dtype=T),
         top: wp.array3d(dtype=T),
     ):
-        """left = A_ik P with P the inverse pivot block, top = A_kj: the panels that update the rest of the matrix."""
+        """left = A_ik P with P the inverse pivot block, top = A_kj: panels of the rank update."""
         world, m, i = wp.tid()
         if active[world] == 0:
             return
         s = T(0.0)
         for n in range(TILE):
-            # A is symmetric beside the pivot but for the sign of columns that were pivots before
+            # A is symmetric beside the pivot except for the sign of eliminated columns
             s += matrix[world, i, first + n] * pivot[world, 0, n, m]
         left[world, m, i] = s
         top[world, m, i] = matrix[world, first + m, i]
@@ -220,12 +220,12 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=T),
     ):
-        """One pivot of block Gauss-Jordan; a thread updates four rows of a column, which share what they read."""
+        """One pivot of block Gauss-Jordan; a thread updates four rows of a column, which share their loads."""
         world, i4, j = wp.tid()
         if active[world] == 0:
             return
         i = 4 * i4
-        # a tile's size is a multiple of 4, so the four rows are all in the pivot's or all outside
+        # a tile's size is a multiple of 4: the four rows are all in the pivot's or all outside
         in_row = i >= first and i < first + TILE
         in_column = j >= first and j < first + TILE
         s = vec4()
@@ -261,9 +261,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """L^-1 of A = L L^T in place of A, and L^-T above the diagonal; one block per world.
 
-        An inverse of A itself would have errors in its small eigenvalues as large as its large ones times rounding.
-        Where a pivot is not safely positive against the diagonal of A, that takes its place and the rest of its column
-        of L is zero, so that L L^T is positive definite whatever A is. Unknowns without a diagonal get zeros.
+        The small eigenvalues of an explicit inverse would have errors of its largest times round-off. A pivot
+        that is not safely positive against the diagonal of A is replaced by that diagonal and the rest of its column of
+        L is zero, so that L L^T is positive definite for any A. Unknowns without a diagonal get zeros.
         """
         thread = wp.tid()
         lane = thread % lanes
@@ -285,8 +285,8 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
                 scale = T(1.0) / wp.sqrt(pivot)
             elif size > T(0.0):
                 scale = T(1.0) / wp.sqrt(size)
-            # left of column k stands L^-1, from there on what is left of A; a thread updates four rows of a column,
-            # which load at once
+            # left of column k is L^-1, from there on the remainder of A; a thread updates four rows of a column,
+            # with simultaneous loads
             if safe:
                 i = 4 * ((k + 1) / 4 + lane / across)
                 while i < n:
@@ -318,12 +318,12 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def inverse_root(d: T) -> T:
-        """1/sqrt|d| of an entry of diag A; 0 where there is no unknown."""
+        """1/sqrt|d| of an entry of diag A; 0 without an unknown."""
         return wp.where(d == T(0.0), T(0.0), T(1.0) / wp.sqrt(wp.abs(d)))
 
     @wp.func
     def scaled_entry(b: T, own: T, other: T, on_diagonal: bool, trace: T) -> S:
-        """An entry of R B R in the storage's precision; on the diagonal with what its rounding needs."""
+        """Entry of R B R in the storage's precision; the diagonal includes the shift for its rounding."""
         x = T(0.0)
         if own > T(0.0) and other > T(0.0):
             x = b / (own * other)
@@ -340,7 +340,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         root: wp.array3d(dtype=T),
         stored: wp.array4d(dtype=S),
     ):
-        """Put the inverses of tiles into their storage, one thread per row."""
+        """Store the inverses of tiles, one thread per row."""
         world, tile, i = wp.tid()
         if active[world] == 0:
             return
@@ -362,7 +362,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         root: wp.array2d(dtype=T),
         stored: wp.array3d(dtype=S),
     ):
-        """Put the dense inverse into its storage, one thread per entry."""
+        """Store the dense inverse, one thread per entry."""
         world, i, j = wp.tid()
         if active[world] == 0:
             return

@@ -1,11 +1,11 @@
-"""Rigid motions of bodies that terms couple: the matrix R^T H R, and the restriction and prolongation of its solutions.
+"""Rigid-body modes of bodies that terms couple: the matrix R^T H R, and restriction and prolongation of its solutions.
 
-A preconditioner made of the bodies' own blocks takes each body that touches another for one on springs. Chains of
-them that move together are then far too stiff, the more the longer they are, and their motions as rigid bodies at the
-place that the preconditioner is made at correct that: z += R (R^T H R)^-1 R^T r, with what couples bodies in R^T H R.
+A preconditioner made of the bodies' own blocks treats contacts with other bodies as springs to ground. Chains of bodies
+that move together are then far too stiff, increasingly with their length; their rigid-body modes at the linearisation
+point correct that: z += R (R^T H R)^-1 R^T r, with the coupling between bodies in R^T H R.
 
-An unknown of a body is a translation along or a turn about an axis through its centre, over its size; a slot moves by
-t + w x a with a = (x - c)/size, a gradient by w x g/size. Motions that a support resists are left out.
+An unknown of a body is a translation along or a rotation about an axis through its centre, over its size; a slot moves
+by t + w x a with a = (x - c)/size, a gradient by w x g/size. Modes that a support resists are omitted.
 """
 
 import functools
@@ -54,10 +54,10 @@ def motion_kernels(dtype: str) -> _types.SimpleNamespace:
         bodies: Bodies, pattern: Pattern, free: wp.array(dtype=vec3), value: wp.array2d(dtype=mat33),
         active: wp.array(dtype=wp.int32), lanes: int, parts: wp.array4d(dtype=mat33d),
     ):  # fmt: skip
-        """R^T H R of each body by itself, H its own blocks `value`: a lane's sum over slots, [world, body, lane].
+        """R^T H R of each body, H its own blocks `value`: partial sums of a lane over slots, [world, body, lane].
 
-        Translations with translations, turns with translations, turns with turns. What rounding of H may take is
-        added to the diagonal.
+        Blocks translation-translation, rotation-translation, rotation-rotation. A bound of the round-off of H is added
+        to the diagonal.
         """
         world, body, lane = wp.tid()
         if active[world] == 0:
@@ -93,7 +93,7 @@ def motion_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=mat33d), scale: wp.array2d(dtype=T),
         matrix: wp.array3d(dtype=T),
     ):  # fmt: skip
-        """The matrix of the bodies by themselves, and its diagonal; rows beyond the bodies are zero."""
+        """Block-diagonal part of the matrix, and its diagonal; rows beyond the bodies are zero."""
         world, row = wp.tid()
         if active[world] == 0:
             return
@@ -124,7 +124,7 @@ def motion_kernels(dtype: str) -> _types.SimpleNamespace:
     def restrict(
         bodies: Bodies, r: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=T)
     ):  # fmt: skip
-        """R^T r; a block of threads per body. r is zero where a component is prescribed."""
+        """R^T r; a block of threads per body. r is zero at prescribed components."""
         world, body, thread = wp.tid()
         if active[world] == 0:
             return

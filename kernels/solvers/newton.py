@@ -1,4 +1,4 @@
-"""Per-world logic of Newton's method: convergence, forcing terms, line search, acceptance. One thread per world."""
+"""Newton's method per world: convergence, forcing terms, line search, acceptance. One thread per world."""
 
 import functools
 import types as _types
@@ -27,19 +27,19 @@ from .searching import NOISE, TURN, search_kernels
 __all__ = ["newton_kernels"]
 
 ROUNDS = 3
-"""Linear solves of an attempt, over its iterations: those that lead to no step are bounded too."""
+"""Maximum linear solves of an attempt per allowed iteration: bounds solves without a step."""
 RIGID = 64.0
-"""Roundings of the displacements below which an error is none, whatever the energy that it is compared with."""
-FAR_FORCING = 0.1  # of the first solve of a step that begins far from its end: what it is solved to is lost
+"""Roundings of the displacements below which an error is negligible, whatever the reference energy."""
+FAR_FORCING = 0.1  # of the first solve of a step that starts far from its end: a tighter solution is wasted
 HOPELESS = 3.0
-"""A first iterate whose strain energy exceeds that of the state by this many kinetic energies is not the best one."""
+"""Strain energy increase of a first iterate, in kinetic energies, above which other first iterates are tried."""
 
 
 @functools.cache
 def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     """Kernels of the Newton iteration, of one thread per world; scalars are float64.
 
-    Of the traits "stored", "gated", "limited", "walls" and "midpoint" count.
+    They depend on the traits "stored", "gated", "limited", "walls" and "midpoint".
     """
     f64 = wp.float64
     Control = control_struct()
@@ -57,7 +57,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def reset_min_J(ctl: Control, active: wp.array(dtype=wp.int32)):
-        """Before an evaluation: forget the smallest J."""
+        """Reset the smallest J before an evaluation."""
         world = wp.tid()
         if active[world] != 0:
             ctl.min_J[world] = f64(1.0e30)
@@ -67,7 +67,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def start(ctl: Control, world: int):
-        """Judge the iterate that Newton's method begins from."""
+        """Initialise the iteration at its first iterate, and test that for convergence."""
         measure(ctl, world)
         phi = objective(ctl, world) + ctl.slot_sums[7, world]
         ctl.phi[world] = phi
@@ -97,16 +97,16 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
             give_up(ctl, world, FAIL_NAN)
         elif wp.static(walls) and ctl.norm[world] > f64(0.0):
-            record(ctl, world)  # what is held is not that of this iterate: it can't be accepted
+            record(ctl, world)  # frozen quantities are not those of this iterate: it cannot be accepted
         else:
             settle(ctl, world)
 
     @wp.func
     def hopeless(ctl: Control, world: int) -> bool:
-        """Whether another first iterate should be looked for: Phi is above a bound of Phi at q_n, or J <= 0.
+        """True if other first iterates should be tried: Phi exceeds a bound of Phi at q_n, or J <= 0.
 
-        At q_n Phi is the strain energy of the state and a kinetic energy, which row 10 of `residual` has for backward
-        Euler and a third of which for BDF2.
+        At q_n Phi is the strain energy of the state plus a kinetic energy: row 10 of `residual` for backward Euler, a
+        third of it for BDF2.
         """
         phi = objective(ctl, world)
         if wp.static(midpoint):
@@ -117,7 +117,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin(ctl: Control, stage: int):
-        """Judge the first iterate; `stage` 0: it is the only one. 1: others may be better. 2: it was chosen."""
+        """Start with the first iterate; `stage` 0: the only one. 1: others may be better. 2: it was chosen."""
         world = wp.tid()
         if stage != 2:
             ctl.choose[world] = 0
@@ -134,7 +134,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def compare(ctl: Control, first: int, better: wp.array(dtype=wp.int32)):
-        """Flag the worlds where the first iterate just evaluated is the best yet: J > 0 before Phi."""
+        """Flag the worlds where the first iterate just evaluated is the best so far: J > 0 before Phi."""
         world = wp.tid()
         better[world] = 0
         if ctl.choose[world] == 0:
@@ -152,7 +152,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def open_search(ctl: Control, world: int):
-        """See whether the direction leads anywhere."""
+        """Check the search direction and start the line search."""
         ctl.bent[world] = wp.max(ctl.bent[world], ctl.negative[world])
         ctl.searching[world] = 1
         barred = False
@@ -169,7 +169,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.mixed[world] = wp.where(lost(ctl, world), 0, 2)
                 ctl.tame[world] = 1
                 ctl.alpha[world] = f64(0.0)
-        elif ctl.slope[world] >= f64(0.0) and wp.static(not midpoint):  # |g| may fall where g.p does not
+        elif ctl.slope[world] >= f64(0.0) and wp.static(not midpoint):  # midpoint: |g| can still fall
             if ctl.reused[world] != 0:
                 ctl.alpha[world] = f64(0.0)
             elif ctl.leaps[world] > 0:
@@ -179,16 +179,16 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def judge_floor(ctl: Control, component_of_part: wp.array(dtype=wp.int32)):
-        """The error that a residual stands for, over the size of the solution, of the worst part.
+        """Error estimate of a stalled residual, relative to the solution, of the worst part.
 
-        With H p = -g it is, in the norm of energy, eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); each part
-        by itself, or a soft one would hide behind a stiff one that a joint ties it to.
+        With H p = -g in the energy norm: eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); for each part
+        separately, since a stiff part would hide the error of a soft one joined to it.
         """
         world = wp.tid()
         if ctl.strict[world] != 2:
             return
         ctl.strict[world] = 0
-        if ctl.unsolved[world] != 0 and ctl.eps > f64(COARSE):  # nor would this solve find the error
+        if ctl.unsolved[world] != 0 and ctl.eps > f64(COARSE):  # this solve cannot give the error either
             give_up(ctl, world, FAIL_FLOOR)
             return
         dq = ctl.dq_dv[world]
@@ -197,7 +197,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             for lane in range(FLOOR_LANES):
                 whole += ctl.floor_sums[0, world, part, lane]
                 largest = wp.max(largest, ctl.floor_sums[4, world, part, lane])
-        if wp.static(walls):  # a gap is rounded as places are
+        if wp.static(walls):  # gaps have position round-off
             largest = wp.max(largest, ctl.length)
         worst = f64(0.0)
         for part in range(component_of_part.shape[0]):
@@ -212,7 +212,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 eta = f64(1.0e30)
                 if ctl.negative[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
                     eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
-                    if ctl.eps > f64(COARSE):  # a direction may be so soft that energy does not see it
+                    if ctl.eps > f64(COARSE):  # a soft direction may be invisible to the energy
                         eta = wp.max(eta, f64(SCATTER) * dq * step / wp.max(largest, f64(1.0e-300)))
                     if eta > ctl.floor_bound and dq * step <= f64(RIGID) * ctl.eps * largest:
                         eta = dq * step / wp.max(largest, f64(1.0e-300))
@@ -235,7 +235,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin_search(ctl: Control, pcg: PCG):
-        """Take the slope along the new direction; try the full step first."""
+        """Slope along the new direction; the first trial is the full step."""
         world = wp.tid()
         if ctl.active[world] == 0:
             ctl.searching[world] = 0
@@ -261,7 +261,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             if ctl.classical == 0:
                 ctl.outer[world] = ctl.outer[world] + 1
         if ctl.strict[world] != 0 and pcg.total[world] < pcg.max_work:
-            # the error that is left is judged before the direction is followed
+            # estimate the error before following the direction
             ctl.strict[world] = 2
             ctl.searching[world] = 0
             wp.atomic_max(ctl.any_hard, 0, 1)

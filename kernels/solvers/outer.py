@@ -1,4 +1,4 @@
-"""What goes around Newton's iteration: multipliers of the classical method, what terms hold or limit."""
+"""Outer loop of Newton's method: classical multiplier updates, updates of frozen quantities, step limits."""
 
 import types as _types
 
@@ -12,13 +12,13 @@ __all__ = ["outer_kernels"]
 
 AHEAD = 3.0
 LOOSE = 0.03
-"""Tolerance of linear solves where the residual grows by more than a factor, AHEAD, once what is held is taken anew."""
+"""Tolerance of linear solves if the residual grows by more than the factor AHEAD when frozen quantities are updated."""
 REFRESH = 0.1
-"""Relative residual from which on what terms hold (caps of friction) is taken anew at each iterate."""
+"""Relative residual below which frozen quantities (friction limits) are updated at each iterate."""
 
 
 def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
-    """Kernels in the module of Newton's."""
+    """Kernels in the module of Newton's method."""
     f64 = wp.float64
     Control = control_struct()
     judging = judging_functions(traits)
@@ -28,14 +28,14 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
-        """Flag the worlds where what terms hold is to be taken anew: Newton's method has solved for it so far."""
+        """Flag the worlds whose frozen quantities are due for an update: the residual is small enough."""
         world = wp.tid()
         flags[world] = 0
         if ctl.active[world] != 0 and ctl.touching[world] == 0:
-            settle(ctl, world)  # nothing is held
+            settle(ctl, world)  # nothing is frozen
         elif ctl.active[world] != 0:
             last = ctl.iterations[world] + 1 >= ctl.max_iterations
-            # within rounding it may not fall below that
+            # within round-off the residual may not fall further
             rounding = ctl.floor_excess[world] <= f64(NEAR)
             if ctl.relative[world] <= f64(REFRESH) or rounding or last:
                 flags[world] = 1
@@ -44,13 +44,13 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def end_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
-        """Judge the iterate, in the flagged worlds with what terms hold now."""
+        """Re-evaluate the iterate of the flagged worlds with the updated frozen quantities."""
         world = wp.tid()
         if ctl.active[world] != 0 and flags[world] != 0:
             before = ctl.norm[world]
             measure(ctl, world)
             if ctl.fixed_forcing == 0 and ctl.norm[world] > f64(AHEAD) * before:
-                # what was held is the larger error: a solve need not go far below what it will leave
+                # the frozen quantities were the larger error: tighter solves are wasted
                 ctl.forcing[world] = wp.max(ctl.forcing[world], f64(LOOSE))
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
             ctl.phi_magnitude[world] = magnitude(ctl, world)
@@ -68,7 +68,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def judge_outer(ctl: Control, running: wp.array(dtype=wp.int32), tol: f64, limit: int):
-        """Classical multiplier updates: another inner solve where a constraint is still violated."""
+        """Classical multiplier updates: start another inner solve if a constraint is still violated."""
         world = wp.tid()
         ctl.stepped[world] = 0
         if running[world] == 0 or ctl.failed[world] != 0:
@@ -87,7 +87,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def free_step(ctl: Control):
-        """Before terms limit a step: the full one."""
+        """Reset the step limit to the full step."""
         world = wp.tid()
         if ctl.active[world] != 0:
             ctl.limit[world] = f64(1.0)

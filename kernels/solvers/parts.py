@@ -1,4 +1,4 @@
-"""Matrices that fall into parts which nothing couples: each part is a dense matrix of its own, [world part, i, j]."""
+"""Block-diagonal matrices of uncoupled components, each a dense matrix: [world part, i, j]."""
 
 import functools
 import types as _types
@@ -23,7 +23,7 @@ def part_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def spread(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
-        """Flags of worlds for each of their parts."""
+        """World flags copied to each component."""
         block = wp.tid()
         out[block] = flags[block / (out.shape[0] / flags.shape[0])]
 

@@ -15,42 +15,42 @@ from .control import control_struct
 __all__ = ["LANES", "forcing_functions", "groups_struct", "pcg_kernels", "pcg_struct"]
 
 TIGHTER = 0.4
-"""Factor on the tolerance of solves with constraints. Of 0.03, 0.18, 0.4 and 1 it saves the third Newton iteration at
+"""Factor on the tolerance of solves with constraints. Of 0.03, 0.18, 0.4 and 1 it avoids the third Newton iteration at
 the least cost: with 0.18, 0.4 and 1 a chain of 100 joints takes 64, 54 and 52 PCG iterations per step, and 2.0, 2.0
 and 2.55 Newton iterations."""
 TRUSTED = 3
-"""Iterations of Newton's method in which factors of the operator's own matrix are trusted to solve. Later ones are
-checked by the conjugate gradients, which also refine."""
+"""Newton iterations whose linear solves rely on factors of the operator's own matrix. Later solves are checked and
+refined by conjugate gradients."""
 STRICT_CHECK, STRICT_GAIN = 10, 0.01
-"""A solve that tells an error ends when it gains less than this share of the energy in so many iterations."""
+"""An error-estimating solve ends when it gains less than STRICT_GAIN of the energy in STRICT_CHECK iterations."""
 LANES = 128
-"""Partial sums per group of bodies; a fixed number, so that results don't depend on the number of worlds."""
+"""Partial sums per group of bodies; fixed, so that results are independent of the number of worlds."""
 
 
 @functools.cache
 def pcg_struct():
-    """The conjugate gradients' scalars of each world."""
+    """Scalars of the conjugate gradients, per world."""
 
     @wp.struct
     class PCGControl:
         active: wp.array(dtype=wp.int32)
         iterations: wp.array(dtype=wp.int32)  # of this solve
         total: wp.array(dtype=wp.int32)  # of this step
-        rz: wp.array(dtype=wp.float64)  # r.z of the iteration before
-        target: wp.array(dtype=wp.float64)  # norm at which the solve ends
-        norm: wp.array(dtype=wp.float64)  # |r| in the D^-1 norm, which Newton's method judges by
+        rz: wp.array(dtype=wp.float64)  # r.z of the previous iteration
+        target: wp.array(dtype=wp.float64)  # target norm of the solve
+        norm: wp.array(dtype=wp.float64)  # |r| in the D^-1 norm of Newton's convergence test
         first_norm: wp.array(dtype=wp.float64)  # at the start of the solve
         sums: wp.array2d(dtype=wp.float64)  # r.z and r.D^-1 r
         curvature: wp.array2d(dtype=wp.float64)  # p.Hp
         any_active: wp.array(dtype=wp.int32)
-        strict: wp.array(dtype=wp.int32)  # the solve goes on until the energy that it finds no longer grows
-        energy: wp.array(dtype=wp.float64)  # that energy, sum of alpha r.z, and what it was when last looked at
+        strict: wp.array(dtype=wp.int32)  # 1: the solve continues until its energy converges, for an error estimate
+        energy: wp.array(dtype=wp.float64)  # that energy, sum of alpha r.z, and its value at the last check
         seen: wp.array(dtype=wp.float64)
         negative: wp.array(dtype=wp.int32)  # the solve met a direction without positive curvature
         unsolved: wp.array(dtype=wp.int32)  # the last solve ended at max_iterations
         exact: wp.array(dtype=wp.int32)  # the preconditioner is the inverse of the operator, up to rounding
-        taken: wp.array(dtype=wp.int32)  # its z is the solution
-        flip: wp.array(dtype=wp.int32)  # such a direction is taken as if its curvature were positive
+        taken: wp.array(dtype=wp.int32)  # 1: its z is the solution
+        flip: wp.array(dtype=wp.int32)  # 1: directions of negative curvature are followed, by its absolute value
         max_iterations: wp.int32  # of a solve
         max_work: wp.int32  # of a step
 
@@ -59,7 +59,7 @@ def pcg_struct():
 
 @functools.cache
 def groups_struct(dtype: str):
-    """Groups of bodies that may translate freely together: Z, the indicator of their position slots."""
+    """Groups of bodies with free common translation: Z, the indicator of their position slots."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
@@ -78,30 +78,30 @@ def groups_struct(dtype: str):
 
 @functools.cache
 def forcing_functions(gated: bool) -> _types.SimpleNamespace:
-    """Norms at which solves end, by Eisenstat and Walker (1996); `gated`: with constraints, see Traits."""
+    """Target norms of linear solves, Eisenstat and Walker (1996); `gated`: with constraints, see Traits."""
     f64 = wp.float64
     Newton = control_struct()
 
     @wp.func
     def least_norm(newton: Newton, world: int) -> f64:
-        """A part of the accepted residual, below which Newton's method needs none."""
+        """Fraction of the accepted residual norm: a smaller residual of the solve gains nothing."""
         least = f64(0.1) * newton.solve_accept[world]
         if wp.static(gated):
-            # the same solve finds the constraint forces: what is left of r across constraints is their error
+            # the solve also yields the constraint forces: the residual across constraints is their error
             least = f64(TIGHTER) * least
             if newton.classical == 0:
-                # a loose tolerance of the forces must not leave constraints violated
+                # a loose force tolerance must not leave constraints violated
                 least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
         return least
 
     @wp.func
     def forced(newton: Newton, world: int, norm: f64) -> f64:
-        """The forcing term times the residual, |r| = norm at the start, but no less than `least_norm`."""
+        """Forcing term times the residual, |r| = norm at the start, and at least `least_norm`."""
         if newton.fixed_forcing != 0:
             return newton.forcing[world] * norm
         goal = newton.forcing[world] * newton.solve_norm[world]
         if wp.static(gated):
-            # where the forces balance already, what is left of the constraints may still call for a step
+            # with balanced forces the remaining constraint violation may still require a step
             goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
             if newton.classical == 0:
                 goal = f64(TIGHTER) * goal
@@ -143,7 +143,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         r: wp.array2d(dtype=vec3),
     ):
-        """r = 0 on components of the model that have converged: the solve for the others must not move them."""
+        """r = 0 on converged components of the model: the solve for the others must not move them."""
         world, slot = wp.tid()
         if active[world] != 0 and newton.quiet[world, of_slot[slot]] != 0:
             r[world, slot] = vec3()
@@ -178,7 +178,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin(newton: Newton, ctl: Control):
-        """Set the norm at which the solve ends: by Eisenstat and Walker, but no tighter than Newton's method needs."""
+        """Set the target norm of the solve: Eisenstat and Walker, but no tighter than Newton's method needs."""
         world = wp.tid()
         ctl.active[world] = 0
         ctl.taken[world] = 0
@@ -193,7 +193,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.negative[world] = 0
         ctl.flip[world] = 1 - newton.linear_stress
         strict = newton.strict[world] != 0
-        # a linear prediction must be that of the whole step, too; of other laws it is none so far away
+        # a linear prediction must also cover the whole step; other laws are not linear that far
         whole = newton.mixed[world] == 1 and newton.linear_stress != 0
         ctl.strict[world] = wp.where(strict or whole, 1, 0)
         if not strict:
@@ -202,7 +202,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.seen[world] = f64(0.0)
         ctl.target[world] = forced(newton, world, norm)
         if ctl.strict[world] != 0:
-            # a residual of rough roundings hides the smooth error: its norm is no guide to when that is found
+            # round-off in the residual hides the smooth error: its norm is no stopping criterion
             ctl.target[world] = f64(0.0)
         if ctl.total[world] >= ctl.max_work:
             return  # the step is given up, see `begin_search`
@@ -217,13 +217,13 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
                 ctl.active[world] = 1
                 wp.atomic_max(ctl.any_active, 0, 1)
         elif strict:
-            ctl.negative[world] = 1  # a preconditioner that is not positive finds no error
+            ctl.negative[world] = 1  # no error estimate with an indefinite preconditioner
 
     @wp.kernel(module=module)
     def first_direction(
         ctl: Control, z: wp.array2d(dtype=vec3), p_out: wp.array2d(dtype=vec3), x: wp.array2d(dtype=vec3)
     ):
-        """p = z, or x += z where that is the solution."""
+        """p = z, or x += z if z is the solution."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             p_out[world, slot] = z[world, slot]
@@ -240,8 +240,8 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     ):
         """x += alpha p, r -= alpha H p with alpha = r.z / p.H p.
 
-        A direction of no positive curvature ends the solve: it is taken in full if it is the first, else not at all;
-        with `flip` as far as the same curvature, were it positive, would have it: it leads off a saddle.
+        A direction without positive curvature ends the solve: followed in full if it is the first, else not at all;
+        with `flip` by the step of the absolute curvature, which leads away from a saddle.
         """
         world, slot = wp.tid()
         if world == 0 and slot == 0:
@@ -267,7 +267,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def new_direction(ctl: Control, z: wp.array2d(dtype=vec3), p_out: wp.array2d(dtype=vec3)):
-        """p = z + beta p with beta = (r.z)_new / (r.z)_old; the first thread of a world decides whether to go on."""
+        """p = z + beta p with beta = (r.z)_new / (r.z)_old; the first thread of a world decides whether to continue."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
@@ -293,7 +293,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             if more and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
                 wp.atomic_max(ctl.any_active, 0, 1)
             else:
-                ctl.active[world] = 0  # threads that see this at once leave p as it was; it is not read again
+                ctl.active[world] = 0  # threads that see this at once leave p unchanged; it is not read again
 
     @wp.kernel(module=module)
     def group_partial(
@@ -319,7 +319,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         velocity: wp.array2d(dtype=vec3),
     ):
-        """c = (Z^T H Z)^-1 Z^T r; a translation meets no stiffness, so Z^T H Z is c_M times the mass of a group."""
+        """c = (Z^T H Z)^-1 Z^T r; a free translation has no stiffness, so Z^T H Z is c_M times the mass of a group."""
         world, group = wp.tid()
         if active[world] == 0:
             return

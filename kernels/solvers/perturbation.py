@@ -1,7 +1,7 @@
-"""Residuals at positions perturbed by roundings, whose mean tells the error that rounding leaves.
+"""Residuals at randomly rounded positions; their mean yields the error due to round-off.
 
-Stochastic arithmetic in the manner of CESTAC (Vignes 1993, Mathematics and Computers in Simulation 35, 233-261): in
-each sample rounding is another, as the bits of the positions are.
+Stochastic arithmetic in the manner of CESTAC (Vignes 1993, Mathematics and Computers in Simulation 35, 233-261): each
+sample perturbs the bits of the positions and so has different round-off.
 """
 
 import functools
@@ -16,11 +16,11 @@ from .control import control_struct
 __all__ = ["SAMPLES", "SCATTER", "perturbation_kernels"]
 
 SAMPLES, SHARE = 4, 0.25
-"""Evaluations, and the weight of each."""
+"""Number of evaluations, and the weight of each."""
 SCATTER = 2.0
-"""Factor on a displacement that the mean of so many residuals tells: it scatters by half of what rounding leaves."""
+"""Factor on a displacement estimated from the mean residual: its scatter is half of the round-off error."""
 MOST = 3
-"""Roundings of a component by which it is moved at most."""
+"""Largest perturbation of a component, in roundings."""
 
 
 @functools.cache
@@ -37,9 +37,9 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     def begin_samples(
         ctl: Control, flags: wp.array(dtype=wp.int32), moved: wp.array2d(dtype=vec3), total: wp.array2d(dtype=vec3)
     ):
-        """Flag the worlds whose next solve tells an error; clear both sums there."""
+        """Flag the worlds whose next solve estimates the error; clear both sums there."""
         world, slot = wp.tid()
-        asks = ctl.active[world] != 0 and ctl.strict[world] == 1  # one that ended since keeps its positions
+        asks = ctl.active[world] != 0 and ctl.strict[world] == 1  # finished worlds keep their positions
         if slot == 0:
             flags[world] = wp.where(asks, 1, 0)
         if asks:
@@ -51,7 +51,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
         ctl: Control, flags: wp.array(dtype=wp.int32), sample: int, u: wp.array2d(dtype=vec3),
         moved: wp.array2d(dtype=vec3),
     ):  # fmt: skip
-        """u += d, up to MOST roundings, others for each slot and sample; moved += d / (dq/dv)."""
+        """u += d, up to MOST roundings, random per slot and sample; moved += d / (dq/dv)."""
         world, slot = wp.tid()
         if flags[world] == 0:
             return

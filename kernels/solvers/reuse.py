@@ -1,9 +1,9 @@
-"""Reuse of a preconditioner, or of the operator's matrix, from an earlier iterate: when it is kept and when remade.
+"""Reuse rule of a preconditioner or operator matrix from an earlier iterate: when to keep it, when to rebuild it.
 
-It is kept until the extra iterations that it causes have cost as much as making it anew: iterations of PCG with a
-preconditioner, of Newton's method with a matrix. The rules count iterations, never time, and their counts are part of
-the state, so that a resumed run takes the same decisions. Below, "the object" is the preconditioner or the matrix, and
-"the place" the displacements that it was made at.
+It is kept until the extra iterations that it causes cost as much as a rebuild: iterations of PCG with a preconditioner,
+of Newton's method with a matrix. The rules count iterations, never time, and their counts are part of the state, so
+that a resumed run takes the same decisions. Below, "the object" is the preconditioner or the matrix, at its
+linearisation point (displacements).
 """
 
 import functools
@@ -19,34 +19,34 @@ from .pcg import pcg_struct
 __all__ = ["reuse_kernels", "reuse_struct"]
 
 DECADES = 3.0
-"""Decades by which the rule expects an iteration of Newton's method to reduce the residual with a new matrix."""
+"""Expected residual reduction of a Newton iteration with a new matrix, in decades."""
 FADE = 0.8
-"""Factor on `pace` where a step begins with a new matrix, so that the rule tries to keep one again after some steps."""
+"""Factor on `pace` when a step begins with a new matrix: the rule retries an old matrix after some steps."""
 AGEING = 0.25
-"""What a solve adds to `excess` where only D, which weights the norms, is kept."""
+"""Increment of `excess` per solve if only D, which weights the norms, is kept."""
 SHARE = 0.3
 """Relative tolerance of a linear solve with a reused matrix, over the reduction by the last Newton iteration."""
 
 
 @functools.cache
 def reuse_struct():
-    """What the rule knows of each world."""
+    """State of the reuse rule, per world."""
 
     @wp.struct
     class ReuseControl:
-        build: wp.array(dtype=wp.int32)  # make the object now
-        moved: wp.array(dtype=wp.int32)  # it is made at this iterate; else again at its old place
-        changed: wp.array(dtype=wp.int32)  # the place has moved since the state last stored it
-        stale: wp.array(dtype=wp.int32)  # 1: the object is not the one of the state; 2: nor is it, but the counts are
-        due: wp.array(dtype=wp.int32)  # make it anew at the next solve
-        mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv that it was made for; negative: never made
+        build: wp.array(dtype=wp.int32)  # build the object now
+        moved: wp.array(dtype=wp.int32)  # 1: build it at this iterate; 0: at its old linearisation point
+        changed: wp.array(dtype=wp.int32)  # the linearisation point has changed since it was stored in the state
+        stale: wp.array(dtype=wp.int32)  # 1: the object is not the state's; 2: nor is it, but its counts are
+        due: wp.array(dtype=wp.int32)  # rebuild it at the next solve
+        mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv of the object; negative: never built
         dq_dv: wp.array(dtype=wp.float64)
-        rate: wp.array(dtype=wp.float64)  # iterations of its first solve (per decade) or step; 0: none yet
-        excess: wp.array(dtype=wp.float64)  # iterations beyond that rate since
-        made_at: wp.array(dtype=wp.int32)  # of a matrix: Newton iteration of this attempt that made it; -1: kept
+        rate: wp.array(dtype=wp.float64)  # iterations of its first solve (per decade) or step; 0: not yet known
+        excess: wp.array(dtype=wp.float64)  # iterations beyond that rate since its first solve
+        made_at: wp.array(dtype=wp.int32)  # matrix: Newton iteration of this attempt that built it; -1: kept
         pace: wp.array(dtype=wp.float64)  # reduction of the residual by a step's first iteration with a kept matrix
         kept: wp.array2d(dtype=wp.float64)  # in the state: due, mass_factor, dq_dv, rate, excess, pace
-        limit: wp.float64  # excess at which making it anew pays
+        limit: wp.float64  # excess at which a rebuild pays
         any_build: wp.array(dtype=wp.int32)
 
     return ReuseControl
@@ -54,7 +54,7 @@ def reuse_struct():
 
 @functools.cache
 def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels of the rule."""
+    """Kernels of the reuse rule."""
     p = precision(dtype)
     vec3 = p.vec3
     f64 = wp.float64
@@ -64,7 +64,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def recall(reuse: Reuse, world: int):
-        """Take the counts from the state, once, after the state was set from elsewhere (reset, checkpoint)."""
+        """Restore the counts from the state, once, after the state was set externally (reset, checkpoint)."""
         if reuse.stale[world] == 1:
             reuse.due[world] = int(reuse.kept[world, 0])
             reuse.mass_factor[world] = reuse.kept[world, 1]
@@ -76,7 +76,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def gain(reduction: f64) -> f64:
-        """Decades by which a reduction makes the residual smaller."""
+        """Reduction of the residual in decades."""
         return -wp.log10(wp.max(reduction, f64(1.0e-30)))
 
     @wp.kernel(module=module)
@@ -87,7 +87,8 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
     ):
-        """Before a solve: decide which worlds make the object, at the iterate if it is due or the step has changed."""
+        """Before a solve: choose the worlds that build the object, at the iterate if it is due or the step has
+        changed."""
         world = wp.tid()
         reuse.build[world] = 0
         reuse.moved[world] = 0
@@ -110,11 +111,11 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def judge_matrix(reuse: Reuse, newton: Newton, keep: int):
-        """Before a solve: decide whether the matrix of this iterate would save Newton's method enough iterations.
+        """Before a solve: decide whether the matrix of this iterate would save enough Newton iterations.
 
-        How many are left with the matrix at hand is estimated from what an iteration with it gained: the last one or,
-        at the start of a step, the first one of the last step that began with a kept matrix (`pace`, which fades).
-        `keep`: 1: the matrix may be kept within a step; 2: from step to step.
+        The number of remaining iterations with the present matrix is estimated from its gain per iteration: that of the
+        last one or, at the start of a step, of the first one of the last step that began with a kept matrix (`pace`,
+        which fades). `keep`: 1: the matrix may be kept within a step; 2: from step to step.
         """
         world = wp.tid()
         if newton.active[world] == 0:
@@ -148,7 +149,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def loosen(reuse: Reuse, newton: Newton):
-        """Loosen the tolerance of a solve with a reused matrix to what an iteration with it can gain."""
+        """Loosen the tolerance of a solve with a reused matrix to the expected gain of an iteration."""
         world = wp.tid()
         newton.reused[world] = 1 - reuse.moved[world]
         if newton.active[world] == 0:
@@ -168,9 +169,9 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
         if newton.mixed[world] != 0:
-            reuse.due[world] = 1  # the state does not hold what it was made from
+            reuse.due[world] = 1  # the state lacks its linearisation point
         made_at = wp.max(reuse.made_at[world], 0)
-        # a step that made it on the way began with another matrix: one iteration more counts for that
+        # a step that rebuilt it midway began with another matrix: count one more iteration
         count = f64(newton.iterations[world] - made_at + wp.min(made_at, 1))
         if reuse.rate[world] == f64(0.0):
             reuse.rate[world] = wp.max(count, f64(1.0))
@@ -183,7 +184,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
     def judge(reuse: Reuse, newton: Newton, pcg: PCG, follows: int):
         """After a solve: count its iterations beyond those of the first solve with this preconditioner.
 
-        `follows`: the preconditioner is always made with the operator's matrix, and only D is kept.
+        `follows`: the preconditioner is always rebuilt with the operator's matrix, and only D is kept.
         """
         world = wp.tid()
         if newton.active[world] == 0 or pcg.iterations[world] == 0:
@@ -202,7 +203,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def commit(reuse: Reuse, accepted: wp.array(dtype=wp.int32)):
-        """After an accepted step: store the counts in the state, unless the step came without a solve."""
+        """After an accepted step: store the counts in the state, unless there was no solve."""
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
@@ -216,23 +217,24 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def mark(flags: wp.array(dtype=wp.int32), reuse: Reuse):
-        """Note that the state of the flagged worlds was set from elsewhere."""
+        """Flag the worlds whose state was set externally."""
         world = wp.tid()
         if flags[world] != 0:
             reuse.stale[world] = 1
 
     @wp.kernel(module=module)
     def renew(flags: wp.array(dtype=wp.int32), reuse: Reuse):
-        """Let the flagged worlds make the object anew before the next solve."""
+        """Request a rebuild before the next solve in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
             reuse.due[world] = 1
 
     @wp.func
     def which(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
-        """What to copy: 1: the iterate to the place; 2: the state's place to it; 3: the place to the state; 0: nothing.
+        """Copy direction: 1: iterate to linearisation point; 2: state to linearisation point; 3: linearisation point to
+        state; 0: none.
 
-        1 and 2 come before a solve, 3 after a step, of which `accepted` has the flags (else it is empty).
+        1 and 2 come before a solve, 3 after a step with the flags `accepted` (else an empty array).
         """
         if accepted.shape[0] > 0:
             return wp.where(accepted[world] != 0 and reuse.changed[world] != 0 and reuse.stale[world] == 0, 3, 0)
@@ -248,7 +250,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         kept: wp.array2d(dtype=vec3),
         place: wp.array2d(dtype=vec3),
     ):
-        """Set the place of the object or, after a step, that of the state; see `which`."""
+        """Copy the displacements of the linearisation point, see `which`."""
         world, slot = wp.tid()
         to = which(reuse, accepted, world)
         if to == 1:
@@ -266,7 +268,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         kept: wp.array2d(dtype=wp.uint32),
         place: wp.array2d(dtype=wp.uint32),
     ):
-        """The same for an array of a term, seen as [world, 32-bit word]."""
+        """`carry_places` for an array of a term, as [world, 32-bit word]."""
         world, word = wp.tid()
         to = which(reuse, accepted, world)
         if to == 1:
@@ -287,7 +289,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         place_gradient: wp.array2d(dtype=wp.vec3d),
         place_stiffness: wp.array2d(dtype=f64),
     ):
-        """As `carry_places`, for the rows of constraints that the object was made with."""
+        """`carry_places` for the rows of constraints of the object."""
         world, row = wp.tid()
         to = which(reuse, accepted, world)
         if to == 1:
@@ -307,7 +309,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def made(reuse: Reuse):
-        """Clear `stale` in the worlds that have made the object."""
+        """Clear `stale` in the worlds that have built the object."""
         world = wp.tid()
         if reuse.build[world] != 0:
             reuse.stale[world] = 0

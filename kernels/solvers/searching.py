@@ -1,4 +1,4 @@
-"""The line search of Newton's method: which trial is taken, and where the next one lies. One thread per world."""
+"""Line search of Newton's method: acceptance of trials and choice of the next step length. One thread per world."""
 
 import types as _types
 
@@ -12,25 +12,26 @@ __all__ = ["NOISE", "TURN", "search_kernels"]
 
 ARMIJO = 1.0e-4
 WOLFE = 0.8
-NOISE = 100.0  # Phi is blind below this many roundings of its parts
+NOISE = 100.0  # roundings of its parts below which changes of Phi are noise
 MAX_SEARCH = 20
 REUSED_SEARCH = 2
 LEAPS = 5
-"""Full steps in a row that may raise Phi: with the stress of the linear prediction in H, a slender body comes to its
-equilibrium over iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
+"""Consecutive full steps that may raise Phi: with the predicted stress in H, a slender body reaches equilibrium over
+iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
 TURN, SHRINK = 0.5, 0.4
-"""Most that such a step turns or stretches an element, and what remains of it when the best iterate was restored."""
-LOST = 10  # solves that lead to no step before the tangent is followed as it is; with 0 soft solids take longer
-GROWN = 30  # doublings of a step along which Phi is concave
-EXCURSIONS = 1  # full steps deep into an obstacle in an attempt: the way back may end where it began
+"""Largest rotation or stretch of an element in such a step, and its reduction factor after restoring the best
+iterate."""
+LOST = 10  # solves without a step after which the exact tangent is used; with 0 soft solids take longer
+GROWN = 30  # maximum doublings of a step along which Phi is concave
+EXCURSIONS = 1  # maximum deep penetrations by full steps in an attempt: the return may end at the start
 KINK, KINKS = 0.5, 8
-"""With contact: where the slope of Phi at a trial is positive and more than this part of that at the iterate, points
-that slipped have turned round, and Phi has a kink before. It is sought by so many trials: a step to its other side has
-the points slip back, and that again, while one that ends near it has them stick."""
+"""Contact: a positive slope of Phi at a trial above KINK times that at the iterate indicates that slipping points have
+reversed and Phi has a kink before. It is located by at most KINKS trials: a step beyond it makes the points slip back,
+again and again, while one that ends near it makes them stick."""
 
 
 def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
-    """Kernels in the module of Newton's, and the function `lost`."""
+    """Kernels in the module of Newton's method, and the function `lost`."""
     f64 = wp.float64
     Control = control_struct()
     stored, walls, midpoint, limited = traits.stored, traits.walls, traits.midpoint, traits.limited
@@ -40,14 +41,14 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.func
     def lost(ctl: Control, world: int) -> bool:
-        """Whether solves with other matrices than the tangent have led nowhere too often, of laws that have a tangent
-        of their own: past a bifurcation it alone knows the way down."""
+        """True if solves with matrices other than the tangent have failed too often, for laws with their own tangent:
+        beyond a bifurcation only the exact tangent gives descent."""
         return ctl.linear_stress == 0 and ctl.rounds[world] - ctl.iterations[world] > LOST
 
     @wp.func
     def watch(ctl: Control, world: int, old_phi: f64, old_norm: f64):
-        """After a full step that raised Phi, or one that followed such: go back to the best iterate where the residual
-        has not halved nor Phi fallen below that of the best one for too long."""
+        """Bookkeeping after a step that raised Phi and the steps that follow it: restore the best iterate if for LEAPS
+        steps neither the residual halved nor Phi fell below its best value."""
         if ctl.leaps[world] == 0:
             ctl.mark[world] = 1
             ctl.best_phi[world] = old_phi
@@ -57,7 +58,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         if wp.static(not midpoint):
             ctl.mixed[world] = 1
         counts = True
-        if wp.static(walls):  # the way back out of an obstacle goes down in Phi all along
+        if wp.static(walls):  # Phi decreases monotonically on the way back out of an obstacle
             counts = ctl.leaps[world] == 0 or not ctl.phi[world] < old_phi
         if counts:
             ctl.leaps[world] = ctl.leaps[world] + 1
@@ -70,7 +71,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def plan_leap(ctl: Control):
-        """Length of a step that may raise Phi: no element turns or stretches by more than the radius."""
+        """Length of a nonmonotone step: the rotation and stretch of elements stay below the trust radius."""
         world = wp.tid()
         if ctl.active[world] != 0 and ctl.wish[world] == 1:
             ctl.wish[world] = 2
@@ -80,7 +81,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.func
     def take(ctl: Control, world: int, stands: bool, leap: bool):
-        """End the search with the trial: its norms, the tolerance of the next solve, convergence.
+        """Accept the trial and end the search: norms, tolerance of the next solve, convergence.
 
         `stands`: the trial is the iterate itself or the best one. `leap`: it may have raised Phi.
         """
@@ -114,7 +115,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
                     ctl.mixed[world] = wp.where(lost(ctl, world), 0, 1)
         ctl.total_iterations[world] = ctl.total_iterations[world] + 1
         ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
-        if ctl.groups > ctl.components:  # the forces of one may dwarf those that are solved for
+        if ctl.groups > ctl.components:  # one group's forces may dwarf those of the unconverged groups
             ratio = ctl.worst[world] / wp.max(old_worst, f64(1.0e-300))
         ctl.reduction[world] = ratio
         eta = f64(0.9) * ratio * ratio
@@ -130,12 +131,12 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.func
     def shorten(ctl: Control, world: int, reused: bool):
-        """Go on with half the step, or end the search; `reused`: the operator is of an earlier iterate."""
+        """Halve the step, or end the search; `reused`: the operator is of an earlier iterate."""
         ctl.wish[world] = 0
         ctl.searches[world] = ctl.searches[world] + 1
         ctl.alpha[world] = f64(0.5) * ctl.alpha[world]
         if reused and ctl.searches[world] > REUSED_SEARCH:
-            # not the iterate is to blame: stand still, and go on with an operator of its own
+            # the reused operator is at fault: keep the iterate and solve with its own operator
             ctl.alpha[world] = f64(0.0)
         if ctl.searches[world] > MAX_SEARCH:
             why = FAIL_LINE_SEARCH
@@ -145,8 +146,8 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.func
     def lengthen(ctl: Control, world: int, good: bool, slope: f64) -> bool:
-        """Double the step where Phi falls ever faster along it, or take the last doubling back where the trial is none:
-        off a saddle, for evaluations in place of solves. Statics, after a solve that met negative curvature."""
+        """Double the step while Phi falls ever faster along it, undo the last doubling if the trial fails: replaces
+        solves near a saddle. Statics, after a solve that met negative curvature."""
         alpha = ctl.alpha[world]
         longer = good and slope <= ctl.slope[world] and ctl.grown[world] >= 0 and ctl.grown[world] < GROWN
         if wp.static(limited):
@@ -162,8 +163,8 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.func
     def between(ctl: Control, world: int, slope: f64) -> f64:
-        """The next length of a search whose trial is on the far side of a kink of Phi, or still steep before it: by
-        the Illinois method on slopes (Dowell and Jarratt 1971)."""
+        """Next step length when the trial is beyond a kink of Phi, or still steep before it: Illinois method on slopes
+        (Dowell and Jarratt 1971)."""
         alpha = ctl.alpha[world]
         low = wp.vec2d(ctl.lower[world])
         high = wp.vec2d(ctl.upper[world])
@@ -181,14 +182,14 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def judge_trial(ctl: Control):
-        """Armijo on Phi while it is not blind, else the sign of the slope; then convergence."""
+        """Armijo test on Phi above its noise, else sign of the slope; then convergence."""
         world = wp.tid()
         if ctl.searching[world] == 0:
             return
         alpha = ctl.alpha[world]
         old_norm = ctl.norm[world]
         old_phi = ctl.phi[world]
-        # forces held in the search are held with their symmetric tangent: Phi is then as curved as H says
+        # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
         bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
         phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
         norm = wp.sqrt(ctl.slot_sums[0, world])
@@ -209,7 +210,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             good = False
         reused = ctl.reused[world] != 0
         if reused and ctl.iterations[world] == 0 and not norm <= f64(0.5) * old_norm:
-            good = False  # a step must not begin worse than with an operator of its own
+            good = False  # a step must not start worse than with its own operator
             ctl.searches[world] = REUSED_SEARCH
         stands = alpha == f64(0.0) or ctl.restoring[world] != 0
         wishes = finite and not (good or stands or reused) and ctl.searches[world] == 0
@@ -217,7 +218,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         wishes = wishes and (ctl.tame[world] == 0 or ctl.mixed[world] == 2)
         if wp.static(walls):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
             wishes = wishes and ctl.refreshed[world] == 0 and ctl.excursions[world] < EXCURSIONS
-        if wp.static(walls and not midpoint):  # sticking sets in where Phi rises again
+        if wp.static(walls and not midpoint):  # sticking begins where Phi rises again
             slope = ctl.slot_sums[6, world] - alpha * bend
             steep = f64(KINK) * wp.abs(ctl.slope[world])
             tries = not (stands or wishes or reused) and ctl.wish[world] == 0 and ctl.searches[world] < KINKS

@@ -78,7 +78,7 @@ def vector_kernels(dtype: str) -> _types.SimpleNamespace:
         best: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
     ):
-        """v = base + alpha p, or the best iterate where that is to be restored."""
+        """v = base + alpha p, or the best iterate if that is to be restored."""
         world, slot = wp.tid()
         if ctl.searching[world] != 0:
             if ctl.restoring[world] != 0:
@@ -93,7 +93,7 @@ def vector_kernels(dtype: str) -> _types.SimpleNamespace:
         base: wp.array2d(dtype=vec3),
         best: wp.array2d(dtype=vec3),
     ):
-        """base = v; before, the best iterate = base where that is marked."""
+        """base = v; before that, best iterate = base in the marked worlds."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             if ctl.mark[world] != 0:
@@ -116,7 +116,7 @@ def vector_kernels(dtype: str) -> _types.SimpleNamespace:
         energy: wp.array3d(dtype=f64),
         sums: wp.array4d(dtype=f64),
     ):
-        """Strided partial sums of FLOOR_ROWS over the slots and elements of a part; empty lists: all there are."""
+        """Strided partial sums of FLOOR_ROWS over the slots and elements of a part; empty lists: all."""
         world, part, lane = wp.tid()
         if ctl.strict[world] != 2:
             return
@@ -165,7 +165,7 @@ def vector_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def any_set(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
-        """out[0] = 1 where any world's flag is set; out must be 0 before."""
+        """out[0] = 1 if any world's flag is set; out must be 0 before."""
         world = wp.tid()
         if flags[world] != 0:
             wp.atomic_max(out, 0, 1)

@@ -1,15 +1,15 @@
-"""Step sizes from an estimate of the local error: what a substep has left in the positions, and what follows from it.
+"""Step size control by an estimate of the local position error of a substep.
 
-The error e of a substep of h, a vector at each place, counts as the rate r = e / max(h, SPREAD pace), with `pace` a
-running mean of the accepted sizes, and enters the running mean m of the rates at its place. It is accepted where
+The error e of a substep h, a vector at each slot, gives the rate r = e / max(h, SPREAD pace), with `pace` the running
+mean of the accepted step sizes, and updates the slot's running mean m of the rates. The substep is accepted if
 
     |m| <= limit and |r| <= CAP limit, or |r| <= limit,    limit = SHARE error size / horizon,
 
-at all places: local errors then add up over the horizon to a share of what was asked. Errors of vibrations change their
-sign and add up to nothing: with their means alone held, a vibration smaller than the error asked for is not resolved.
-Where a velocity jumps, e is of order h however short the substep is: the pace lets it pass. What rounding of the
-displacements may explain does not count, in single precision: at most ROUNDING eps |u| of e, and of the mean of n rates
-1/n of that, for roundings do not add up, and only as far as the rates scatter.
+at all slots: local errors then accumulate over the horizon to a fraction of the requested error. Errors of vibrations
+change sign and do not accumulate: since only their means are bounded, a vibration below the requested error is not
+resolved. At a velocity jump e is of order h for any h: the bound by the pace accepts it. In single precision the
+round-off of displacements is subtracted: at most ROUNDING eps |u| from e, and from the mean of n rates 1/n of that, as
+round-off does not accumulate, and no more than the scatter of the rates.
 """
 
 import functools
@@ -26,54 +26,54 @@ from .control import step_span, step_struct
 __all__ = ["COUNTS", "KEPT", "MAX_LEVEL", "adaptive_kernels", "adaptive_struct"]
 
 KEPT = ("wish", "pace", "seen")
-"""Columns of what the state holds, [world, column]: the size that the next substep should have at most, s, 0 at the
-start; the mean of sizes, s; the substeps that the mean of rates has seen, at most AVERAGE."""
+"""Columns of the control's state, [world, column]: the upper bound of the next substep, s, 0 at the start; mean step
+size, s; number of substeps in the mean of rates, at most AVERAGE."""
 COUNTS = ("substeps", "rejected", "least_h", "largest_h")
-"""Columns of what a step reports: accepted substeps, those refused for their error, least and largest size, s."""
+"""Columns of a step's report: accepted substeps, substeps rejected for their error, smallest and largest size, s."""
 MAX_LEVEL = 26
-"""Halvings of the interval between common instants at most; a float32 time would not tell such steps apart."""
+"""Maximum halvings of the interval between synchronisation times; float32 times would not resolve smaller steps."""
 SHARE = 0.5
-"""Of the error asked for that the estimates may add up to: errors grow on their way to the end."""
+"""Fraction of the requested error that the estimates may accumulate to: errors grow until the end."""
 GROW = 0.7
-"""A step is doubled where its estimate then keeps to this part of the tolerance."""
+"""Fraction of the tolerance below which a doubled step's predicted error allows the doubling."""
 CUT = 3
-"""Halvings of a refused substep at most: where a motion is not smooth, the estimate falls with a lower power of h."""
+"""Maximum halvings of a rejected substep: for nonsmooth motions the estimate falls with a lower power of h."""
 SPREAD = 0.125
-"""Part of the pace that counts. With 1, loads and contacts that set in leave errors of velocity, which grow on."""
+"""Lower bound of the step size in an error rate, over the pace; 1 lets velocity errors from impacts accumulate."""
 START = 0.1
-"""Part of the error asked for that a multistep scheme's first step, of order 1, may have."""
+"""Fraction of the requested error allowed for the first step of a multistep scheme, of order 1."""
 MOST = 65536
-"""Substeps between two common instants at most."""
+"""Maximum number of substeps between two synchronisation times."""
 MEMORY = 256.0
-"""Substeps that the pace looks back over."""
+"""Substeps in the running mean of step sizes."""
 AVERAGE = 16.0
-"""Substeps that the mean of rates looks back over."""
+"""Substeps in the running mean of rates."""
 CAP = 4.0
-"""A rate may be this many times what their mean may be."""
+"""Largest rate, over the bound of their mean."""
 ROUNDING = 2.0
-"""Roundings of the largest displacement that an estimate is off by at most."""
+"""Largest error of an estimate, in roundings of the largest displacement."""
 
 
 @functools.cache
 def adaptive_struct():
-    """What the control of step sizes knows of each world."""
+    """Step size control data of each world."""
 
     @wp.struct
     class AdaptiveControl:
-        flags: wp.array(dtype=wp.int32)  # an estimate is wanted
-        span: wp.array(dtype=wp.float64)  # s, that the error of this attempt counts over
+        flags: wp.array(dtype=wp.int32)  # 1: an estimate is requested
+        span: wp.array(dtype=wp.float64)  # s, time in the error rate of this attempt
         rate: wp.array(dtype=wp.float64)  # largest rate of this attempt, m/s
-        mean: wp.array(dtype=wp.float64)  # largest mean of rates with it, m/s
+        mean: wp.array(dtype=wp.float64)  # largest mean of rates including it, m/s
         scatter: wp.array(dtype=wp.float64)  # largest difference of the two, m/s
         moved: wp.array(dtype=wp.float64)  # largest displacement, m
-        tries: wp.array(dtype=wp.int32)  # refusals in a row that are none of the estimate's
-        work: wp.array(dtype=wp.int32)  # PCG iterations of the substeps before
+        tries: wp.array(dtype=wp.int32)  # consecutive rejections not due to the estimate
+        work: wp.array(dtype=wp.int32)  # PCG iterations of the previous substeps
         kept: wp.array2d(dtype=wp.float64)  # KEPT, in the state
         counts: wp.array2d(dtype=wp.float64)  # COUNTS
-        horizon: wp.array(dtype=wp.float64)  # [1] s, over which errors may add up
+        horizon: wp.array(dtype=wp.float64)  # [1] s, over which errors may accumulate
         first: wp.array(dtype=wp.float64)  # [1] s, size of the first substep
         tolerance: wp.float64  # m
-        eps: wp.float64  # rounding unit of displacements
+        eps: wp.float64  # round-off unit of displacements
         max_tries: wp.int32
 
     return AdaptiveControl
@@ -98,7 +98,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.func
     def refine(step: Step, wish: f64, world: int):
-        """Raise the level until substeps are no longer than the wish."""
+        """Raise the level until substeps are no longer than `wish`."""
         level = step.level[world]
         part = step.part[world]
         h = span_of(step, world) / f64(wp.lshift(1, level))
@@ -111,7 +111,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def open_step(step: Step, ctl: Adaptive):
-        """Begin a step of all running worlds with the size that the state asks for."""
+        """Start the step of all running worlds with the substep size in the state."""
         world = wp.tid()
         for k in range(4):
             ctl.counts[world, k] = f64(0.0)
@@ -138,13 +138,13 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.func
     def rate_of(step: Step, ctl: Adaptive, world: int, v: vec3, v_n: vec3, v_before: vec3) -> vec3:
-        """Local error of a place over the time that it counts over, m/s."""
+        """Local error of a slot over the time span of the rate, m/s."""
         previous = f64(0.0)
         if wp.static(multistep):
             if step.a1[world] > f64(0.0):
                 previous = step.previous_h[world]
         c = estimate(step.h[world], previous)
-        # differences first: the velocities themselves may be large beside them
+        # differences first: the velocities may be much larger
         e = T(c[0]) * (v - v_n)
         if wp.static(multistep):
             e -= T(c[2]) * (v_n - v_before)
@@ -152,13 +152,13 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.func
     def mean_of(ctl: Adaptive, world: int, mean: vec3, rate: vec3) -> vec3:
-        """The running mean with one more rate, m/s."""
+        """Running mean including one more rate, m/s."""
         part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(AVERAGE))
         return mean + T(part) * (rate - mean)
 
     @wp.func
     def size_of(x: vec3) -> f64:
-        """Length; what is no number is large."""
+        """Length; 1e300 if not finite."""
         size = f64(wp.length(x))
         if not wp.isfinite(size):
             size = f64(1.0e300)
@@ -176,9 +176,9 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         v_before: wp.array2d(dtype=vec3),
         means: wp.array2d(dtype=vec3),
     ):
-        """Largest rate, mean of rates and displacement of a free place. A maximum does not depend on the order.
+        """Largest rate, mean of rates and displacement over free slots. The maximum is independent of the order.
 
-        `arm`: what an unknown moves by 1, m: 1 of positions, half the section of gradients across it, else 0.
+        `arm`: lever arm of an unknown, m: 1 for positions, half the section for gradients across it, else 0.
         """
         world, slot = wp.tid()
         if ctl.flags[world] == 0 or arm[slot] == T(0.0):
@@ -193,7 +193,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.func
     def starts(step: Step, world: int) -> int:
-        """Whether the substep is a multistep scheme's first, of order 1."""
+        """1 if the substep is a multistep scheme's first, of order 1."""
         if wp.static(multistep):
             if step.a1[world] == f64(0.0):
                 return 1
@@ -208,7 +208,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         v_before: wp.array2d(dtype=vec3),
         means: wp.array2d(dtype=vec3),
     ):
-        """Take the rate of an accepted substep into the mean, which begins after one of order 1."""
+        """Update the mean with the rate of an accepted substep; reset it after a substep of order 1."""
         world, slot = wp.tid()
         if step.accepted[world] == 0:
             return
@@ -228,7 +228,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def judge(step: Step, newton: Newton, pcg: PCG, ctl: Adaptive):
-        """Refuse a substep whose error is too large; find the size of the next."""
+        """Reject a substep with too large an error; choose the size of the next."""
         world = wp.tid()
         if step.running[world] == 0:
             return
@@ -237,7 +237,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
             ctl.kept[world, 0] = f64(0.5) * h
             ctl.tries[world] = ctl.tries[world] + 1
             if ctl.tries[world] > ctl.max_tries:
-                step.level[world] = MAX_LEVEL  # it is the last
+                step.level[world] = MAX_LEVEL  # no more halvings
             return
         pace = ctl.kept[world, 1]
         span = ctl.span[world]
@@ -258,7 +258,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
             newton.failed[world] = FAIL_ERROR
             ctl.counts[world, 1] = ctl.counts[world, 1] + f64(1.0)
             if ctl.counts[world, 0] + ctl.counts[world, 1] > f64(MOST):
-                step.level[world] = MAX_LEVEL  # it is the last
+                step.level[world] = MAX_LEVEL  # no more halvings
             wish = f64(0.5) * h
             half = f64(1.0) / power(f64(2.0), n)
             ratio = ratio * half
@@ -285,9 +285,9 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def settle(step: Step, ctl: Adaptive):
-        """After an attempt: what is kept, and substeps no longer than the wish.
+        """After an attempt: update the count of rates, refine the substeps to at most the bound.
 
-        The state to go back to is that of the step's start.
+        A rejected step returns to the state at its start.
         """
         world = wp.tid()
         step.first_refusal[world] = 0
@@ -299,7 +299,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def close_step(pcg: PCG, ctl: Adaptive):
-        """Iterations of all substeps, for the report."""
+        """PCG iterations of all substeps, for the report."""
         world = wp.tid()
         pcg.total[world] = pcg.total[world] + ctl.work[world]
 

@@ -1,6 +1,6 @@
-"""From element contributions to slots: the residual of a step Eq. (17), the product H p, the diagonal blocks.
+"""Assembly of element contributions on slots: the residual of a step Eq. (17), the product H p, the diagonal blocks.
 
-Contributions are gathered per slot in a fixed order instead of added atomically: reproducible, and faster.
+Contributions are gathered per slot in a fixed order, not added atomically: reproducible, and faster.
 """
 
 import functools
@@ -19,19 +19,19 @@ __all__ = ["RESIDUAL_ROWS", "gather_kernels"]
 
 RESIDUAL_ROWS = 11
 """Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
-part of Phi and its magnitude; g.p with non-potential forces held; what Phi changes by when they are refreshed; the
-squared norm of the rounding of the positions; |g|^2; v~.M v~ c_M / 2."""
+part of Phi and its magnitude; g.p with non-conservative forces frozen; change of Phi by their update; squared norm of
+the position round-off; |g|^2; v~.M v~ c_M / 2."""
 
 
 SUM_BLOCKS = {"float64": 6, "float32": 8}
-"""Blocks of 256 threads of `with_mass_sum` that registers must leave room for: it waits for memory most of the time."""
+"""Minimum resident blocks of 256 threads of `with_mass_sum` (register limit): the kernel is memory-latency bound."""
 REACTION = wp.constant(wp.float64(1.0e-6))
-"""Share of the squared reactions in the squared scale of the residual."""
+"""Fraction of the squared reactions in the squared scale of the residual."""
 
 
 @functools.cache
 def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """Kernels over slots. Of the traits "nonpotential", "tangent", "pooled", "ties" and "midpoint" count."""
+    """Kernels over slots; they depend on the traits "nonpotential", "tangent", "pooled", "ties" and "midpoint"."""
     nonpotential, tangent, pooled, ties = traits.nonpotential, traits.tangent, traits.pooled, traits.ties
     midpoint = traits.midpoint
     p = precision(dtype)
@@ -59,9 +59,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def spread(balance: Balance, free: vec3, D: vec3, world: int, slot: int) -> f64:
-        """Squared D norm of the velocity that makes all of u: times eps^2, what its rounding does to the residual.
+        """Squared D norm of the velocity u/(dq/dv): times eps^2, the residual due to round-off of u.
 
-        Where u = q~ + (dq/dv) v is a small difference, that of its parts.
+        If u = q~ + (dq/dv) v is a small difference, v sets the round-off.
         """
         u = balance.u[world, slot]
         v = balance.v[world, slot]
@@ -73,7 +73,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def constraint_forces(con: Constraints, mul: Multipliers, world: int, slot: int) -> wp.mat33d:
-        """J^T of the trial's lambda, of rho c, and of the held lambda + rho c, as rows."""
+        """J^T of the trial's lambda, of rho c, and of the frozen lambda + rho c, as rows."""
         tie = wp.vec3d()
         squeeze = wp.vec3d()
         merit = wp.vec3d()
@@ -104,7 +104,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def sought(balance: Balance, world: int, slot: int) -> vec3:
-        """What the Newton step is solved for."""
+        """Gradient on the right side of the Newton step."""
         if wp.static(ties):
             return balance.gradient[world, slot]
         else:
@@ -112,7 +112,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def square(a: vec3) -> f64:
-        """a.a, of forces that float32 can't hold the square of."""
+        """a.a in float64, for forces whose square overflows float32."""
         s = f64(0.0)
         for k in range(3):
             s += f64(a[k]) * f64(a[k])
@@ -142,7 +142,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     ):
         """Eq. (17): g = M (v - v~) c_M + f_int - f_dead - f_nonpotential + J^T lambda, and the rows of `RESIDUAL_ROWS`.
 
-        `gradient` is that of the augmented potential, g + J^T rho c, which the next Newton step is solved for.
+        `gradient` is that of the augmented potential, g + J^T rho c, the right side of the next Newton step.
         """
         world, slot = wp.tid()
         if active[world] == 0:
@@ -177,7 +177,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             descent += vec3(tie[2])
             for k in range(3):
                 magnitude[k] = magnitude[k] + T(wp.abs(tie[0][k]))
-        if wp.static(pooled):  # what a body is squeezed between cancels its own forces: each alone is a scale
+        if wp.static(pooled):  # opposing contact forces on a body cancel: each sets a scale by itself
             for k in range(3):
                 magnitude[k] = magnitude[k] + wp.abs(of_pool[k])
         balance.inertia[world, slot] = a
@@ -189,13 +189,13 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         kinetic = T(0.5) * wp.dot(vs - balance.v_tilde[world, slot], a)
         work = wp.dot(held, vs)
         balance.rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
-        # a held, stressed body without loads has no other force than its reactions: a small part of them is its scale
+        # a prestressed body without loads has only reactions: a small fraction of them is its scale
         reaction = own - wp.cw_mul(own, free)
         balance.rows[1, world, slot] = weighted(wp.cw_mul(own, free), D) + REACTION * weighted(reaction, D)
         balance.rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
         balance.rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
         balance.rows[4, world, slot] = f64(kinetic - work)
-        if wp.static(midpoint):  # there is no Phi: half of the square of what the Newton step is solved for
+        if wp.static(midpoint):  # Phi does not exist: half of the squared gradient replaces it
             balance.rows[4, world, slot] = f64(0.5) * weighted(wp.cw_mul(sought(balance, world, slot), free), D)
         balance.rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
         balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
@@ -211,7 +211,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def pool_range(more: Additions, slot: int) -> wp.vec2i:
-        """Entries of the pool that a slot has; read early, for a load that nothing waits for costs nothing."""
+        """Pool entries of a slot; loaded early to hide the latency."""
         out = wp.vec2i()
         if wp.static(pooled):
             out = wp.vec2i(more.pool_start[slot], more.pool_start[slot + 1])
@@ -230,7 +230,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         slot: int,
         result: wp.array2d(dtype=vec3),
     ) -> f64:
-        """H p on the free components: what terms add to the elements' part included. Returns p.Hp."""
+        """H p on the free components: adds the terms' part to the elements' part. Returns p.Hp."""
         out = h
         if wp.static(tangent):
             f = vec3()
@@ -257,7 +257,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.func
     def share_of_warp(share: f64, index: int, warp: int, world: int, rows: wp.array3d(dtype=f64)):
-        """p.Hp of a warp's rows."""
+        """Store the sum of p.Hp over a warp's rows."""
         total = row_sum(share, warp)
         if index % warp == 0:
             rows[0, world, index / warp] = total
@@ -302,7 +302,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """The same from contributions that hold the mass and the factors."""
+        """H p from contributions that include the mass and the factors."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
@@ -327,7 +327,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         out: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """The same with the elements' part and the mass as one matrix, so many lanes per row."""
+        """H p with the elements' part and the mass as one matrix, `lanes` threads per row."""
         world, index = wp.tid()
         if active[world] == 0:
             return

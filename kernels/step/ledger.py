@@ -1,4 +1,4 @@
-"""The energy ledger of a step: what was stored, lost, and done by loads, supports and fields."""
+"""Energy ledger of a step: stored energy, losses, and work of loads, supports and fields."""
 
 import functools
 import types as _types
@@ -37,22 +37,23 @@ LEDGER = (
 """Columns of the energy ledger, J, accumulated since the start (the first three: current values); terms add theirs."""
 
 STORED, WORK, LOSS, NUMERICAL, HELD_VISCOUS = range(5)
-"""What a term books per substep: what it stores now; work done on the model; loss; a part of the integrator's; viscous
-loss of a force that counts among the dead loads."""
+"""Kinds of energy increments of a term per substep: stored energy (current value); work on the model; loss; integrator
+part; viscous loss of a force among the dead loads."""
 
 LEDGER_ROWS = 10
 SETTLING = 8.0
-"""Substeps whose energy is not watched: beside what a motion that sets in has by then, no step resolves it."""
+"""Initial substeps excluded from the energy monitor: relative to the small energy at the onset of a motion, no step
+resolves it."""
 
 
 @functools.cache
 def booked_struct():
-    """What terms book of a substep."""
+    """Energy increments of terms in a substep."""
 
     @wp.struct
     class Booked:
         kind: wp.array(dtype=wp.int32)  # [row] STORED, WORK, ...
-        nonpotential: wp.array(dtype=wp.int32)  # [row] 1: of a force whose work is among that of fields
+        nonpotential: wp.array(dtype=wp.int32)  # [row] 1: of a force whose work is counted as that of fields
         column: wp.array(dtype=wp.int32)  # [row] of the ledger, -1: none
         sums: wp.array2d(dtype=wp.float64)  # [row, world] J
 
@@ -63,7 +64,7 @@ def booked_struct():
 def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Module) -> _types.SimpleNamespace:
     """Kernels of the energy ledger, in the module of the step's; arguments as those of `step_kernels`.
 
-    `chord`: the inertia's part of the integrator's work is its work along the chord less the change of kinetic energy.
+    `chord`: the inertia's part of the integrator work is its work along the chord less the change of kinetic energy.
     """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -76,15 +77,15 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
 
     @wp.func
     def watch(step: Step, world: int, before: f64, energy: f64, turnover: f64, added: f64):
-        """Net energy that the integrator and residuals have added, over the largest stored plus the sum of |work|.
+        """Net energy added by the integrator and by residuals, over the peak energy plus the sum of |work|.
 
-        Net, for schemes of order 2 exchange energy with the motion to and fro; and not in the first steps from rest,
-        nor in those after work that exceeds all energy so far.
+        Net, since second-order schemes exchange energy with the motion periodically; excluding the first steps from
+        rest and those after work that exceeds all energy so far.
         """
         largest = wp.max(wp.max(step.growth[world, 1], step.least_energy[world]), before)
         turned = step.growth[world, 2] + turnover
         steps = step.growth[world, 5] + f64(1.0)
-        if step.growth[world, 1] == f64(0.0) and before > f64(0.5) * energy:  # it moves already
+        if step.growth[world, 1] == f64(0.0) and before > f64(0.5) * energy:  # already in motion
             steps = f64(SETTLING) + f64(1.0)
             step.growth[world, 6] = before
         if turned > step.growth[world, 6]:
@@ -148,10 +149,10 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         booked: Booked,
         ledger: wp.array2d(dtype=f64),
     ):
-        """Add a substep to the ledger; the integrator's part from its own formula, never as the remainder.
+        """Add a substep to the ledger; the integrator part by its own formula, never as the remainder.
 
-        The force of a term does the work f.dq on a substep. What it stores and loses of that is booked; the rest is the
-        integrator's, and of a force without a potential the work of fields.
+        The force of a term does the work f.dq on a substep. Its stored energy and loss are booked; the remainder is the
+        integrator's, or for a non-conservative force the work of fields.
         """
         world = wp.tid()
         if step.accepted[world] == 0:
@@ -218,7 +219,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         ledger[world, 9] = ledger[world, 9] + sums[6, world]
         if step.watched != 0:
             turnover += wp.abs(loads) + wp.abs(sums[4, world]) + wp.abs(fields) + wp.abs(viscous)
-            # stiff damping moves energy from `numerical` to `viscous`; `balance` is the work of accepted residuals
+            # stiff damping: an excess of `viscous` cancels a deficit of `numerical`; `balance`: work of residuals
             added = step.counted * balance - (numerical + viscous)
             watch(step, world, energy - (change_K + change_W + stored), energy, turnover, added)
 

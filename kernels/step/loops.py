@@ -1,4 +1,4 @@
-"""What loops of learning need on the device: ends of episodes, what steps add up to, chosen worlds, observations."""
+"""Episodes of reinforcement learning on the device: ends, run statistics, masked copies, observations."""
 
 import functools
 import math
@@ -12,7 +12,7 @@ from .control import REPORT, SAME_TIME, STATUS
 __all__ = ["MOTION", "TALLY", "VALUES", "loop_kernels", "observation_kernels"]
 
 TALLY = ("newton", "pcg", "rough", "floored", "residual", "floor", "violation", "energy_growth", "min_J")
-"""Columns of what steps add up to: sums, then largest values, then the smallest."""
+"""Columns of the run statistics: sums, then maxima, then minima."""
 LARGEST = 8
 MOTION = {"position": 0, "displacement": 1, "velocity": 2}
 """Kinds of observed vectors."""
@@ -23,7 +23,7 @@ VALUES = {"length": 0, "travel": 1, "angle": 2}
 
 @functools.cache
 def loop_kernels() -> _types.SimpleNamespace:
-    """Kernels of one thread per world."""
+    """Kernels with one thread per world."""
     f64 = wp.float64
     module = kernel_module("loops", light=True)
     column = {name: REPORT.index(name) for name in REPORT}
@@ -33,14 +33,14 @@ def loop_kernels() -> _types.SimpleNamespace:
     def end_episodes(
         time: wp.array(dtype=f64), t_end: wp.array(dtype=f64), dt: wp.array(dtype=f64), status: wp.array(dtype=wp.int32)
     ):
-        """Freeze the worlds that are at their end."""
+        """Freeze the worlds that have reached their end time."""
         world = wp.tid()
         if status[world] == wp.static(running) and time[world] >= t_end[world] - f64(SAME_TIME) * dt[world]:
             status[world] = wp.static(STATUS["frozen"])
 
     @wp.kernel(module=module)
     def tally(report: wp.array2d(dtype=f64), sums: wp.array2d(dtype=f64), stepped: wp.array(dtype=wp.int32)):
-        """Add a step to what steps add up to."""
+        """Add a step to the run statistics."""
         world = wp.tid()
         status = wp.int32(report[world, wp.static(column["status"])])
         sums[world, 0] += report[world, wp.static(column["newton"])]
@@ -61,20 +61,20 @@ def loop_kernels() -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def clear_tally(sums: wp.array2d(dtype=f64)):
-        """Begin anew."""
+        """Reset the run statistics."""
         world, k = wp.tid()
         sums[world, k] = wp.where(k < wp.static(LARGEST), f64(0.0), f64(wp.inf))
 
     @wp.kernel(module=module)
     def copy_chosen(flags: wp.array(dtype=wp.int32), source: wp.array(dtype=f64), target: wp.array(dtype=f64)):
-        """Copy a number of the flagged worlds."""
+        """Copy a number in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
             target[world] = source[world]
 
     @wp.kernel(module=module)
     def clear_chosen(flags: wp.array(dtype=wp.int32), target: wp.array(dtype=wp.int32)):
-        """Clear a flag of the flagged worlds."""
+        """Clear a flag in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
             target[world] = 0
@@ -117,7 +117,7 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
         source: wp.array(dtype=wp.int32), column: wp.array(dtype=wp.int32), report: wp.array2d(dtype=f64),
         stepped: wp.array(dtype=wp.int32), out: wp.array2d(dtype=T),
     ):  # fmt: skip
-        """Columns of the report of the last step; 0 where there is none."""
+        """Columns of the report of the last step; 0 without a step."""
         world, k = wp.tid()
         out[world, column[k]] = wp.where(stepped[world] != 0, T(report[world, source[k]]), T(0.0))
 
@@ -126,7 +126,7 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
         start: wp.array(dtype=wp.int32), slot: wp.array(dtype=wp.int32), weight: wp.array(dtype=f64),
         place: wp.array(dtype=vec3d), u: wp.array2d(dtype=vec3), world: int, k: int,
     ) -> vec3d:  # fmt: skip
-        """A vector of a joint: what it is in the reference, and the sum of w_i u_i."""
+        """Current vector of a joint: its reference value plus the sum of w_i u_i."""
         x = place[k]
         for i in range(start[k], start[k + 1]):
             x += weight[i] * vec3d(u[world, slot[i]])
@@ -139,7 +139,7 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
         column: wp.array(dtype=wp.int32), u: wp.array2d(dtype=vec3), target: wp.array2d(dtype=f64),
         out: wp.array2d(dtype=T),
     ):  # fmt: skip
-        """Lengths, travels and angles from three vectors each; `row`: of a drive whose full turns count, or -1."""
+        """Lengths, travels and angles from three vectors each; `row`: of a drive with multiple turns, or -1."""
         world, k = wp.tid()
         a = present(start, slot, weight, place, u, world, 3 * k)
         b = present(start, slot, weight, place, u, world, 3 * k + 1)
@@ -156,7 +156,7 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def numbers(values: wp.array(dtype=f64), column: int, out: wp.array2d(dtype=T)):
-        """A number of each world."""
+        """Copy of a number of each world."""
         world = wp.tid()
         out[world, column] = T(values[world])
 

@@ -1,8 +1,7 @@
-"""The predictor: the first iterate of a step, extrapolated from the velocities of the steps before.
+"""Predictor: the first iterate of a step, extrapolated from the velocities of previous steps.
 
-It is v_n (order 0), 2 v_n - v_{n-1} (order 1) or 3 v_n - 3 v_{n-1} + v_{n-2} (order 2): the one that would have been
-nearest to the result of the last step. Smooth motions need a third fewer PCG iterations for it, and others as many as
-with v_n.
+It is v_n (order 0), 2 v_n - v_{n-1} (order 1) or 3 v_n - 3 v_{n-1} + v_{n-2} (order 2): the order that would have been
+the best for the last step. It saves a third of the PCG iterations in smooth motions, and costs none in others.
 """
 
 import functools
@@ -19,21 +18,21 @@ __all__ = ["PREDICTOR_ROWS", "predictor_kernels", "predictor_struct"]
 PREDICTOR_ROWS = 4
 """Rows of `compare` that are summed per world."""
 BETTER = 0.05
-"""A higher order is chosen where its squared error is below this share of the lower order's."""
+"""Squared error ratio to the lower order below which a higher order is chosen."""
 ROUNDINGS = 1.0e3
-"""Errors below this many roundings of the velocity count as none."""
+"""Errors below this many roundings of the velocity are negligible."""
 
 
 @functools.cache
 def predictor_struct():
-    """What the predictor knows of the steps before, per world."""
+    """Velocity history of the predictor, per world."""
 
     @wp.struct
     class PredictorControl:
-        order: wp.array(dtype=wp.int32)  # that this attempt begins with
-        count: wp.array(dtype=wp.int32)  # earlier velocities known, of steps of the same size; at most 2
+        order: wp.array(dtype=wp.int32)  # order of this attempt
+        count: wp.array(dtype=wp.int32)  # available earlier velocities, from steps of equal size; at most 2
         kept: wp.array2d(dtype=wp.float64)  # in the state: next order and count, size and end of the last step
-        sums: wp.array2d(dtype=wp.float64)  # squared errors that orders 0, 1, 2 would have had; the velocity's square
+        sums: wp.array2d(dtype=wp.float64)  # squared errors of orders 0, 1, 2 in the last step; squared velocity
 
     return PredictorControl
 
@@ -49,14 +48,14 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
 
     @wp.func
     def continued(order: int, v: vec3, before: vec3, first: vec3) -> vec3:
-        """Extrapolation of order 1 or 2 from the velocities of one, two and three steps ago, m/s."""
+        """Extrapolation of order 1 or 2 from the velocities of the last three steps, m/s."""
         if order == 2:
             return T(3.0) * (v - before) + first
         return T(2.0) * v - before
 
     @wp.kernel(module=module)
     def begin(predictor: Predictor, step: Step, newton: Newton):
-        """Choose the order: that of the state, if its last step had this size and ended where the attempt starts."""
+        """Choose the order: that of the state, if its last step had this size and ended at the start of the attempt."""
         world = wp.tid()
         predictor.order[world] = 0
         predictor.count[world] = 0
@@ -78,7 +77,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         first: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
     ):
-        """Set the first iterate on free components where the order is above 0; else it stays v_n."""
+        """Extrapolated first iterate on free components if the order is above 0; else v_n is kept."""
         world, slot = wp.tid()
         order = predictor.order[world]
         if step.running[world] == 0 or order == 0:
@@ -104,9 +103,9 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         first: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
     ):
-        """Squared errors that the orders would have had in an accepted step, in the norm of D.
+        """Squared errors of the orders in an accepted step, in the norm of D.
 
-        Rows 0 to 2: the orders; row 3: the square of the velocity.
+        Rows 0 to 2: the orders; row 3: the squared velocity.
         """
         world, slot = wp.tid()
         if step.accepted[world] == 0:
@@ -118,7 +117,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         if wp.static(accelerated):
             fall = (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         e = w - a - fall
-        if step.a1[world] > f64(0.0):  # a multistep scheme extrapolates linearly already
+        if step.a1[world] > f64(0.0):  # a multistep scheme already extrapolates linearly
             e = w - continued(1, a, before[world, slot], first[world, slot])
         rows[0, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
         for order in range(1, 3):
@@ -134,7 +133,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         before: wp.array2d(dtype=vec3),
         first: wp.array2d(dtype=vec3),
     ):
-        """Move the stored velocities on by a step; `own`: v_{n-1} too, which multistep schemes store themselves."""
+        """Shift the stored velocities by a step; `own`: v_{n-1} too, which multistep schemes store themselves."""
         world, slot = wp.tid()
         if step.accepted[world] != 0:
             first[world, slot] = before[world, slot]
@@ -143,7 +142,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
 
     @wp.kernel(module=module)
     def learn(predictor: Predictor, step: Step):
-        """Choose the order for the next step: the smallest error wins, higher orders by a margin."""
+        """Order of the next step: the smallest error, with a margin for higher orders."""
         world = wp.tid()
         if step.accepted[world] == 0:
             return
@@ -151,7 +150,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         best = int(0)  # noqa: RUF046 - a variable of the loop
         least = f64(BETTER) * predictor.sums[0, world]
         if predictor.sums[0, world] <= f64(NOISE) * predictor.sums[3, world]:
-            least = f64(0.0)  # extrapolated rounding errors would grow from step to step
+            least = f64(0.0)  # extrapolated round-off would grow from step to step
         for order in range(1, 3):
             if order <= count and predictor.sums[order, world] < least:
                 best = order

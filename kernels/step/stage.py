@@ -1,4 +1,4 @@
-"""The middle of a step, where the conserving scheme takes its forces."""
+"""Midpoint of a step, where the conserving scheme evaluates its forces."""
 
 import functools
 import types as _types
@@ -27,7 +27,7 @@ def stage_kernels(dtype: str) -> _types.SimpleNamespace:
         u_stage: wp.array2d(dtype=vec3),
         v_stage: wp.array2d(dtype=vec3),
     ):
-        """Half of what u changes by, (dq/dv) (v_n + v)/2, and u half-way, m; without subtracting places."""
+        """Half of the change of u, (dq/dv) (v_n + v)/2, and u at the midpoint, m; without differences of positions."""
         world, slot = wp.tid()
         if active[world] != 0:
             half = (T(0.5) * T(dq_dv[world])) * (v_n[world, slot] + v[world, slot])

@@ -1,7 +1,7 @@
-"""The step itself: time levels, predictor, acceptance, energy ledger, report.
+"""Step control: time levels, predictor, acceptance, energy ledger, report.
 
-A step of dt, or of what is left to the end, is walked in substeps of dt / 2^level. A refused substep raises the level
-by one; after an accepted one the level falls again as soon as the position is even, so that time stays an exact binary
+A step of dt, or of the remainder to the end, consists of substeps of dt / 2^level. A refused substep raises the level
+by one; after an accepted one the level decreases as soon as the position is even, so that time stays an exact binary
 fraction of dt.
 """
 
@@ -21,11 +21,11 @@ from .ledger import ledger_kernels
 __all__ = ["step_kernels"]
 
 FULL = 1e-9
-"""Part of the load that may lack where all of it counts as acting."""
+"""Tolerance of the load factor at full load."""
 LARGEST_GROWTH = {"float64": 1e9, "float32": 1e4}
-"""Growth of a step up to which a multistep scheme takes the step before: its differences are rounding beyond."""
+"""Largest step ratio for which a multistep scheme uses the previous step: beyond, its differences are round-off."""
 STRETCH = 4.0
-"""Largest growth of a step that accelerations are extrapolated for: after many halvings they are those of an event."""
+"""Largest step ratio for the extrapolation of accelerations: after many halvings they belong to a short event."""
 
 
 @functools.cache
@@ -35,10 +35,10 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     Args:
         dtype: precision of the vectors.
         scheme: the time discretisation, with `coefficients`, a wp.func (h, previous h, parameter) -> Coefficients, and
-            what its kernels are specialised for: static (no inertia, v is the displacement increment), multistep (it
-            uses the step before the last), takes_velocity (q~ takes v_n), accelerated (it keeps accelerations: a_n and
-            w_n stand in place of the state before the last), midpoint (forces of the middle), variant (their name).
-        traits: of the model; "nonpotential" and "gated" count.
+            the specialisation of its kernels: static (no inertia, v is the displacement increment), multistep (uses the
+            state before the last), takes_velocity (v_n in q~), accelerated (with accelerations: a_n and w_n replace the
+            state before the last), midpoint (forces at the midpoint), variant (their name).
+        traits: of the model; depends on "nonpotential" and "gated".
     """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -56,7 +56,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
-        """Open a step of the worlds that run and are not at their end; refuse it where energy has grown."""
+        """Start a step in the running worlds before their end; refuse it after spurious energy growth."""
         world = wp.tid()
         time = step.time[world]
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
@@ -101,7 +101,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         newton.suspect[world] = 0
         newton.turned[world] = 0
         if step.running[world] == 0:
-            return  # `refused` keeps the verdict of a world that failed earlier in this step
+            return  # `refused` stays set in a world that failed earlier in this step
         step.refused[world] = 0
         newton.failed[world] = 0
         newton.iterations[world] = 0
@@ -114,7 +114,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.stage_time[world] = step.new_time[world] - f64(0.5) * h
         previous = f64(0.0)
         if wp.static(multistep):
-            # a state that was set, reset or advanced by another scheme since has no past
+            # a state that was set, reset or advanced by another scheme has no history
             known = step.previous_end[world] == step.time[world]
             if known and h <= f64(GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
@@ -151,10 +151,10 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         v_tilde: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
     ):
-        """q~, v~ and the first iterate; a clamped component keeps its place.
+        """q~, v~ and the first iterate; prescribed components keep their positions.
 
-        The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) where the step before is known: its error is
-        of the second order in h then, which a stiff rotating body needs. With accelerations it is v_n + h g.
+        The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) if the previous step is known: its error is
+        then of second order in h, as stiff rotating bodies require. With accelerations it is v_n + h g.
         """
         world, slot = wp.tid()
         if step.running[world] == 0:
@@ -185,7 +185,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
                 fall = T(f64(1.0) / step.mass_factor[world])
             first = w + (fall * is_position[slot]) * vec3(step.gravity[world])
             if wp.static(multistep):
-                if step.a1[world] > f64(0.0):  # goes on as it went: exact for a constant acceleration too
+                if step.a1[world] > f64(0.0):  # linear extrapolation: also exact for a constant acceleration
                     ratio = T(step.h[world] / step.previous_h[world])
                     first = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
             if wp.static(accelerated):
@@ -210,7 +210,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         v_tilde: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
     ):
-        """Another first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
+        """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
         if newton.choose[world] == 0:
             return
@@ -234,7 +234,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
 
     @wp.kernel(module=module)
     def end_attempt(step: Step, newton: Newton):
-        """Accept the substep, or refuse it and halve."""
+        """Accept the substep, or refuse and halve it."""
         world = wp.tid()
         if step.running[world] == 0:
             return
@@ -267,7 +267,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         step.halvings[world] = step.halvings[world] + 1
         level = step.level[world] + 1
         why = newton.failed[world]
-        # a shorter step has no more digits, and is another motion
+        # a shorter step has no better round-off, and changes the motion
         hopeless = why == FAIL_WORK or why == FAIL_FLOOR
         if step.most_newton > 0 and newton.total_iterations[world] >= step.most_newton:
             hopeless = True
@@ -282,7 +282,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
 
     @wp.kernel(module=module)
     def failed_now(step: Step, newton: Newton, flags: wp.array(dtype=wp.int32)):
-        """Flags of the worlds whose step failed for good: accepted substeps of it are taken back."""
+        """Flag the worlds whose step failed finally: its accepted substeps are rolled back."""
         world = wp.tid()
         flags[world] = 0
         if step.status[world] == wp.static(STATUS["failed"]) and step.refused[world] == 1:
@@ -300,7 +300,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         u_before: wp.array2d(dtype=vec3),
         v_before: wp.array2d(dtype=vec3),
     ):
-        """Make the accepted iterate the state."""
+        """Store the accepted iterate in the state."""
         world, slot = wp.tid()
         if step.accepted[world] == 0:
             return
@@ -328,7 +328,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
 
     @wp.kernel(module=module)
     def write_report(step: Step, newton: Newton, pcg: PCG, report: wp.array2d(dtype=f64)):
-        """The one array that the host reads after a step; columns as `REPORT`."""
+        """Report of a step, one array for the host; columns as `REPORT`."""
         world = wp.tid()
         report[world, 0] = f64(step.status[world])
         report[world, 1] = f64(newton.total_iterations[world])

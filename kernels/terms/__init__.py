@@ -1,1 +1,1 @@
-"""Forces that are not of elements: loads, followers, constraints."""
+"""Forces besides those of elements: loads, follower loads, constraints, contact."""

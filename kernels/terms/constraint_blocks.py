@@ -1,4 +1,4 @@
-"""What constraints add to H as a matrix."""
+"""Contributions of constraints to the matrix of H."""
 
 import functools
 import types as _types
@@ -15,7 +15,7 @@ __all__ = ["constraint_block_kernels", "coupling_struct"]
 
 @functools.cache
 def coupling_struct():
-    """What constraints add to entries: rho w grad_a grad_b^T."""
+    """Contributions of constraints to matrix entries: rho w grad_a grad_b^T."""
 
     @wp.struct
     class Couplings:

@@ -1,14 +1,14 @@
 """Holonomic constraints by augmented Lagrangian: rows c(q, t) = 0 m, their derivatives, and multipliers in N.
 
-Every constraint is made of vectors a = sum_k w_k e_k, linear in the slots (a difference of two points, a material
-direction, a constant), three at most per row:
+Every constraint is built from vectors a = sum_k w_k e_k, linear in the slots (a difference of two points, a material
+direction, a constant), at most three per row:
 
     DOT       c = scale (a.b - f)                       DP1, DP2; PIN with b a constant axis
     DISTANCE  c = scale (|a| - f)                       DIST
     TURN      c = scale (cos f a2 - sin f a).b          the sine of the angle between b and the direction f of (a, a2)
 
-Vectors are the terms 3 row + side, sides a, b, a2. Rows are evaluated in float64 from displacements, so that c has no
-rounding of large coordinates. One thread per (world, row); slots gather from terms in a fixed order.
+Vectors are the terms 3 row + side, sides a, b, a2. Rows are evaluated in float64 from displacements, so that c is free
+of the round-off of large coordinates. One thread per (world, row); slots gather from terms in a fixed order.
 """
 
 import functools
@@ -36,12 +36,12 @@ TURN = 2
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
 MOST_TURN = 1.0
-"""rad that a driven angle may change by in a substep: from further off, a body may be crushed instead of turned."""
+"""Largest change of a driven angle in a substep, rad: a larger one may crush a body instead of turning it."""
 
 
 @functools.cache
 def constraint_struct():
-    """The rows of a model, their terms, and where each slot finds the terms that it enters."""
+    """Constraint rows of a model, their terms, and the terms of each slot."""
 
     @wp.struct
     class Constraints:
@@ -59,17 +59,17 @@ def constraint_struct():
         slot_start: wp.array(dtype=wp.int32)  # [slot + 1]
         slot_term: wp.array(dtype=wp.int32)
         slot_weight: wp.array(dtype=wp.float64)
-        cluster: wp.array(dtype=wp.int32)  # [row] rows whose matrix is inverted together
+        cluster: wp.array(dtype=wp.int32)  # [row] cluster of rows inverted together
         cluster_start: wp.array(dtype=wp.int32)  # [cluster + 1] rows
         matrix_start: wp.array(dtype=wp.int32)  # [cluster] entry of its dense matrix
         pair: wp.array(dtype=wp.int32)  # [matrix entry] its first pair of terms
         pair_side: wp.array(dtype=wp.vec2i)  # [pair] sides of the row and of the column
-        pair_block: wp.array(dtype=wp.int32)  # [pair] the block of both vectors
+        pair_block: wp.array(dtype=wp.int32)  # [pair] block of both vectors
         couple_start: wp.array(dtype=wp.int32)  # [row + 1] its couplings to rows of other clusters
-        couple_row: wp.array(dtype=wp.int32)  # [coupling] the row
-        couple_column: wp.array(dtype=wp.int32)  # [coupling] the other row
+        couple_row: wp.array(dtype=wp.int32)  # [coupling] its row
+        couple_column: wp.array(dtype=wp.int32)  # [coupling] its column
         couple_pair: wp.array(dtype=wp.int32)  # [coupling + 1] its pairs of terms
-        colour: wp.array(dtype=wp.int32)  # [cluster] coupled clusters differ
+        colour: wp.array(dtype=wp.int32)  # [cluster] colour; coupled clusters differ
         colour_cluster: wp.array(dtype=wp.int32)  # clusters by colour
         block_start: wp.array(dtype=wp.int32)  # [block + 1]
         block_slot: wp.array(dtype=wp.int32)
@@ -80,20 +80,20 @@ def constraint_struct():
 
 @functools.cache
 def multiplier_struct():
-    """What varies: [world, row], [world, term]."""
+    """Variable quantities of constraints: [world, row], [world, term]."""
 
     @wp.struct
     class Multipliers:
         value: wp.array2d(dtype=wp.float64)  # c, m
         target: wp.array2d(dtype=wp.float64)  # f
         last: wp.array2d(dtype=wp.float64)  # f of the last accepted step
-        gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector, where forces are taken
-        ahead: wp.array2d(dtype=wp.vec3d)  # the same at the end of the step, along which c changes
-        scale: wp.array2d(dtype=wp.float64)  # of the row, negative where a turn is more than a right angle off
+        gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector, where forces are evaluated
+        ahead: wp.array2d(dtype=wp.vec3d)  # dc / d vector at the end of the step, the derivative of c
+        scale: wp.array2d(dtype=wp.float64)  # of the row, negative beyond a right angle of a turn
         force: wp.array2d(dtype=wp.float64)  # lambda, N
         change: wp.array2d(dtype=wp.float64)  # of lambda with a full Newton step
         trial: wp.array2d(dtype=wp.float64)  # lambda at the trial of the line search
-        merit: wp.array2d(dtype=wp.float64)  # lambda + rho c with lambda held in the line search
+        merit: wp.array2d(dtype=wp.float64)  # lambda + rho c with lambda frozen in the line search
         excess: wp.array2d(dtype=wp.float64)  # rho c
         stiffness: wp.array2d(dtype=wp.float64)  # rho, N/m
         product: wp.array2d(dtype=wp.vec3d)  # [world, term] contributions to H p
@@ -104,8 +104,8 @@ def multiplier_struct():
         coupling: wp.array2d(dtype=wp.float64)  # [world, coupling] J D^-1 J^T between clusters
         restricted: wp.array2d(dtype=wp.float64)  # J D^-1 r
         swept: wp.array2d(dtype=wp.float64)
-        solved: wp.array2d(dtype=wp.float64)  # matrix times it
-        classical: wp.int32  # multipliers change in the outer loop only
+        solved: wp.array2d(dtype=wp.float64)  # inverse matrix times J D^-1 r
+        classical: wp.int32  # 1: multipliers change in the outer loop only
         kappa: wp.float64
 
     return Multipliers
@@ -113,19 +113,19 @@ def multiplier_struct():
 
 @functools.cache
 def joint_struct():
-    """Which rows are a joint's, and the child's side of their entries, for reactions."""
+    """Rows of each joint, and the child side of their entries, for reactions."""
 
     @wp.struct
     class Joints:
         first: wp.array(dtype=wp.int32)  # [joint] row
         last: wp.array(dtype=wp.int32)
-        anchor: wp.array(dtype=wp.vec3d)  # [joint] reference place
+        anchor: wp.array(dtype=wp.vec3d)  # [joint] reference position
         anchor_start: wp.array(dtype=wp.int32)  # [joint + 1]
         anchor_slot: wp.array(dtype=wp.int32)
         anchor_weight: wp.array(dtype=wp.float64)
         role: wp.array(dtype=wp.int32)  # [entry] 1 child's gradient, 2 child's position, negative: a parent's against
         # a child in space, 0: not counted
-        place: wp.array(dtype=wp.vec3d)  # [entry] reference value of the slot, in space
+        place: wp.array(dtype=wp.vec3d)  # [entry] reference position of the slot, of a child in space
 
     return Joints
 
@@ -163,9 +163,8 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
 def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNamespace:
     """Kernels of the constraints for one precision of the slots.
 
-    `midpoint`: rows hold at the end of a step and act along their gradient in its middle, of a distance
-    (a0 + a1) / (|a0| + |a1|), of a turn at the mean of its angles: the work of a step is lambda times the change of c,
-    to the last digit.
+    `midpoint`: rows hold at the end of a step; forces act along a midpoint gradient, (a0 + a1) / (|a0| + |a1|) of a
+    distance, at the mean of the angles of a turn: the work of a step is exactly lambda times the change of c.
     """
     p = precision(dtype)
     vec3 = p.vec3
@@ -188,13 +187,13 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
 
     @wp.func
     def put(into: wp.array2d(dtype=vec3d), world: int, row: int, G: wp.mat33d):
-        """Store what `gradients` gives."""
+        """Store the output of `gradients`."""
         for side in range(3):
             into[world, 3 * row + side] = G[side]
 
     @wp.kernel(module=module)
     def reset_violation(active: wp.array(dtype=wp.int32), mul: Multipliers):
-        """Before an evaluation."""
+        """Reset the largest violations before an evaluation."""
         world, component = wp.tid()
         if active[world] != 0:
             mul.violation[world, component] = f64(0.0)
@@ -237,11 +236,11 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             along = wp.sin(f) * a2 + wp.cos(f) * a
             c = scale * wp.dot(wp.cos(f) * a2 - wp.sin(f) * a, b)
             if wp.dot(along, b) < f64(0.0):
-                # more than a right angle off: the sine vanishes at a half turn too, which is no solution
+                # beyond a right angle: the sine also vanishes at a half turn, which is no solution
                 c = wp.sign(c) * f64(2.0) * scale - c
                 scale = -scale
             if wp.abs(f - mul.last[world, row]) > f64(MOST_TURN):
-                c = f64(2.0) * con.scale[row]  # turns can't be told apart: the step must be halved
+                c = f64(2.0) * con.scale[row]  # ambiguous number of turns: the step must be halved
         else:
             c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
         turn = f
@@ -308,7 +307,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         bend = gradients(kind, scale, f, a, b, a2)
         tight = dq_dv[world] * mul.stiffness[world, row] * change
         force = dq_dv[world] * mul.trial[world, row]
-        if wp.static(midpoint):  # gradients move with half of the end
+        if wp.static(midpoint):  # the gradients move by half of the end's change
             force = f64(0.5) * force
         mul.product[world, 3 * row] = tight * Ga + force * bend[0]
         mul.product[world, 3 * row + 1] = tight * Gb + force * bend[1]
@@ -321,7 +320,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """Warm start: the forces and right sides of the last accepted step."""
+        """Warm start: multipliers and right sides of the last accepted step."""
         world, row = wp.tid()
         if active[world] == 0:
             return
@@ -340,7 +339,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
     ):
-        """Change of lambda that belongs to a full Newton step, rho (c + (dq/dv) J p); none in converged components."""
+        """Change of lambda in a full Newton step, rho (c + (dq/dv) J p); 0 in converged components."""
         world, row = wp.tid()
         if active[world] == 0:
             return
@@ -351,7 +350,8 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
 
     @wp.kernel(module=module)
     def adopt(flags: wp.array(dtype=wp.int32), mul: Multipliers):
-        """Make the multipliers of the trial those of the iterate, which may be evaluated again: no change is left."""
+        """Make the trial's multipliers those of the iterate and clear their change: the iterate may be evaluated
+        again."""
         world, row = wp.tid()
         if flags[world] != 0:
             mul.force[world, row] = mul.trial[world, row]
@@ -362,7 +362,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         accepted: wp.array(dtype=wp.int32), mul: Multipliers, state: wp.array2d(dtype=f64),
         travel: wp.array2d(dtype=f64),
     ):  # fmt: skip
-        """Make the multipliers and right sides of an accepted step the state's."""
+        """Store the multipliers and right sides of an accepted step in the state."""
         world, row = wp.tid()
         if accepted[world] != 0:
             state[world, row] = mul.trial[world, row]
@@ -379,8 +379,8 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     ):
         """Work of a substep per row: of the drive, -lambda scale df, and lambda (J dq - scale df), which is lost.
 
-        A constraint at rest does no work along the exact path; along a chord it takes some. `midpoint`: a driven row
-        does the work of its drive alone.
+        A constraint at rest does no work along the exact path, but some along a chord. `midpoint`: a driven row does
+        the work of its drive alone.
         """
         world, row = wp.tid()
         if accepted[world] == 0:
@@ -409,7 +409,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         first_column: int,
         report: wp.array2d(dtype=f64),
     ):
-        """Force and moment about the anchor that each joint exerts on its child, world axes, and its violation."""
+        """Force and moment about the anchor by each joint on its child, world axes, and its violation."""
         world, joint = wp.tid()
         anchor = joints.anchor[joint]
         for k in range(joints.anchor_start[joint], joints.anchor_start[joint + 1]):

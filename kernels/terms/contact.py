@@ -1,7 +1,7 @@
-"""Contact of surface points with rigid shapes: forces, their tangent, and what an accepted step keeps and books.
+"""Contact of surface points with rigid shapes: forces, tangent, friction limits, explicit forces.
 
-A point's force is the derivative of a scalar: `normal_law` of its depth, and `friction` of its anchored slip whose cap
-mu F_n is held in a line search and refreshed at each iterate. The gap and all of the law are in float64.
+A point's force is the derivative of a scalar: `normal_law` of its depth, and `friction` of its anchored slip, whose
+limit mu F_n is frozen during a line search and updated at each iterate. Gap and law are evaluated in float64.
 """
 
 import functools
@@ -19,19 +19,19 @@ from .contact_touch import touch_functions
 __all__ = ["MOST_TURN", "RELAX_LANES", "SPEED_FLOOR", "contact_kernels"]
 
 SPEED_FLOOR = 1e-3
-"""Least approach speed that the default law's damping is made for, m/s."""
+"""Lower bound of the approach speed in the damping of the default law, m/s."""
 IDLE, LOADED, STIFF = 0, 1, 2
-"""A point has no force; one without a derivative; one with."""
+"""States of a point: no force; a force without tangent; a force with tangent."""
 MOST_TURN = 1.0
-"""Angle by which a collider in touch may turn in a step, rad: of one that turns further a step knows nothing."""
+"""Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
 RELAX_LANES = 128
 SHRINKS = 0.35
-"""Caps that come closer by less than this per change are relaxed."""
+"""Ratio of successive changes of the friction limits above which they are relaxed."""
 
 
 @functools.cache
 def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
-    """Kernels of contact in one precision of the displacements; `meshes`: a collider is one."""
+    """Kernels of contact in one precision of the displacements; `meshes`: some collider is a triangle mesh."""
     p = precision(dtype)
     T, vec3, sym = p.T, p.vec3, p.sym
     f64, vec3d = wp.float64, wp.vec3d
@@ -51,7 +51,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def poses(
         con: Contacts, his: History, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), at: Attempt
     ):  # fmt: skip
-        """Places of the colliders at the end of the attempt, and their motion in it."""
+        """Poses of the colliders at the end of the attempt, and their motion in it."""
         world, k = wp.tid()
         if active[world] == 0:
             return
@@ -81,7 +81,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, u_n: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt,
     ):  # fmt: skip
-        """Where the points are as an attempt begins, and the approach speed that damping is made for."""
+        """Positions of the points at the start of an attempt, and the approach speed of the damping."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
@@ -120,7 +120,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def settle(
         con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3), at: Attempt
     ):  # fmt: skip
-        """Points begin where they are: what follows is at a state, without motion."""
+        """Point data at a state without motion, for evaluations outside of a step."""
         world, item, q = wp.tid()
         c = facets.contact[item]
         k = con.collider[c]
@@ -138,7 +138,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, v_n: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32), at: Attempt,
     ):  # fmt: skip
-        """Forces at the state that the attempt begins from, of contacts that are treated so."""
+        """Forces of explicit contacts at the state that the attempt begins from."""
         world, item, q = wp.tid()
         if active[world] == 0 or facets.share[q, item] == f64(0.0):
             return
@@ -168,7 +168,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
         u: wp.array2d(dtype=vec3d),
     ) -> f64:  # fmt: skip
-        """Minus the work of an explicit force on the step so far."""
+        """Potential of an explicit force: minus its work on the step so far, J."""
         k = con.collider[c]
         x_n = his.turn[world, k] * at.start[world, point] + his.place[world, k]
         x = facets.X[q, item] + along(facets, u, world, q, item)
@@ -179,10 +179,10 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), fresh: int, at: Attempt,
     ):  # fmt: skip
-        """Forces of points, their stiffness and potential.
+        """Forces of points, N, their stiffness and potential.
 
-        `fresh`: an attempt begins. Caps are held while Newton's method solves for them: with held caps the problem has
-        a potential, which with those of each iterate is lost where an iterate lies deep in an obstacle.
+        `fresh`: an attempt begins. Friction limits are frozen while Newton's method solves: the problem then has a
+        potential, which it would lose with the limits of each iterate where an iterate lies deep in an obstacle.
         """
         world, item, q = wp.tid()
         if active[world] == 0:
@@ -203,7 +203,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
         if con.dead[c] == 0:
             new = hold(con, his, at, world, c, point, t)
-            if fresh != 0:  # the first caps are those of the last step, and none where a contact is born
+            if fresh != 0:  # initial limits: those of the last step, zero for a new contact
                 at.plane[world, rec] = t.n
                 held = new
                 held[0] = wp.min(new[0], his.cap[world, rec])
@@ -267,7 +267,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         before = at.touched[world, row]
         at.touched[world, row] = touched
         if wp.max(before, touched) == IDLE:
-            return  # what it has written before is nothing too
+            return  # the rows are already zero
         energy = wp.vec2d()
         for q in range(facets.points):
             state = at.state[world, first + q]
@@ -283,7 +283,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def partial_asked(flags: wp.array(dtype=wp.int32), at: Attempt):
-        """Sums of what caps of the iterate differ from those held by, r, and of how that has changed, by lanes."""
+        """Partial sums, by lanes, of r = limit of the iterate - frozen limit, and of the change of r, for `relax`."""
         world, lane = wp.tid()
         if flags[world] == 0:
             return
@@ -298,7 +298,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def relax(flags: wp.array(dtype=wp.int32), tol: f64, at: Attempt, unsettled: wp.array(dtype=wp.int32)):
-        """Part of r that caps change by: all of it, unless it does not shrink; then Aitken's (Irons and Tuck 1969)."""
+        """Relaxation factor of the friction limits: 1 while r shrinks, else Aitken's (Irons and Tuck 1969)."""
         world = wp.tid()
         if flags[world] == 0:
             return
@@ -316,7 +316,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def refresh(flags: wp.array(dtype=wp.int32), at: Attempt):
-        """Take the caps of the iterate, or a part of the way to them."""
+        """Update the frozen friction limits by the relaxed change, and the plane of friction."""
         world, point = wp.tid()
         if flags[world] != 0:
             new = at.next[world, point]
@@ -329,7 +329,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def times(k: sym, p: vec3) -> vec3:
-        """The symmetric matrix k (Voigt) times p."""
+        """Product of the symmetric matrix k (Voigt) with p."""
         return vec3(k[0] * p[0] + k[5] * p[1] + k[4] * p[2], k[5] * p[0] + k[1] * p[1] + k[3] * p[2],
                     k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
 
@@ -351,7 +351,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def product_facets(
         facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, at: Attempt, pool: wp.array2d(dtype=vec3)
     ):  # fmt: skip
-        """Their sums on the slots of the facets."""
+        """Sums of the point products on the slots of the facets."""
         world, index = wp.tid()
         if active[world] == 0:
             return
@@ -368,7 +368,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=sym)):
-        """3x3 blocks on the diagonal of the facets."""
+        """3x3 diagonal blocks of the facets."""
         world, item, i = wp.tid()
         if active[world] == 0:
             return

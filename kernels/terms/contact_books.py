@@ -1,4 +1,4 @@
-"""What an accepted step of contact leaves: history, books of energy, the record of each contact, fields, and blocks."""
+"""Contact after an accepted step: history, energy ledger, record of each contact, fields, and matrix blocks."""
 
 import functools
 import types as _types
@@ -20,7 +20,7 @@ BOOKED = 5  # stored, loss, friction, work of the colliders, the integrator's pa
 LANES = 32
 SUMS = len(RECORD) - 1
 FORCES = 7
-"""Rows averaged over the substeps of a step, the first so many; area, stick and stored are those at its end."""
+"""Leading rows of the record, averaged over the substeps of a step; area, stick and stored are values at its end."""
 
 
 @functools.cache
@@ -40,7 +40,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.struct
     class Outcome:
-        """What a point leaves after a substep, of the whole region."""
+        """Result of a point after a substep, for the whole region."""
 
         touch: Touch
         force: vec3d  # on the body, N
@@ -49,25 +49,25 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         cap: f64
         slips: wp.int32
         slid: vec3d  # slip in the substep, m
-        stored: f64  # J, as all below
+        stored: f64  # J, as are the following
         loss: f64
         rubbed: f64
         given: f64  # by the collider
-        left: f64  # the integrator's part, less what the ledger finds of it by itself
+        left: f64  # the integrator's part that the ledger does not find by itself
 
     @wp.func
     def spring_after(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64, pulled: vec3d) -> vec3d:
-        """The friction spring that stays where the force is cut to the cap; by Eq. (83) of the paper's law."""
+        """Friction spring after the force was cut to the friction limit; Eq. (83) for the paper's law."""
         w = pull(con, world, c, t, held, inv_h)
         if wp.length(vec3d(w[0], w[1], w[2])) <= held[0]:
             return t.q
         trial = vec3d(w[0], w[1], w[2])
-        if con.law[c] != PAPER:  # spring and damper slip together: it stretches no further than the point has moved
+        if con.law[c] != PAPER:  # spring and damper slip together: the stretch is bounded by the motion of the point
             if held[0] <= f64(0.0):
                 return vec3d()
             size = wp.length(trial)
             return t.q - ((size - held[0]) / (w[3] * size)) * trial
-        # this turns the spring where gamma_t v is above the cap
+        # reverses the spring where gamma_t v exceeds the friction limit
         return (f64(1.0) / held[1]) * pulled - ((w[3] - held[1]) / held[1]) * t.slip
 
     @wp.func
@@ -75,11 +75,11 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, at: Attempt, world: int, c: int, q: int, item: int,
         point: int, u: wp.array2d(dtype=vec3d),
     ) -> Outcome:  # fmt: skip
-        """What a point leaves.
+        """Force, friction spring and energies of a point at the end of a substep.
 
         The force on the body does `given` = f . (motion of the collider's material at the point) and, on the relative
-        motion, -(change of what is stored + loss + friction + the integrator's part). That part is made of its own
-        formulas: chords of convex energies, and what a turning normal and a turning collider leave.
+        motion, -(change of stored energy + loss + friction + the integrator's part). The integrator's part has formulas
+        of its own: chords of convex energies, and the contributions of a turning normal and a turning collider.
         """
         out = Outcome()
         rec = record_of(con, c, point)
@@ -98,7 +98,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         pulled = friction_force(con, world, c, t, held, inv_h)
         w = pull(con, world, c, t, held, inv_h)
         out.slips = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > held[0] or law == SMOOTH, 1, 0)
-        base = vec3d()  # the spring as it was, in the tangent plane
+        base = vec3d()  # previous spring, in the tangent plane
         if his.speed[world, rec] > f64(0.0):
             base = his.spring[world, rec]
             if law != PAPER:
@@ -122,15 +122,16 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         out.slid = t.slip - (out.kept - base)
         out.rubbed = wp.dot(pulled - held[1] * out.kept, out.kept - base) + wp.dot(pulled, out.slid)
         chord = spring[0] * change + held[1] * wp.dot(out.kept, out.kept - base) - gain
-        chord += (normal - spring[0]) * (change - t.rise)  # of a place that moves
+        chord += (normal - spring[0]) * (change - t.rise)  # of a moving contact point
         x = at.turn[world, kc] * t.y + at.place[world, kc]
-        carried = at.shift[world, kc]  # of the collider's material at the point, by its last velocity
+        carried = at.shift[world, kc]  # motion of the collider's material at the point, by its last velocity
         if con.spin[kc] >= 0:
             angle = at.angle[world, kc] - his.angle[world, kc]
             carried = angle * wp.cross(con.axis[kc], x - con.anchor[kc])
         risen = recovered(con, his, clock, world, c, point)
         out.given = wp.dot(out.force, carried) + normal * risen
-        # the ledger takes for the integrator what the work of the force leaves; it is to find these formulas
+        # the ledger attributes the remaining work of the force to the integrator; `left` makes it agree with these
+        # formulas
         x_n = his.turn[world, kc] * at.start[world, point] + his.place[world, kc]
         turned = -wp.dot(out.force, x - x_n - carried) - (normal * (change - risen) + wp.dot(pulled, t.slip))
         out.left = chord + turned + wp.dot(out.force, x - x_n) + gain + out.loss + out.rubbed
@@ -141,7 +142,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, at: Attempt, world: int, c: int, point: int,
         o: Outcome,
     ):  # fmt: skip
-        """Keep the history of a point."""
+        """Store the history of a point."""
         rec = record_of(con, c, point)
         if facets.moving != 0:
             his.lead[world, rec] = o.touch.depth
@@ -179,7 +180,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         accepted: wp.array(dtype=wp.int32), at: Attempt, booked: wp.array3d(dtype=f64),
     ):  # fmt: skip
-        """Books of an accepted substep and the record of it per facet, and the history after it."""
+        """Energy increments of an accepted substep, its record per facet, and the history after it."""
         world, item = wp.tid()
         if accepted[world] == 0:
             return
@@ -221,7 +222,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, rows_of: wp.array(dtype=wp.int32), accepted: wp.array(dtype=wp.int32), at: Attempt,
         out: wp.array4d(dtype=f64),
     ):  # fmt: skip
-        """Sums over the facets of a contact, by lanes; [world, contact, RECORD, lane]."""
+        """Sums over the facets of a contact, by lanes: [world, contact, RECORD, lane]."""
         world, c, j, lane = wp.tid()
         if accepted[world] == 0:
             return
@@ -238,7 +239,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def total_records(
         clock: Clock, accepted: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=f64), at: Attempt
     ):  # fmt: skip
-        """The record of the step so far: forces averaged over time, work added up."""
+        """Record of the step so far: forces averaged over time, work summed."""
         world, c, j = wp.tid()
         if accepted[world] == 0:
             return
@@ -267,7 +268,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32), his: History, at: Attempt,
     ):  # fmt: skip
-        """Keep the places of the colliders; the energy of contact counts in the bound of the next first iterate."""
+        """Store the poses of the colliders; add the contact energy to the bound of the next initial iterate."""
         world, k = wp.tid()
         if accepted[world] == 0:
             return
@@ -282,7 +283,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def write_records(at: Attempt, first: int, report: wp.array2d(dtype=f64)):
-        """The record of each contact into the report of the step; of slip and stick means over the area in contact."""
+        """Record of each contact for the report of the step; slip and stick as averages over the area in contact."""
         world, c = wp.tid()
         area = at.total[world, c, 8]
         for j in range(SUMS + 1):
@@ -296,8 +297,8 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, u: wp.array2d(dtype=vec3d), time: wp.array(dtype=f64),
         at: Attempt, places: int, gap: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """At a state, without rates: gap, m, and the elastic force on the point, N; with `places` the gap of a place
-        that acts is at the point next to it."""
+        """Gap, m, and elastic force, N, of each point at a state, without rates; with `places` the gap of a moving
+        contact point is written at the point next to it."""
         world, item, q = wp.tid()
         point = facets.point + item * facets.points + q
         if facets.share[q, item] == f64(0.0):
@@ -306,7 +307,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         c = facets.contact[item]
         share = facets.share[q, item] * acts(con, at, world, c, point)
         acting = point
-        if facets.moving != 0:  # the force at the place is one on the points of its facet
+        if facets.moving != 0:  # the force at the contact point is written at a point of its facet
             gap[world, point] = -at.level[world, point]
             row = facets.row + item
             share = f64(0.0)
@@ -331,7 +332,7 @@ def book_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
 @functools.cache
 def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
-    """What contact adds to a matrix."""
+    """Contributions of contact to an assembled matrix."""
     p = precision(dtype)
     T, mat33, sym = p.T, p.mat33, p.sym
     f64 = wp.float64

@@ -1,6 +1,6 @@
-"""Colliders of all kinds for kernels of contact: distance, sweep, and the side of a point.
+"""Distance, sweep and side of a point for colliders of all kinds.
 
-A model without triangle meshes takes functions that know none.
+Models without triangle meshes use functions compiled without the mesh code.
 """
 
 import functools
@@ -15,18 +15,18 @@ from .contact_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
 __all__ = ["MESHES", "collider_functions"]
 
 MESHES = "_meshes"
-"""In names of modules that know meshes."""
+"""Suffix of the names of modules compiled with the mesh code."""
 
 SLIPS = 16
-"""Of a point's mark: it slips; below are the sides."""
+"""Bit of a point's contact state: slipping; the bits below are the side."""
 NAMES = ("distance", "sweep", "side_after", "deepening", "beside")
 MESH_SLIPS = 1 << 30
-"""The same where sides are triangles."""
+"""Slipping bit where sides are triangles."""
 
 
 @functools.cache
 def collider_functions(meshes: bool) -> _types.SimpleNamespace:
-    """Device functions, see `contact_shapes` and `contact_mesh`, and the number SLIPS."""
+    """Device functions, see `contact_shapes` and `contact_mesh`, and the constant SLIPS."""
     slips = MESH_SLIPS if meshes else SLIPS
     f64, vec3d = wp.float64, wp.vec3d
     Contacts = contact_struct(meshes)
@@ -37,7 +37,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def distance(con: Contacts, k: int, y: vec3d, side: int) -> wp.vec4d:
-        """Outward unit normal and signed distance of a place in the frame of collider k."""
+        """Outward unit normal and signed distance at a position in the frame of collider k."""
         if wp.static(meshes):
             if con.kind[k] == MESH:
                 return of_mesh(con, k, y, side)
@@ -45,7 +45,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
-        """Side through which a motion is inside at its end, -1: any; -2: it went through."""
+        """Side through which a motion ends inside, -1: any; -2: it passed through the collider."""
         if wp.static(meshes):
             if con.kind[k] == MESH:
                 return sweep_mesh(con, k, start, end, side)
@@ -53,7 +53,8 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def known_side(con: Contacts, k: int, live: bool, mark: int) -> int:
-        """The side that a mark tells, -1: none; of a point that touches no sheet -3 in front of it, -4 behind."""
+        """Side stored in a contact state, -1: none; of a point without contact to a sheet -3 in front of it, -4
+        behind."""
         if live:
             return mark % slips - 1
         if wp.static(meshes):
@@ -63,7 +64,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def beside(con: Contacts, k: int, y: vec3d, mark: int) -> int:
-        """The mark of a point that touches nothing: where on a sheet it is, as before if rounding hides that."""
+        """Contact state of a free point: its side of a sheet, unchanged where round-off hides the side."""
         if wp.static(meshes):
             if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
                 return beside_mesh(con, k, y, mark)
@@ -71,7 +72,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def released(con: Contacts, k: int, live: bool, mark: int) -> int:
-        """The mark of a point that touches no more."""
+        """Contact state of a point that has left contact."""
         if wp.static(meshes):
             if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
                 if live and mark % slips > 0:
@@ -81,7 +82,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def side_after(con: Contacts, k: int, y: vec3d, side: int) -> int:
-        """The side to keep of a point that is at y and was swept to a side: on a mesh it slides over triangles."""
+        """Updated side of a point at y that was swept to a side: on a mesh it slides over triangles."""
         if wp.static(meshes):
             if con.kind[k] == MESH:
                 return side_on_mesh(con, k, y, side)
@@ -91,10 +92,9 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
     def deepening(
         con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
     ) -> wp.vec2d:  # fmt: skip
-        """Change of the depth by a motion, from the motion itself where that is exact, and 1; else 0. Last the
-        distances of its ends.
+        """(change of depth, 1) from the motion itself where that is exact, else (difference of the end distances, 0).
 
-        As a difference of places it would be rounded as those are, by more than a stiff body at rest moves.
+        A difference of positions has their round-off, which exceeds the motion of a stiff body at rest.
         """
         kind = con.kind[k]
         if kind == HALF_SPACE:

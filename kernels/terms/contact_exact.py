@@ -1,7 +1,7 @@
-"""Displacements of the slots that contact reads, in float64 where the model has float32.
+"""Float64 displacements of the slots of contact for float32 models.
 
-A displacement of 1 cm is rounded to 5e-10 m in float32. Over a step of 10 us that is a speed of 5e-5 m/s, 5 % of the
-least that the normal law's damping is made for: contact takes the motion of a step from the velocities.
+float32 rounds a displacement of 1 cm to 5e-10 m. Over a step of 10 us that is a speed of 5e-5 m/s, 5 % of the
+lower bound in the damping of the normal law: contact integrates the motion of a step from the velocities.
 """
 
 import functools
@@ -16,7 +16,7 @@ __all__ = ["exact_kernels"]
 
 @functools.cache
 def exact_kernels() -> _types.SimpleNamespace:
-    """Kernels of float32 models, [world, some slot]."""
+    """Kernels of float32 models, [world, listed slot]."""
     f64, vec3, vec3d = wp.float64, wp.vec3f, wp.vec3d
     module = kernel_module("contact_exact")
 
@@ -25,7 +25,7 @@ def exact_kernels() -> _types.SimpleNamespace:
         slots: wp.array(dtype=wp.int32), q_tilde: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3),
         dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), u: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """q = q~ + (dq/dv) v of some slots, without rounding it to float32."""
+        """q = q~ + (dq/dv) v of the listed slots, without rounding to float32."""
         world, i = wp.tid()
         if active[world] != 0:
             slot = slots[i]
@@ -36,7 +36,7 @@ def exact_kernels() -> _types.SimpleNamespace:
         slots: wp.array(dtype=wp.int32), u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
         out: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """The numbers of u as they are."""
+        """Copy of u in float64."""
         world, i = wp.tid()
         if active[world] != 0:
             slot = slots[i]

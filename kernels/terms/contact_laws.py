@@ -1,17 +1,18 @@
 """Contact laws of one point as derivatives of scalars: normal force of the depth, friction of the anchored slip.
 
-delta is the depth, m; delta_n that at the start of the step; all in float64. Of a lumped contact ("sphere") the elastic
-force is k delta^1.5, else k delta.
+delta is the depth, m; delta_n that at the start of the step; all in float64. The elastic force is k delta^1.5 for a
+lumped contact ("sphere"), else k delta.
 
-"default": Hunt and Crossley's normal force and an anchored spring of friction. Of patches with mu_static > mu points
-begin to slip one after another, the least loaded first, and those that slip carry mu alone: a stiff body slides before
+"default": Hunt and Crossley's normal force and an anchored friction spring. In patches with mu_static > mu the points
+begin to slip one after another, the least loaded first, and slipping points carry only mu: a stiff body slides before
 mu_static.
 
-"paper": Paper I, Eqs. (73)-(83), as they stand. What is known of them: with max(0, .) rebounds for e = 0.1, 0.3, 0.5,
-0.7, 0.9 are 0.2527, 0.3971, 0.5503, 0.7182, 0.9020 (spheres) and 0.2242, 0.3635, 0.5174, 0.6926, 0.8914 (patches). The
-implicit patch jumps at touch, and some impacts have no solution (`smoothing` ramps it). With k_t ~ sqrt(delta) and a
-spring that stays energy appears when the normal load rises (Elata and Berryman 1996). Eq. (83) turns the spring round
-where gamma_t v exceeds mu F_n. Eq. (78) does not turn it with the bodies: a stuck block walks on a plate that turns.
+"paper": Paper I, Eqs. (73)-(83), unmodified. Known properties: with max(0, .) rebounds for e = 0.1, 0.3, 0.5, 0.7, 0.9
+are 0.2527, 0.3971, 0.5503, 0.7182, 0.9020 (spheres) and 0.2242, 0.3635, 0.5174, 0.6926, 0.8914 (patches). The implicit
+patch force jumps at first contact, and some impacts have no solution (`smoothing` ramps it). With k_t ~ sqrt(delta) and
+a persistent spring, energy is created when the normal load rises (Elata and Berryman 1996). Eq. (83) reverses the
+spring where gamma_t v exceeds mu F_n. Eq. (78) does not rotate it with the bodies: a sticking block walks on a rotating
+plate.
 
 "smooth": Paper I, 6.2.
 """
@@ -34,7 +35,7 @@ def law_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def elastic(lumped: int, k: f64, delta: f64) -> wp.vec2d:
-        """Elastic force, N, and the energy stored, J."""
+        """Elastic force, N, and stored energy, J."""
         if delta <= f64(0.0):
             return wp.vec2d()
         if lumped != 0:
@@ -44,11 +45,10 @@ def law_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def hunt_crossley(lumped: int, k: f64, rate: f64, delta: f64, delta_n: f64) -> vec4d:
-        """F = F_el (1 + rate (delta - delta_n)), not below 0 (Hunt and Crossley 1975), its derivative, its integral.
+        """F = F_el (1 + rate (delta - delta_n)), not below 0 (Hunt and Crossley 1975), its derivative, its integral,
+        and the magnitude of the terms that the integral is the difference of (for its round-off).
 
-        Last the size of what the integral is the difference of, whose rounding it has.
-
-        rate = chi / h, 1/m. F grows with delta wherever it is not 0, so its integral is convex.
+        rate = chi / h, 1/m. F increases with delta wherever it is positive, so its integral is convex.
         """
         if delta <= f64(0.0):
             return vec4d()
@@ -70,7 +70,7 @@ def law_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def damped(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
-        """k_n delta - gamma_n v_n of Eq. (77), not cut, its derivative and its integral.
+        """k_n delta - gamma_n v_n of Eq. (77) before the cut at 0, its derivative and its integral.
 
         g = gamma_n / h (of spheres gamma_n is g h delta^(1/4)); the damping grows linearly over the depth `ramp`.
         """
@@ -87,13 +87,13 @@ def law_functions() -> _types.SimpleNamespace:
             psi = spring[1] + g * part * delta * (delta / f64(3.0) - f64(0.5) * delta_n)
             return vec3d(force, k + g * part + g / ramp * (delta - delta_n), psi)
         psi = spring[1] + g * (f64(0.5) * delta * delta - delta_n * delta)
-        # what the ramp leaves out below its depth
+        # reduction of the integral by the ramp
         psi += g * ramp * (f64(0.5) * delta_n - ramp / f64(6.0))
         return vec3d(spring[0] + g * (delta - delta_n), k + g, psi)
 
     @wp.func
     def paper_law(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec4d:
-        """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative and integral; last its size."""
+        """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative, integral, and the magnitude of the integral."""
         if delta <= f64(0.0):
             return vec4d()
         out = damped(lumped, k, g, ramp, delta, delta_n)
@@ -101,7 +101,7 @@ def law_functions() -> _types.SimpleNamespace:
             return vec4d()
         size = elastic(lumped, k, delta)[1] + g * delta * (delta + wp.abs(delta_n))
         if delta_n > f64(0.0) and g > f64(0.0):
-            low = f64(0.0)  # where the force begins: it is negative below, and positive at delta_n
+            low = f64(0.0)  # depth at which the force begins: negative below, positive at delta_n
             high = wp.min(delta, delta_n)
             for _ in range(60):
                 middle = f64(0.5) * (low + high)
@@ -129,7 +129,7 @@ def law_functions() -> _types.SimpleNamespace:
     def normal_law(
         law: int, lumped: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
     ) -> vec4d:  # fmt: skip
-        """Normal force, N, its derivative by the depth, N/m, its integral, J, and the size of its parts; g is
+        """Normal force, N, its derivative by the depth, N/m, its integral, J, and the magnitude of its terms; g is
         chi/h or gamma_n/h."""
         if law == DEFAULT:
             return hunt_crossley(lumped, k, g, delta, delta_n)
@@ -139,7 +139,8 @@ def law_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def friction(trial: vec3d, stiffness: f64, cap: f64) -> wp.vec2d:
-        """Huber's potential, J, of a trial force stiffness x slip, cut at `cap`, and the part of it that acts."""
+        """Huber potential, J, of a trial force stiffness x slip cut at `cap`, and the fraction of the trial force that
+        acts."""
         size = wp.length(trial)
         if size <= cap:
             return wp.vec2d(f64(0.5) * size * size / stiffness, f64(1.0))

@@ -1,12 +1,12 @@
-"""Rigid triangle meshes: nearest place, side and crossing, by a tree of boxes built once in the mesh's own frame.
+"""Rigid triangle meshes: nearest position, side and crossing by a bounding-box tree built once in the mesh's frame.
 
-The tree is our own and all of it is float64, unlike `wp.Bvh`: nothing has to be rounded outward, and its stack is each
-thread's own (queries of `wp.Bvh` share one per block on CUDA). It is balanced: box i has the boxes 2 i + 1 and 2 i + 2.
+Unlike `wp.Bvh` the tree is float64 throughout: no outward rounding is needed, and each thread has its own stack
+(queries of `wp.Bvh` share one per block on CUDA). It is balanced: the children of box i are 2 i + 1 and 2 i + 2.
 
-A closed mesh is solid. A sheet, which has an edge with one triangle, is felt from both of its sides. In both what lies
-in front is told by angle-weighted normals (Baerentzen and Aanaes, IEEE TVCG 11, 2005), and a point that has passed the
-surface belongs to the triangle it came through, until it leaves again: `side` is twice the triangle's number, plus 1
-where it came from behind. What counts then are triangles that face like that one and are ahead of the point.
+A closed mesh is solid. A sheet, which has an edge with one triangle, acts on both of its sides. Angle-weighted normals
+(Baerentzen and Aanaes, IEEE TVCG 11, 2005) determine the front. A point that has passed the surface keeps the triangle
+of its entry until it leaves again: `side` is twice the triangle's number, plus 1 for an entry from behind. Candidates
+are then the triangles that face like that one and are ahead of the point.
 """
 
 import functools
@@ -19,35 +19,35 @@ __all__ = ["FLAT", "MESH", "RIM", "SHARP", "mesh_functions", "mesh_struct"]
 MESH = 5
 """The kind of collider, after those of `contact_shapes`."""
 SHARP, FLAT, RIM = range(3)
-"""A border between triangles of different planes, of one plane, or of an edge that has one triangle."""
+"""Edge between triangles of different planes, of one plane, or of a single triangle."""
 PARTS = 7
-"""Parts of a triangle: face, edges ab, bc, ca, corners a, b, c."""
+"""Features of a triangle: face, edges ab, bc, ca, corners a, b, c."""
 STACK = 40
-"""Boxes that wait, at most one per level of a tree and one more; 2^30 triangles need 30."""
+"""Stack size: at most one box per level of a tree and one more; 2^30 triangles need 30."""
 ALIKE = 0.5
-"""Cosine of the angle by which triangles of one side may turn."""
+"""Minimum cosine between the normals of triangles of one side."""
 FINE = 1e-12
-"""Over the mesh's size: what is behind a surface by less is on it."""
+"""Distance behind a surface that counts as on it, over the mesh's size."""
 ROUNDED = 1e-6
-"""The same of a point that was on the other side: float32 rounds a step's end so far, or less."""
+"""FINE for a point that was on the other side: bound of the float32 round-off of a step's end."""
 SLIVER = 1e-6
-"""Over its thickness: depth of a passage that is none, as over the edge of a blade."""
+"""Depth of a negligible passage (over the edge of a blade), over the mesh's thickness."""
 
 
 @functools.cache
 def mesh_struct():
-    """Triangles of all meshes, [collider], [box] or [.., triangle]; those of a leaf are next to each other."""
+    """Triangles of all meshes, [collider], [box] or [.., triangle]; the triangles of a leaf are contiguous."""
 
     @wp.struct
     class Meshes:
-        box: wp.array(dtype=wp.int32)  # [collider] its first box
-        leaf: wp.array(dtype=wp.int32)  # its first leaf
-        inner: wp.array(dtype=wp.int32)  # boxes above the leaves
+        box: wp.array(dtype=wp.int32)  # [collider] index of its first box
+        leaf: wp.array(dtype=wp.int32)  # index of its first leaf
+        inner: wp.array(dtype=wp.int32)  # number of boxes above the leaves
         low: wp.array(dtype=wp.vec3d)  # [box] corners of boxes, m
         high: wp.array(dtype=wp.vec3d)
-        start: wp.array(dtype=wp.int32)  # [leaf] its first triangle; the next entry ends it
+        start: wp.array(dtype=wp.int32)  # [leaf] index of its first triangle; the next entry ends it
         corner: wp.array2d(dtype=wp.vec3d)  # [corner, triangle], m
-        normal: wp.array2d(dtype=wp.vec3d)  # [part, triangle] of length 1
+        normal: wp.array2d(dtype=wp.vec3d)  # [part, triangle] unit normal
         border: wp.array2d(dtype=wp.int32)  # [part, triangle] FLAT, SHARP or RIM
 
     return Meshes
@@ -62,13 +62,13 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
     @wp.struct
     class Nearest:
         place: vec3d
-        square: f64  # of the distance
+        square: f64  # squared distance
         part: wp.int32
         triangle: wp.int32  # -1: none
 
     @wp.struct
     class Hits:
-        """The first place where a segment passes to the back, and the first to the front; t in [0, 1], or 2."""
+        """First crossings of a segment to the back and to the front; parameter t in [0, 1], or 2."""
 
         into: f64
         out: f64
@@ -77,7 +77,8 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def closest_on(a: vec3d, b: vec3d, c: vec3d, n: vec3d, y: vec3d) -> vec4d:
-        """The place of a triangle nearest to y, and its part (Ericson, Real-Time Collision Detection, 2005, 5.1.5)."""
+        """Nearest position on a triangle to y, and its feature (Ericson, Real-Time Collision Detection, 2005,
+        5.1.5)."""
         zero = f64(0.0)
         ab = b - a
         ac = c - a
@@ -108,7 +109,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def away(low: vec3d, high: vec3d, y: vec3d) -> f64:
-        """Square of the distance from a box."""
+        """Squared distance from a box."""
         out = f64(0.0)
         for k in range(3):
             d = wp.max(wp.max(low[k] - y[k], y[k] - high[k]), f64(0.0))
@@ -117,12 +118,12 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def sense_of(side: int) -> f64:
-        """1 where a point came from the front, -1 from behind."""
+        """Side sign: 1 for a point from the front, -1 from behind."""
         return wp.where(side >= 0 and side % 2 == 1, f64(-1.0), f64(1.0))
 
     @wp.func
     def counts(con: Contacts, t: int, y: vec3d, side: int) -> bool:
-        """Whether a triangle faces like that of a side and is ahead of a point that has passed the surface."""
+        """True if a triangle faces like that of a side and is ahead of a point that has passed the surface."""
         if side < 0:
             return True
         n = con.mesh.normal[0, t]
@@ -132,7 +133,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def nearest(con: Contacts, k: int, y: vec3d, side: int) -> Nearest:
-        """The place of a mesh that is nearest to y; with a side, among triangles that count."""
+        """Nearest position on a mesh to y; with a side, among the candidate triangles."""
         best = Nearest()
         best.square = f64(1.0e300)
         best.triangle = -1
@@ -172,7 +173,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def facing(con: Contacts, k: int, s: Nearest, y: vec3d) -> vec4d:
-        """Normal and distance at the nearest place, positive in front of the surface."""
+        """Normal and signed distance at the nearest position, positive in front of the surface."""
         n = con.mesh.normal[s.part, s.triangle]
         if con.mesh.border[s.part, s.triangle] == FLAT:
             return vec4d(n[0], n[1], n[2], wp.dot(y - con.mesh.corner[0, s.triangle], n))
@@ -185,12 +186,12 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def rim(con: Contacts, s: Nearest) -> bool:
-        """Whether the nearest place is on the rim of a sheet."""
+        """True if the nearest position is on the boundary of a sheet."""
         return con.mesh.border[s.part, s.triangle] == RIM
 
     @wp.func
     def distance(con: Contacts, k: int, y: vec3d, side: int) -> vec4d:
-        """Normal towards the side that a point belongs to, and signed distance; without one outside of a sheet."""
+        """Normal towards the side of the point, and signed distance; without a side: outside of a sheet."""
         s = nearest(con, k, y, -1)
         d = facing(con, k, s, y)
         if con.size[k][2] == f64(0.0) and (side < 0 or rim(con, s)):
@@ -200,13 +201,13 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
             ahead = nearest(con, k, y, side)
             if ahead.triangle >= 0:
                 d = sense_of(side) * facing(con, k, ahead, y)
-                if (d[3] > f64(0.0)) != rim(con, ahead):  # off the rim it is outside
+                if (d[3] > f64(0.0)) != rim(con, ahead):  # away from the boundary it is outside
                     d = -d
         return d
 
     @wp.func
     def side_after(con: Contacts, k: int, y: vec3d, side: int) -> int:
-        """The side of a point where it has come to, -1 outside."""
+        """Side of a point at its new position, -1 outside."""
         if distance(con, k, y, side)[3] >= f64(0.0):
             return -1
         s = nearest(con, k, y, side)
@@ -216,7 +217,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def beside(con: Contacts, k: int, y: vec3d, mark: int) -> int:
-        """1 in front of a sheet, 2 behind, and as before where it is closer than rounding."""
+        """1 in front of a sheet, 2 behind, and unchanged within round-off of the sheet."""
         s = nearest(con, k, y, -1)
         above = wp.dot(y - s.place, con.mesh.normal[s.part, s.triangle])
         if wp.abs(above) <= f64(ROUNDED) * con.size[k][0]:
@@ -227,7 +228,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def apart(low: vec3d, high: vec3d, middle: vec3d, half: vec3d) -> bool:
-        """Whether a segment misses a box (separating axes)."""
+        """True if a segment misses a box (separating axes)."""
         e = f64(0.5) * (high - low)
         c = middle - f64(0.5) * (high + low)
         a = vec3d(wp.abs(half[0]), wp.abs(half[1]), wp.abs(half[2]))
@@ -243,7 +244,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def within(con: Contacts, t: int, p: vec3d, tol: f64) -> bool:
-        """Whether a place of its plane is in a triangle, or next to it by `tol`."""
+        """True if a position in the plane of a triangle is within it or within `tol` of it."""
         n = con.mesh.normal[0, t]
         for k in range(3):
             a = con.mesh.corner[k, t]
@@ -254,12 +255,12 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def hits(con: Contacts, k: int, a: vec3d, b: vec3d, side: int) -> Hits:
-        """Where the segment from a to b passes the surface, from where it begins by `side`: -3 in front, -4 behind."""
+        """Crossings of the surface by the segment from a to b; `side` at its start: -3 in front, -4 behind."""
         out = Hits()
         out.into = f64(2.0)
         out.out = f64(2.0)
         tol = f64(FINE) * con.size[k][0]
-        level = -tol  # from here on up it begins in front
+        level = -tol  # lowest start height that counts as in front
         if side < -2:
             level = wp.where(side == -3, -f64(ROUNDED), f64(ROUNDED)) * con.size[k][0]
         reach = f64(2.0) * f64(ROUNDED) * con.size[k][0]
@@ -298,7 +299,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def passes(con: Contacts, k: int, first: int, entry: vec3d, last: int, leave: vec3d, sense: f64) -> bool:
-        """Whether a way in through a triangle and out through another leads through the mesh, not over its edge."""
+        """True if a path in through a triangle and out through another crosses the mesh, not just its edge."""
         n = con.mesh.normal[0, first]
         turn = wp.dot(n, con.mesh.normal[0, last])
         deep = sense * wp.dot(n, entry - leave)
@@ -309,14 +310,14 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.func
     def passed(con: Contacts, k: int, side: int, y: vec3d) -> bool:
-        """Whether a point is so far behind a sheet that it is beyond it."""
+        """True if a point is so far behind a sheet that it is beyond it."""
         deep = sense_of(side) * wp.dot(con.mesh.normal[0, side / 2], con.mesh.corner[0, side / 2] - y)
         return con.size[k][2] == f64(0.0) and deep > con.size[k][1]
 
     @wp.func
     def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
-        """See `contact_shapes`: the side through which a motion has passed the surface at its end, -1: none or any,
-        -2: it went through."""
+        """Side through which a motion has passed the surface at its end, -1: none or any, -2: it passed through; see
+        `contact_shapes`."""
         h = hits(con, k, start, end, side)
         d = end - start
         if side >= 0:
@@ -347,7 +348,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
     def deepening(
         con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
     ) -> wp.vec2d:  # fmt: skip
-        """Change of the depth by a motion along one plane, and 1; else 0. Last the distances of its ends."""
+        """(change of depth, 1) by a motion along one plane, else (difference of the end distances, 0)."""
         if side < 0:
             return wp.vec2d()
         n = sense_of(side) * con.mesh.normal[0, side / 2]

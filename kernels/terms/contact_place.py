@@ -1,7 +1,7 @@
-"""Where a lumped contact acts: the deepest place of a surface, sought within its facets.
+"""Contact point of a lumped contact: the deepest position of a surface, found within its facets.
 
-The surface is that through the points of each facet: Lagrange's polynomials of the points, which neighbours share on
-their common edge, so that the place moves without jumps where a smooth body rolls.
+The surface interpolates the points of each facet by Lagrange polynomials, which neighbours share on their common edge:
+the contact point moves continuously as a smooth body rolls.
 """
 
 import functools
@@ -18,17 +18,17 @@ from .contact_touch import touch_functions
 __all__ = ["place_kernels"]
 
 PICKS = 8
-"""Choices of the place in an attempt."""
+"""Choices of the contact point in an attempt."""
 TURNS = 12
-"""Newton's steps within a facet."""
+"""Newton steps within a facet."""
 HALVINGS = 6
 PROBE = 1e-5
-"""Step in a facet's coordinates, by which the curvature of a shape is a difference of its normals."""
+"""Step in a facet's coordinates for finite differences of the shape's normals (its curvature)."""
 
 
 @functools.cache
 def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
-    """Kernels of lumped contacts, in a module of their own; `meshes`: a collider is one."""
+    """Kernels of lumped contacts, in a module of their own; `meshes`: some collider is a triangle mesh."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64, vec2d, vec3d = wp.float64, wp.vec2d, wp.vec3d
@@ -48,7 +48,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.struct
     class Jet:
-        """A place of a facet in the collider's frame, and its derivatives by the facet's coordinates."""
+        """Position on a facet in the collider's frame, and its derivatives by the facet's coordinates."""
 
         y: vec3d
         a: vec3d
@@ -60,7 +60,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def jet(con: Contacts, facets: Facets, at: Attempt, world: int, k: int, item: int, u: wp.array2d(dtype=vec3d),
             s: vec2d) -> Jet:  # fmt: skip
-        """The place of coordinates s."""
+        """Position and derivatives at coordinates s."""
         out = Jet()
         back = wp.transpose(at.turn[world, k])
         for q in range(facets.points):
@@ -80,7 +80,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def side_of(corners: int, k: int, s: vec2d) -> vec3d:
-        """Inward normal of an edge of the unit triangle or square, and how far s is inside."""
+        """Inward normal of an edge of the unit triangle or square, and the distance of s from it."""
         if corners == 3 and k == 2:
             return vec3d(f64(-1.0), f64(-1.0), f64(1.0) - s[0] - s[1])
         if k == 0:
@@ -93,7 +93,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def room(corners: int, s: vec2d, d: vec2d) -> f64:
-        """Part of a step d, at most 1, that stays within the facet."""
+        """Fraction of a step d, at most 1, that stays within the facet."""
         part = f64(1.0)
         for k in range(corners):
             edge = side_of(corners, k, s)
@@ -104,8 +104,8 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def downhill(g: vec2d, h: vec3d, corners: int, s: vec2d) -> vec2d:
-        """Newton's step for a gap with gradient g and second derivatives h (aa, ab, bb), along an edge where that
-        blocks it, cut to the facet; 0 where none leads down."""
+        """Newton step for a gap with gradient g and second derivatives h (aa, ab, bb), along an edge where that
+        blocks it, cut to the facet; 0 without a descent direction."""
         det = h[0] * h[2] - h[1] * h[1]
         size = wp.abs(h[0]) + f64(2.0) * wp.abs(h[1]) + wp.abs(h[2])
         d = g * (f64(-1.0) / wp.max(wp.max(size, wp.length(g)), f64(1.0e-300)))
@@ -132,7 +132,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def deepest_of(con: Contacts, facets: Facets, at: Attempt, world: int, k: int, item: int,
                    u: wp.array2d(dtype=vec3d), start: vec2d) -> vec3d:  # fmt: skip
-        """Coordinates of the place of a facet that is closest to the collider, and its gap, down from a start."""
+        """Coordinates of the position of a facet closest to the collider, and its gap, by descent from a start."""
         s = start
         here = jet(con, facets, at, world, k, item, u, s)
         d = distance(con, k, here.y, -1)
@@ -181,7 +181,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
             d = distance(con, k, y, -1)
             depth = reach(con, his, world, c, point, time[world], con.grow[world, k]) - d[3]
-            if con.dead[c] != 0:  # its force is that of the last state
+            if con.dead[c] != 0:  # explicit: its force is that of the last state
                 depth = at.depth[world, point]
         at.level[world, point] = depth
 
@@ -190,7 +190,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), at: Attempt,
     ):  # fmt: skip
-        """The deepest place of each facet, where that may touch and be the deepest of its contact; else a point."""
+        """Deepest position of each facet that may touch and be the deepest of its contact; else its deepest point."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -210,7 +210,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         at.near[world, row] = first + q
         at.spot[world, row] = facets.coords[q]
         at.best[world, row] = top
-        highest = top + (top - low)  # a bound of what lies between points
+        highest = top + (top - low)  # upper bound between the points
         known = f64(-1.0e300)
         if at.pick[world, c] >= con.first[c] and at.pick[world, c] < con.first[c + 1]:
             known = at.level[world, at.pick[world, c]]
@@ -227,9 +227,9 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, row_start: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.int32), fresh: int, at: Attempt,
         changed: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """The deepest place of each lumped contact, of equals the first; it may change a few times per attempt.
+        """Deepest facet of each lumped contact, the first of equals; it may change PICKS times per attempt.
 
-        Where two places are as deep there is no equilibrium with either alone: the last choice stays.
+        With two equally deep positions neither alone gives an equilibrium: the last choice stays.
         """
         world, c = wp.tid()
         if active[world] == 0 or con.lumped[c] == 0:
@@ -254,7 +254,8 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, clock: Clock, u_n: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settled: int, at: Attempt,
     ):  # fmt: skip
-        """Functions of the place that is taken, and where it was as the attempt began; `settled`: it is at a state."""
+        """Shape values of the chosen contact point and its position at the start of the attempt; `settled`: at a
+        state."""
         world, item = wp.tid()
         c = facets.contact[item]
         if active[world] == 0 or facets.moving == 0 or at.moves[world, c] != facets.row + item:
@@ -306,7 +307,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             if clock.still == 0:
                 motion = (at.turn[world, k] * y + at.place[world, k] - x) / clock.h[world]
                 approach = wp.dot(turn * vec3d(d[0], d[1], d[2]), motion - v)
-                # a place that rolls in comes down at first with twice its mean speed
+                # a rolling contact point descends initially at twice its mean speed
                 rolled = depth_before(con, facets, his, at, world, c, point) - at.depth[world, point]
                 speed = wp.max(speed, approach - f64(2.0) * rolled / clock.h[world])
             at.speed[world, point] = speed

@@ -1,7 +1,7 @@
-"""Rigid analytic shapes: signed distance and outward normal, and whether a motion passes through them.
+"""Rigid analytic shapes: signed distance, outward normal, and passage of a motion through them.
 
 All in float64 and in the shape's own frame: half-space z <= 0, sphere about the origin, box along the axes, capsule and
-cylinder along z. `size` holds what `warpfea.model.contacts` says: radius; half edges; radius and half length.
+cylinder along z. `size` as in `warpfea.model.contacts`: radius; half edges; radius and half length.
 """
 
 import functools
@@ -13,9 +13,10 @@ __all__ = ["BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "SPHERE", "shape_function
 
 HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER = range(5)
 LATERAL = 6
-"""Sides: 0 to 5 are the faces -x, +x, -y, +y, -z, +z (ends of a cylinder: 4, 5), 6 the round side of a cylinder."""
+"""Sides: 0 to 5 are the faces -x, +x, -y, +y, -z, +z (ends of a cylinder: 4, 5), 6 the lateral side of a cylinder."""
 THROUGH = 0.5
-"""A motion that enters deeper than this part of a shape's radius or thickness and comes out again passes through it."""
+"""A motion passes through a shape if it enters deeper than this fraction of its radius or thickness and leaves
+again."""
 
 
 @functools.cache
@@ -26,7 +27,7 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def unit(v: vec3d) -> vec3d:
-        """v over its length; z where it has none."""
+        """Unit vector along v; z for v = 0."""
         size = wp.length(v)
         if size > f64(0.0):
             return v / size
@@ -48,7 +49,7 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def depth_below(kind: int, size: vec3d, y: vec3d, side: int) -> f64:
-        """Signed depth of a place under a side of a box or a cylinder."""
+        """Signed depth of a position under a side of a box or a cylinder."""
         if side == LATERAL:
             return size[0] - wp.sqrt(y[0] * y[0] + y[1] * y[1])
         axis = side / 2
@@ -57,12 +58,12 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def axis_place(size: vec3d, y: vec3d) -> vec3d:
-        """The place on a capsule's axis that is nearest to y."""
+        """Nearest position to y on a capsule's axis."""
         return vec3d(f64(0.0), f64(0.0), wp.clamp(y[2], -size[1], size[1]))
 
     @wp.func
     def nearest_side(kind: int, size: vec3d, y: vec3d) -> int:
-        """The side that a place inside a box or a cylinder is closest to."""
+        """Nearest side to a position inside a box or a cylinder."""
         best = wp.int32(5)
         least = depth_below(kind, size, y, 5)
         first = wp.where(kind == CYLINDER, 4, 0)
@@ -113,8 +114,8 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def enters(kind: int, size: vec3d, a: vec3d, d: vec3d) -> vec3d:
-        """Where a + t d is within a box or a cylinder: t of entry and of leaving, and 16 x side of entry + side of
-        leaving; without entry the first is the larger."""
+        """Interval of t with a + t d within a box or a cylinder: t of entry, t of exit, and 16 x side of entry + side
+        of exit; the first is larger than the second if there is none."""
         t_in = f64(-1.0e300)
         t_out = f64(1.0e300)
         side_in = wp.int32(0)
@@ -170,7 +171,7 @@ def shape_functions() -> _types.SimpleNamespace:
             return distance(kind, size, a, -1)[3] + size[0]
         half = wp.where(kind == CAPSULE, size[1], f64(0.0))
         t = wp.clamp(-wp.dot(a, d) / aa, f64(0.0), f64(1.0))
-        for _ in range(8):  # alternately the nearest place on either segment: convex, and exact for a sphere
+        for _ in range(8):  # alternating projection on the two segments: convex, and exact for a sphere
             z = wp.clamp(a[2] + t * d[2], -half, half)
             t = wp.clamp((z * d[2] - wp.dot(a, d)) / aa, f64(0.0), f64(1.0))
         p = a + t * d
@@ -178,9 +179,9 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def sweep(kind: int, size: vec3d, start: vec3d, end: vec3d, side: int) -> int:
-        """Side through which a motion from `start` to `end` is inside at its end, -1: any; -2: it went through.
+        """Side through which a motion from `start` to `end` ends inside, -1: any; -2: it passed through.
 
-        `side`: that at the start, -1 where it was outside.
+        `side`: that at the start, -1: outside.
         """
         if kind == HALF_SPACE:
             return -1
@@ -214,7 +215,7 @@ def shape_functions() -> _types.SimpleNamespace:
                 if near < f64(THROUGH) * size[0]:
                     return -2
             return -1
-        # it left by another side: off an edge, or through
+        # it left by another side: over an edge, or through
         limit = f64(2.0) * f64(THROUGH) * half_size(kind, size, wp.where(entry == LATERAL, 0, entry / 2))
         if depth_below(kind, size, start + cross[1] * d, entry) > limit:
             return -2

@@ -1,4 +1,4 @@
-"""Whether bodies begin across a sheet of triangles, of which no side can be told then."""
+"""Check for bodies that cross a sheet of triangles at the start, where their side is undefined."""
 
 import functools
 import types as _types
@@ -15,7 +15,7 @@ __all__ = ["sheet_kernels"]
 
 @functools.cache
 def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
-    """A kernel in a module of its own, which runs as a simulation begins."""
+    """A kernel in a module of its own, run once at the start of a simulation."""
     vec3, vec3d = precision(dtype).vec3, wp.vec3d
     Contacts, Facets, Attempt = contact_struct(True), facet_struct(dtype), attempt_struct(dtype)
     along = touch_functions(dtype, True).along
@@ -27,7 +27,7 @@ def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), tolerance: wp.array(dtype=wp.float64), at: Attempt,
         found: wp.array2d(dtype=wp.int32),
     ):  # fmt: skip
-        """Of each facet a point that is behind a sheet as seen from the point before it, + 1; found: [world, row]."""
+        """Point of each facet that is behind a sheet as seen from the preceding point, + 1; found: [world, row]."""
         world, item = wp.tid()
         k = con.collider[facets.contact[item]]
         before = vec3d()

@@ -1,4 +1,4 @@
-"""A surface point against its obstacle: where it is, its normal force, its friction, and their derivative."""
+"""A surface point against its obstacle: position, normal force, friction, and their derivative."""
 
 import functools
 import types as _types
@@ -17,7 +17,8 @@ __all__ = ["touch_functions"]
 
 @functools.cache
 def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
-    """Device functions in one precision of the displacements; all but these is float64. `meshes`: a collider is one."""
+    """Device functions in one precision of the displacements; everything else is float64. `meshes`: some collider is a
+    mesh."""
     T = precision(dtype).T
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
@@ -39,15 +40,15 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
         n: vec3d  # outward normal of the shape
         depth: f64
-        rise: f64  # by which it has grown in the step; of a place that moves, from that of the place before
+        rise: f64  # change of depth in the step; of a moving contact point, from the depth of the previous one
         side: wp.int32
-        law: wp.vec4d  # normal force, its derivative, its potential, the size of the potential's parts
+        law: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
         m: vec3d  # normal of the plane of friction
-        motion: vec3d  # in the step, relative to the collider
-        whole: vec3d  # motion and spring
-        slip: vec3d  # motion in that plane
-        q: vec3d  # spring: tangential slip since it was anchored
-        y: vec3d  # place in the collider's frame
+        motion: vec3d  # in the step, relative to the collider, m
+        whole: vec3d  # motion plus spring, m
+        slip: vec3d  # motion in that plane, m
+        q: vec3d  # spring: tangential slip since it was anchored, m
+        y: vec3d  # position in the collider's frame, m
 
     @wp.func
     def along(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
@@ -59,14 +60,14 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def shape_of(facets: Facets, at: Attempt, world: int, point: int, i: int, item: int) -> T:
-        """Function of slot i of a facet where a point, or a lumped contact, acts."""
+        """Shape value of slot i at the active point: a point of a facet, or that of a lumped contact."""
         if facets.moving != 0:
             return at.weight[world, facets.contact[item], i]
         return facets.shape[point, i, item]
 
     @wp.func
     def acting(facets: Facets, at: Attempt, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
-        """sum_i s_i field_i where a point, or a lumped contact, acts."""
+        """sum_i s_i field_i at the active point."""
         if facets.moving == 0:
             return along(facets, field, world, point, item)
         out = vec3d()
@@ -76,14 +77,14 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def reference(facets: Facets, at: Attempt, world: int, point: int, item: int) -> vec3d:
-        """Where that is in the reference, m."""
+        """Reference position of the active point, m."""
         if facets.moving != 0:
             return at.middle[world, facets.contact[item]]
         return facets.X[point, item]
 
     @wp.func
     def monomial(x: f64, power: int, derivative: int) -> f64:
-        """A derivative of x^power."""
+        """Derivative of x^power."""
         out = f64(1.0)
         for j in range(derivative):
             out *= f64(power - j)
@@ -93,7 +94,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def lagrange(facets: Facets, q: int, s: wp.vec2d) -> f64:
-        """The polynomial that is 1 at point q and 0 at the others of a facet."""
+        """Lagrange polynomial of a facet: 1 at point q and 0 at the others."""
         out = f64(0.0)
         for m in range(facets.power.shape[0]):
             out += facets.basis[q, m] * (monomial(s[0], facets.power[m][0], 0) * monomial(s[1], facets.power[m][1], 0))
@@ -101,37 +102,37 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def plane(n: vec3d, a: vec3d) -> vec3d:
-        """The part of a that is normal to n."""
+        """Component of a normal to n."""
         return a - wp.dot(n, a) * n
 
     @wp.func
     def record_of(con: Contacts, c: int, point: int) -> int:
-        """Where the history of a point is."""
+        """Index of a point's history."""
         if con.lumped[c] != 0:
             return con.first[c]
         return point
 
     @wp.func
     def allowance(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
-        """What is left of a stored overlap."""
+        """Remaining part of an initial overlap, m."""
         left = f64(1.0) - (time - his.born[world]) / con.decay[c]
         return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
 
     @wp.func
     def recovered(con: Contacts, his: History, clock: Clock, world: int, c: int, point: int) -> f64:
-        """How far the surface of a stored overlap moves out in a substep, m: its force does work."""
+        """Outward motion of the surface of an initial overlap in a substep, m: its force does work."""
         now = clock.new_time[world]
         before = allowance(con, his, world, c, point, now - clock.h[world])
         return before - allowance(con, his, world, c, point, now)
 
     @wp.func
     def reach(con: Contacts, his: History, world: int, c: int, point: int, time: f64, grown: f64) -> f64:
-        """Distance from the shape, which has grown so much, at which contact begins."""
+        """Gap at which contact begins, m: offset + `grown` - remaining overlap."""
         return con.offset[c] + grown - allowance(con, his, world, c, point, time)
 
     @wp.func
     def depth_before(con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, point: int) -> f64:
-        """Depth as the step began: of a live contact whose place moves, of the deepest place then."""
+        """Depth at the start of the step, m; for a moving point in contact, that of the deepest position then."""
         if facets.moving != 0:
             rec = record_of(con, c, point)
             if his.speed[world, rec] > f64(0.0):
@@ -152,8 +153,8 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def in_plane(t: Touch, m: vec3d) -> Touch:
-        """The point with friction in the plane of a normal m, which is held with the caps: on a curved shape the force
-        would not be the derivative of its potential if the plane turned with the iterate."""
+        """The point with friction in the plane of a normal m, frozen with the friction limits: on a curved shape the
+        force would not be the derivative of its potential if the plane turned with the iterate."""
         out = t
         out.m = m
         out.slip = plane(m, t.motion)
@@ -165,7 +166,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
         u: wp.array2d(dtype=vec3d), time: f64, inv_h: f64, shrink: f64,
     ) -> Touch:  # fmt: skip
-        """A point at displacements u, in float64, see contact_exact.py."""
+        """A point at displacements u (float64, see kernels/terms/contact_exact.py)."""
         out = Touch()
         k = con.collider[c]
         rec = record_of(con, c, point)
@@ -179,7 +180,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
         out.side = -1
         far = bool(False)
-        if wp.static(meshes):  # no nearer than it was, less its way: a mesh need not be searched
+        if wp.static(meshes):  # lower bound of the distance, the last one minus the motion: avoids a search of the mesh
             d[3] = at.reach[world, point] - at.depth[world, point] - wp.length(out.y - at.start[world, point])
             far = con.kind[k] == MESH and con.law[c] != SMOOTH and not live and d[3] > wp.max(begins, f64(0.0))
         if not far:
@@ -212,7 +213,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
-        """mu of a contact that slipped in the last step, else mu_static."""
+        """Friction coefficient: mu for a contact that slipped in the last step, else mu_static."""
         live = his.speed[world, rec] > f64(0.0)
         if live and his.mark[world, rec] >= SLIPS:
             return con.mu[world, c]
@@ -222,8 +223,8 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def put_explicit(
         con: Contacts, his: History, at: Attempt, world: int, c: int, point: int, delta: f64, n: vec3d, v: vec3d, h: f64
     ):  # fmt: skip
-        """Force and spring, Eqs. (77)-(83) literally, of a point at depth delta that moves with v relative to what it
-        touches, for a step h."""
+        """Force and spring, Eqs. (77)-(83) unmodified, of a point at depth delta with relative velocity v, for a step
+        h."""
         rec = record_of(con, c, point)
         v_n_rel = wp.dot(v, n)
         v_t = v - v_n_rel * n
@@ -249,7 +250,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def hold(con: Contacts, his: History, at: Attempt, world: int, c: int, point: int, t: Touch) -> vec3d:
-        """Cap, k_t and shrinkage of the spring at an iterate."""
+        """Friction limit, k_t and reduction factor of the spring at an iterate."""
         rec = record_of(con, c, point)
         mu = coefficient(con, his, world, c, rec)
         live = his.speed[world, rec] > f64(0.0)
@@ -265,14 +266,14 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def pull(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64) -> wp.vec4d:
-        """Friction that resists the motion, as a trial force and in w its whole stiffness (spring and damper)."""
+        """Friction opposing the motion: trial force, and in w its total stiffness (spring and damper)."""
         gamma = tangent_damping(con, world, c, held[1]) * inv_h
         trial = held[1] * t.q + gamma * t.slip
         return wp.vec4d(trial[0], trial[1], trial[2], held[1] + gamma)
 
     @wp.func
     def friction_potential(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64) -> f64:
-        """J, with a cap that is held."""
+        """Friction potential with a frozen limit, J."""
         if held[0] <= f64(0.0):
             return f64(0.0)
         if con.law[c] == SMOOTH:
@@ -284,7 +285,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def friction_force(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64) -> vec3d:
-        """What friction adds to the residual, N."""
+        """Friction force on the residual, N."""
         if held[0] <= f64(0.0):
             return vec3d()
         if con.law[c] == SMOOTH:
@@ -297,7 +298,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def point_stiffness(con: Contacts, world: int, c: int, t: Touch, held: vec3d, inv_h: f64) -> mat33d:
-        """Derivative of the force that a point adds to the residual, positive: without that of the normal."""
+        """Derivative of the force that a point adds to the residual, positive; the change of the normal is omitted."""
         K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
         if held[0] > f64(0.0):
             P = wp.identity(n=3, dtype=f64) - wp.outer(t.m, t.m)
@@ -318,7 +319,7 @@ def touch_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def acts(con: Contacts, at: Attempt, world: int, c: int, point: int) -> f64:
-        """1 unless another point stands for the contact."""
+        """1, or 0 if another point represents the contact."""
         if con.lumped[c] != 0 and at.pick[world, c] != point:
             return f64(0.0)
         return f64(1.0)

@@ -1,4 +1,4 @@
-"""Loads that turn with the body: pressure on faces and moments, and the symmetric part of their tangents."""
+"""Follower loads: pressure on faces, moments, and the symmetric part of their tangents."""
 
 import functools
 import types as _types
@@ -28,7 +28,7 @@ def follower_struct(dtype: str):
         weight: wp.array(dtype=T)  # [point]; faces
         gradient: wp.array2d(dtype=vec3)  # [local, item] c_ki of the point's vectors y_k = sum_i c_ki e_i; moments
         axes: wp.array(dtype=p.mat33)  # [item] reference values of the vectors (columns); moments
-        share: wp.array(dtype=T)  # [item] part of the moment; moments
+        share: wp.array(dtype=T)  # [item] fraction of the moment; moments
         offset: wp.int32
         count: wp.int32
 
@@ -101,9 +101,9 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """(K + K^T)/2 p with K = df/dq of the pressure force: its symmetric part, all of it on a closed surface.
+        """(K + K^T)/2 p with K = df/dq of the pressure force: its symmetric part; exact on a closed surface.
 
-        `share`: of p, that there is of it at u.
+        `share`: factor on the change of u in p.
         """
         world, item = wp.tid()
         if active[world] == 0:
@@ -155,15 +155,15 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
 
     @wp.func
     def complete(Y: mat33) -> mat33:
-        """The section's vectors with its unit normal before them."""
+        """Section vectors preceded by their unit normal."""
         return place(Y, 0, wp.normalize(wp.cross(column(Y, 1), column(Y, 2))))
 
     @wp.func
     def spin_force(Y: mat33, m: vec3) -> mat33:
-        """Forces on the vectors (columns) that do the work m.w on their spin w.
+        """Forces on the vectors (columns) whose work on their spin w is m.w.
 
-        3: w is the axial vector of Ydot Y^-1. 2: the section and its normal turn, w = axial of Adot A^-1 with
-        A = [n, y_1, y_2]. 1: w = y x ydot / y^2.
+        3: w is the axial vector of Ydot Y^-1. 2: rotation of the section with its normal, w = axial of Adot A^-1 with A
+        = [n, y_1, y_2]. 1: w = y x ydot / y^2.
         """
         out = mat33()
         if wp.static(vectors == 3):
@@ -219,7 +219,7 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
 
     @wp.func
     def current(data: Follower, u: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
-        """Present vectors: their reference values (the axes) and displacements."""
+        """Current vectors: their reference values (the axes) plus displacements."""
         return data.axes[item] + gather(data, u, world, item)
 
     @wp.kernel(module=module)
@@ -230,7 +230,7 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """f_i = sum_k c_ki phi_k, phi the forces that do the work of the moment on the spin of the vectors."""
+        """f_i = sum_k c_ki phi_k, phi the forces that do the moment's work on the spin of the vectors."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -249,7 +249,7 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """(K + K^T)/2 p with K = df/dq; `share`: of p, that there is of it at u."""
+        """(K + K^T)/2 p with K = df/dq; `share`: factor on the change of u in p."""
         world, item = wp.tid()
         if active[world] == 0:
             return

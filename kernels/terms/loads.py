@@ -13,7 +13,7 @@ __all__ = ["body_force_kernel", "law_function_kernel", "law_struct", "load_kerne
 
 @functools.cache
 def law_struct():
-    """Time laws: row k is a constant (count 1) or samples of time, piecewise linear, held beyond both ends."""
+    """Time laws: row k is a constant (count 1) or samples of time, piecewise linear, constant beyond both ends."""
 
     @wp.struct
     class TimeLaws:
@@ -31,7 +31,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Laws = law_struct()
-    # a module per kind of load: a scene compiles what it uses
+    # a module per kind of load: a scene compiles only those it uses
     laws_module = kernel_module(f"laws_{dtype}")
     controls_module = kernel_module(f"controls_{dtype}")
     dead_module = kernel_module(f"dead_load_{dtype}")
@@ -48,7 +48,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=wp.vec3d),
     ):
-        """Value of each law at the new time; constants carry the ramp of a static load path."""
+        """Value of each law at the new time; constants are scaled by the ramp of a static load path."""
         world, law = wp.tid()
         if active[world] == 0:
             return
@@ -76,7 +76,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=wp.vec3d),
     ):
-        """Value of the law that a control is; it carries the ramp of a static load path where a constant does."""
+        """Value of a law that is a control; scaled by the ramp of a static load path if a constant would be."""
         world = wp.tid()
         if active[world] == 0:
             return
@@ -120,7 +120,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         gravity: wp.array(dtype=wp.vec3d),
     ):
-        """Gravity of a time law."""
+        """Gravity from a time law."""
         world = wp.tid()
         if active[world] != 0:
             gravity[world] = value[world, law]
@@ -184,7 +184,8 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         v: wp.array2d(dtype=vec3),
     ):
-        """The same for u(t) = (R(angle) - I) arm, arm the slot's reference value from the anchor (Rodrigues)."""
+        """`drive_displacement` for u(t) = (R(angle) - I) arm, arm the slot's reference position relative to the anchor
+        (Rodrigues)."""
         world, k = wp.tid()
         if active[world] == 0:
             return
@@ -238,7 +239,7 @@ def law_function_kernel(function: wp.Function, scalar: bool, take_dtype: str):
 
 @functools.lru_cache(maxsize=256)
 def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
-    """Kernel of Eq. (23): f_i = sum_q rho w s_i b(r_q, t), b at the current position; one serves all elements."""
+    """Kernel of Eq. (23): f_i = sum_q rho w s_i b(r_q, t), b at the current position; the same for all elements."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     take = precision(take_dtype)
@@ -286,7 +287,7 @@ _names: dict[str, list[wp.Function]] = {}
 
 
 def _unique_module(kind: str, function: wp.Function, *key) -> wp.Module:
-    """A module per user function, named alike in every process so that the kernel cache finds it again."""
+    """Module of a user function, with a name reproducible across processes for the kernel cache."""
     same = _names.setdefault(function.key, [])
     if function not in same:
         same.append(function)

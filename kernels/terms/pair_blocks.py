@@ -1,4 +1,4 @@
-"""What contact between bodies adds to a matrix: the blocks of each side by itself."""
+"""Matrix blocks of contact between bodies: the diagonal blocks of each side."""
 
 import functools
 import types as _types
@@ -14,7 +14,7 @@ __all__ = ["pair_block_kernels"]
 
 @functools.cache
 def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
-    """The kernel for master facets; slave facets have that of contact with obstacles."""
+    """Kernel for master facets; slave facets use that of contact with obstacles."""
     p = precision(dtype)
     T, mat33, sym = p.T, p.mat33, p.sym
     f64 = wp.float64

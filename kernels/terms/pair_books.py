@@ -1,4 +1,4 @@
-"""What an accepted step of contact between bodies leaves: books of energy, records, history."""
+"""Contact between bodies after an accepted step: energy ledger, records, history."""
 
 import functools
 import types as _types
@@ -49,13 +49,13 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def add_work(rows: wp.array3d(dtype=f64), world: int, row: int, work: f64):
-        """What a stored overlap does that recovers, which the integrator's own formula lacks."""
+        """Work of a recovering initial overlap, which the integrator's own formula omits."""
         add(rows, 3, world, row, work)
         add(rows, 4, world, row, work)
 
     @wp.func
     def forget(his: History, seats: Seats, world: int, point: int):
-        """A point is in contact no longer."""
+        """Reset the history of a point that has left contact."""
         his.spring[world, point] = vec3d()
         his.stored[world, point] = f64(0.0)
         his.cap[world, point] = f64(0.0)
@@ -66,7 +66,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def tell_force(at: Attempt, world: int, row: int, force: vec3d, x: vec3d):
-        """A force and its moment into the record of a facet."""
+        """Add a force and its moment to the record of a facet."""
         moment = wp.cross(x, force)
         for j in range(3):
             add(at.rows, j, world, row, force[j])
@@ -74,7 +74,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def spring_after(law: int, s: Touch, held: vec3d, w: wp.vec4d, pulled: vec3d) -> vec3d:
-        """The friction spring that stays where the force is cut to the cap; by Eq. (83) of the paper's law."""
+        """Friction spring after the force was cut to the friction limit; Eq. (83) for the paper's law."""
         trial = vec3d(w[0], w[1], w[2])
         size = wp.length(trial)
         if size <= held[0]:
@@ -90,7 +90,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
         his: History, seats: Seats, at: Attempt, t: Touching, world: int, point: int, f: int, cap: f64, slips: int,
         closing: f64,
     ):  # fmt: skip
-        """Where a point is in contact, the largest speed of its approach, and whether it slips."""
+        """Store the master facet of a point, its largest approach speed, and its slip state."""
         his.cap[world, point] = cap
         his.speed[world, point] = wp.max(at.speed[world, point], closing)
         mark = wp.int32(1)
@@ -105,7 +105,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
         accepted: wp.array(dtype=wp.int32), at: Attempt, t: Touching, booked: wp.array3d(dtype=f64),
     ):  # fmt: skip
-        """Books of an accepted substep and the record of it per facet, and the history after it."""
+        """Energy increments of an accepted substep, its record per facet, and the history after it."""
         world, item = wp.tid()
         if accepted[world] == 0:
             return
@@ -127,7 +127,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
             if share == f64(0.0) or (f < 0 and not live):
                 continue
             stored, kept, base = f64(0.0), vec3d(), vec3d()
-            if f < 0:  # beyond an edge of the surface
+            if f < 0:  # beyond the boundary of the surface
                 at.state[world, point] = IDLE
                 add(booked, 1, world, row, share * his.stored[world, point])
                 forget(his, seats, world, point)
@@ -186,7 +186,7 @@ def pair_book_kernels(dtype: str) -> _types.SimpleNamespace:
         clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32), his: History, at: Attempt,
     ):  # fmt: skip
-        """The energy of contact counts in the bound of the next first iterate."""
+        """Add the contact energy to the bound of the next initial iterate."""
         world = wp.tid()
         if accepted[world] == 0:
             return

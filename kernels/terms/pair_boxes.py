@@ -1,4 +1,4 @@
-"""Master facets as an attempt has them: coefficients of their polynomials, their middles, and boxes in a tree."""
+"""Master facets during an attempt: polynomial coefficients, midpoints, and bounding boxes of the tree."""
 
 import functools
 import types as _types
@@ -13,13 +13,13 @@ from .pair_places import place_functions
 __all__ = ["MARGIN", "box_kernels"]
 
 MARGIN = 0.25
-"""Boxes of the tree are larger than facets by this part of a side: they fit for several steps."""
+"""Enlargement of the boxes of the tree over a facet's side: they stay valid for several steps."""
 ROUNDING = 2.4e-7
 
 
 @functools.cache
 def box_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels in one precision of the displacements, in the module of `seek_kernels`, and functions of boxes."""
+    """Kernels in one precision of the displacements, in the module of `seek_kernels`, and box functions."""
     vec3 = precision(dtype).vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
     mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
@@ -33,7 +33,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
         D: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """Coefficient m of a field of the slots on a master facet."""
+        """Coefficient m of a slot field on a master facet."""
         c = vec3d()
         d = vec3d()
         for i in range(mas.conn.shape[0]):
@@ -48,7 +48,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
         D: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """Coefficients of displacements on master facets, in float64, see contact_exact.py."""
+        """Coefficients of displacements on master facets in float64, see kernels/terms/contact_exact.py."""
         world, item, m = wp.tid()
         if active[world] != 0 and m < mas.terms[mas.kind[item]]:
             control(mas, u, world, item, m, C, D)
@@ -58,7 +58,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
         t: Touching,
     ):  # fmt: skip
-        """Those of displacements and velocities as an attempt begins; no depth is known yet."""
+        """Coefficients of displacements and velocities at the start of an attempt; resets the largest depths."""
         world, item, m = wp.tid()
         if active[world] != 0:
             for body in range(mas.most * item + m, t.deepest.shape[1], mas.most * mas.count):
@@ -69,7 +69,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def down(x: vec3d) -> box3:
-        """x in single precision, rounded down by more than it can be rounded up."""
+        """x in single precision, rounded down by more than its largest round-off."""
         return box3(
             wp.float32(x[0] - wp.abs(x[0]) * f64(ROUNDING)),
             wp.float32(x[1] - wp.abs(x[1]) * f64(ROUNDING)),
@@ -83,7 +83,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def contains(low: box3, high: box3, other_low: box3, other_high: box3) -> bool:
-        """Whether a box holds another one."""
+        """True if a box contains another one."""
         inside = bool(True)
         for j in range(3):
             if other_low[j] < low[j] or other_high[j] > high[j]:
@@ -92,17 +92,17 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def rows_of(s: Jet) -> mat43:
-        """A jet as it is kept."""
+        """Position and derivatives, packed in a matrix."""
         return mat43(s.x[0], s.x[1], s.x[2], s.a[0], s.a[1], s.a[2], s.b[0], s.b[1], s.b[2], s.c[0], s.c[1], s.c[2])
 
     @wp.func
     def jet_of(m: mat43) -> Jet:
-        """A jet that was kept."""
+        """Position and derivatives from their matrix."""
         return Jet(m[0], m[1], m[2], m[3])
 
     @wp.kernel(module=module)
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), t: Touching):
-        """Whether facets, as the attempt began and now, are within their boxes; and new boxes."""
+        """Flag facets outside of their boxes, at the start of the attempt or now; compute new boxes."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -130,7 +130,8 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def keep_middles(mas: Masters, active: wp.array(dtype=wp.int32), t: Touching):
-        """Middles of facets, as the attempt began and now, and how far they rise above the plane there."""
+        """Position and derivatives at the midpoint of each facet, at the start of the attempt and now, and the facet's
+        largest height above the tangent plane there."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -151,7 +152,7 @@ def box_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def adopt_boxes(t: Touching):
-        """Take the new boxes."""
+        """Replace the boxes by the new ones."""
         index = wp.tid()
         t.lower[index] = t.wanted_lower[index]
         t.upper[index] = t.wanted_upper[index]

@@ -1,4 +1,4 @@
-"""What kernels of contact between bodies read and write beside the structs of contact with obstacles."""
+"""Structs of contact between bodies, in addition to those of contact with obstacles."""
 
 import functools
 
@@ -11,33 +11,33 @@ __all__ = ["master_struct", "seat_struct", "touching_struct"]
 
 @functools.cache
 def master_struct(dtype: str):
-    """Facets of master surfaces: places are polynomials of two coordinates, and linear along an outward vector.
+    """Facets of master surfaces: positions are polynomials of two coordinates, linear along an outward vector.
 
-    x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i rise_mi u_i)): the vector is the material's,
-    carried along by the deformation gradient, so that a point near a surface has weights on the slots of one element.
+    x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i rise_mi u_i)): the outward vector is a material
+    vector mapped by the deformation gradient, so that a point near a surface depends on the slots of one element.
     """
     T = precision(dtype).T
 
     @wp.struct
     class Masters:
-        tree: wp.uint64  # boxes of [world, facet], grouped by world and surface
-        of: wp.array(dtype=wp.int32)  # [contact] its surface
-        sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points are of the second body
-        bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points and of the facets, among those in pairs
+        tree: wp.uint64  # bounding-box tree of [world, facet], grouped by world and surface
+        of: wp.array(dtype=wp.int32)  # [contact] its master surface
+        sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points belong to the second body
+        bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points and of the facets, numbered among bodies in pairs
         surfaces: wp.int32
-        touch: wp.float64  # depth as a step begins that counts as touch, m
-        most: wp.int32  # monomials of a facet, at most
+        touch: wp.float64  # depth at the start of a step that counts as contact, m
+        most: wp.int32  # maximum number of monomials of a facet
         conn: wp.array2d(dtype=wp.int32)  # [local, facet] slot
         shape: wp.array3d(dtype=T)  # [monomial, local, facet]
         rise: wp.array3d(dtype=T)  # 1/m
         X: wp.array2d(dtype=wp.vec3d)  # [monomial, facet]
         N: wp.array2d(dtype=wp.vec3d)
         kind: wp.array(dtype=wp.int32)  # [facet]
-        terms: wp.array(dtype=wp.int32)  # [kind] monomials
+        terms: wp.array(dtype=wp.int32)  # [kind] number of monomials
         corners: wp.array(dtype=wp.int32)  # [kind]
         power: wp.array2d(dtype=wp.vec2i)  # [kind, monomial] exponents
-        hull: wp.array3d(dtype=wp.float64)  # [kind, point, monomial] control points whose hull holds the facet
-        limit: wp.array(dtype=wp.float64)  # [facet] depth beyond which a point would leave through another side, m
+        hull: wp.array3d(dtype=wp.float64)  # [kind, point, monomial] control points; convex hull of the facet
+        limit: wp.array(dtype=wp.float64)  # [facet] depth beyond which a point would leave through the opposite side, m
         size: wp.array(dtype=wp.float64)  # [facet] length of a side, m
         surface: wp.array(dtype=wp.int32)  # [facet]
         pool: wp.int32  # first entry in the pool
@@ -48,19 +48,19 @@ def master_struct(dtype: str):
 
 @functools.cache
 def seat_struct():
-    """What the state keeps of points in contact, beside their history, [world, point]."""
+    """Pair history in the state beside `History`, [world, point]."""
 
     @wp.struct
     class Seats:
-        seat: wp.array2d(dtype=wp.int32)  # master facet + 1 that a point is in contact with
-        spot: wp.array2d(dtype=wp.vec3d)  # where on it: coordinates, and m along the outward vector
+        seat: wp.array2d(dtype=wp.int32)  # master facet in contact + 1; 0: none
+        spot: wp.array2d(dtype=wp.vec3d)  # its coordinates, and m along the outward vector
 
     return Seats
 
 
 @functools.cache
 def touching_struct(dtype: str):
-    """What an attempt makes; [world, control]: monomial m of facet f is control `most f + m`."""
+    """Pair quantities of an attempt; [world, control]: monomial m of facet f is control `most f + m`."""
     p = precision(dtype)
     T, vec3, vec2, sym = p.T, p.vec3, p.vec2, p.sym
     mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
@@ -68,52 +68,52 @@ def touching_struct(dtype: str):
     @wp.struct
     class Touching:
         C: wp.array2d(dtype=wp.vec3d)  # [world, control] coefficients of displacements at the iterate
-        D: wp.array2d(dtype=wp.vec3d)  # of those of the outward vector
-        C0: wp.array2d(dtype=wp.vec3d)  # as the attempt began
+        D: wp.array2d(dtype=wp.vec3d)  # of the outward vector
+        C0: wp.array2d(dtype=wp.vec3d)  # at the start of the attempt
         D0: wp.array2d(dtype=wp.vec3d)
-        V0: wp.array2d(dtype=wp.vec3d)  # of velocities then
-        middle: wp.array2d(dtype=mat43)  # [world, facet] place in its middle and derivatives there, rows as of a Jet
-        swell: wp.array2d(dtype=wp.float64)  # [world, facet] most that it rises above the plane in its middle, m
-        middle0: wp.array2d(dtype=mat43)  # as the attempt began
+        V0: wp.array2d(dtype=wp.vec3d)  # of velocities at the start of the attempt
+        middle: wp.array2d(dtype=mat43)  # [world, facet] position at the midpoint and derivatives, rows as of a Jet
+        swell: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the midpoint, m
+        middle0: wp.array2d(dtype=mat43)  # at the start of the attempt
         lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
         upper: wp.array(dtype=wp.vec3)
         wanted_lower: wp.array(dtype=wp.vec3)
         wanted_upper: wp.array(dtype=wp.vec3)
         stale: wp.array(dtype=wp.int32)  # a facet has left its box
-        fits: wp.array(dtype=wp.int32)  # refits so far
-        near: wp.array2d(dtype=wp.int32)  # [world, facet row of the slaves] a master surface is in reach
-        calm_lower: wp.array2d(dtype=wp.vec3)  # box in which none is, as of refit `calm`
+        fits: wp.array(dtype=wp.int32)  # number of refits so far
+        near: wp.array2d(dtype=wp.int32)  # [world, facet row of the slaves] 1 if a master surface is within reach
+        calm_lower: wp.array2d(dtype=wp.vec3)  # box without master facets, valid for refit `calm`
         calm_upper: wp.array2d(dtype=wp.vec3)
         calm: wp.array2d(dtype=wp.int32)
-        x0: wp.array2d(dtype=wp.vec3d)  # [world, point] place as the attempt began
-        deepest: wp.array2d(dtype=wp.float64)  # [world, body] largest depth of its points in contact then, m
-        first: wp.array2d(dtype=wp.int32)  # facet + 1 from which its motion is measured, 0: none yet
-        spot0: wp.array2d(dtype=wp.vec3d)  # where it was on that
-        stretch: wp.array2d(dtype=wp.vec2d)  # then: gap per coordinate along the outward vector, and its rest, m
-        seat: wp.array2d(dtype=wp.int32)  # master facet at the iterate, -1: none; -2: went through
+        x0: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the attempt, m
+        deepest: wp.array2d(dtype=wp.float64)  # [world, body] largest depth of its points in contact at the start, m
+        first: wp.array2d(dtype=wp.int32)  # facet + 1 that its motion is relative to; 0: not yet set
+        spot0: wp.array2d(dtype=wp.vec3d)  # start coordinates on that facet
+        stretch: wp.array2d(dtype=wp.vec2d)  # start value of the gap per outward coordinate, and its remainder, m
+        seat: wp.array2d(dtype=wp.int32)  # master facet at the iterate, -1: none; -2: penetrated completely
         spot: wp.array2d(dtype=wp.vec3d)
-        foot: wp.array2d(dtype=wp.vec3d)  # coordinates of the closest place on the facet
+        foot: wp.array2d(dtype=wp.vec3d)  # coordinates of the projection on the facet
         depth: wp.array2d(dtype=wp.float64)
-        before: wp.array2d(dtype=wp.float64)  # depth as the attempt began
-        normal: wp.array2d(dtype=wp.vec3d)  # of the facet there, minus the derivative of the depth by the place
-        motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material
-        whole: wp.array2d(dtype=wp.vec3d)  # that and the friction spring
-        weight: wp.array3d(dtype=T)  # [world, point, local] functions of the master's slots at the foot
-        slope: wp.array3d(dtype=vec2)  # their derivatives by the coordinates of the foot
-        lean: wp.array3d(dtype=vec3)  # [world, point, 2] what a turn of the facet does to the force, see `lean_on`
-        bend: wp.array2d(dtype=sym)  # and its own turn and curvature
-        turned: wp.array2d(dtype=vec2)  # [world, point] of a product, what turns the facet
-        held_weight: wp.array3d(dtype=T)  # functions that friction acts by, held with its cap
+        before: wp.array2d(dtype=wp.float64)  # depth at the start of the attempt, m
+        normal: wp.array2d(dtype=wp.vec3d)  # of the facet there, minus the derivative of the depth by the position
+        motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material, m
+        whole: wp.array2d(dtype=wp.vec3d)  # motion plus friction spring, m
+        weight: wp.array3d(dtype=T)  # [world, point, local] shape values of the master's slots at the projection
+        slope: wp.array3d(dtype=vec2)  # their derivatives by the facet coordinates
+        lean: wp.array3d(dtype=vec3)  # [world, point, 2] geometric stiffness by rotation of the facet, see `lean_on`
+        bend: wp.array2d(dtype=sym)  # geometric stiffness by change of the projection and by curvature
+        turned: wp.array2d(dtype=vec2)  # [world, point] of a product: rotation of the facet
+        held_weight: wp.array3d(dtype=T)  # shape values of friction, frozen with the friction limit
         held_motion: wp.array2d(dtype=wp.vec3d)
-        held_whole: wp.array2d(dtype=wp.vec3d)  # that and the spring, as they were taken
-        held_shift: wp.array2d(dtype=wp.vec3d)  # relative displacement by these functions then
+        held_whole: wp.array2d(dtype=wp.vec3d)  # motion plus spring when they were frozen, m
+        held_shift: wp.array2d(dtype=wp.vec3d)  # relative displacement by the frozen shape values at that time, m
         held_facet: wp.array2d(dtype=wp.int32)
-        friction: wp.array2d(dtype=wp.vec3d)  # part of a point's force that acts by them, N
-        listed: wp.array2d(dtype=wp.int32)  # [world, point] facet + 1 whose list it is in
-        changed: wp.array(dtype=wp.int32)  # a point belongs into another list
-        count: wp.array(dtype=wp.int32)  # [world facet] of lists in the making
-        chunk: wp.array2d(dtype=wp.int32)  # [world, chunk of facets] points before it
-        points: wp.array2d(dtype=wp.int32)  # [world, facet] points of its list, which begins at `start`
+        friction: wp.array2d(dtype=wp.vec3d)  # friction part of a point's force, N
+        listed: wp.array2d(dtype=wp.int32)  # [world, point] facet + 1 of the list that contains it
+        changed: wp.array(dtype=wp.int32)  # 1 if some point belongs to another list
+        count: wp.array(dtype=wp.int32)  # [world facet] point counts during list construction
+        chunk: wp.array2d(dtype=wp.int32)  # [world, chunk of facets] number of preceding points
+        points: wp.array2d(dtype=wp.int32)  # [world, facet] number of points in its list, which begins at `start`
         start: wp.array2d(dtype=wp.int32)
         entry: wp.array2d(dtype=wp.int32)  # [world, point]
 

@@ -1,4 +1,4 @@
-"""Lists of the points of each master facet: counted, placed and sorted anew where a point passes to another facet."""
+"""Point list of each master facet by counting sort; rebuilt when a point changes its facet."""
 
 import functools
 import types as _types
@@ -11,7 +11,7 @@ from .pair_data import master_struct, touching_struct
 __all__ = ["CHUNK", "list_kernels"]
 
 CHUNK = 64
-"""Facets whose lists are placed together."""
+"""Facets per chunk of the prefix sum."""
 
 
 @functools.cache
@@ -22,7 +22,7 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def clear_lists(t: Touching):
-        """No points."""
+        """Clear the point counts."""
         i = wp.tid()
         t.count[i] = 0
         if i == 0:
@@ -30,7 +30,7 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def count_points(mas: Masters, t: Touching):
-        """How many points a facet has."""
+        """Count the points of each facet."""
         world, point = wp.tid()
         f = t.listed[world, point] - 1
         if f >= 0:
@@ -38,7 +38,7 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def sum_chunks(mas: Masters, t: Touching):
-        """Points in the lists of each chunk of facets."""
+        """Number of points in the lists of each chunk of facets."""
         world, chunk = wp.tid()
         total = wp.int32(0)
         for f in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, mas.count)):
@@ -47,7 +47,7 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def scan_chunks(t: Touching):
-        """Points before each chunk."""
+        """Prefix sum over the chunks."""
         world = wp.tid()
         before = wp.int32(0)
         for chunk in range(t.chunk.shape[1]):
@@ -57,7 +57,7 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def place_lists(mas: Masters, t: Touching):
-        """Where the lists begin in each world."""
+        """Start of each list in each world."""
         world, f = wp.tid()
         start = t.chunk[world, f / CHUNK]
         for other in range(f / CHUNK * CHUNK, f):
@@ -67,7 +67,7 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def fill_lists(mas: Masters, t: Touching):
-        """Points into their lists, in any order."""
+        """Fill the lists, in arbitrary order."""
         world, point = wp.tid()
         f = t.listed[world, point] - 1
         if f >= 0:
@@ -76,7 +76,7 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def sort_lists(t: Touching):
-        """Points of a list in their order: sums are the same every time."""
+        """Sort each list by point: sums become deterministic."""
         world, f = wp.tid()
         first = t.start[world, f]
         for k in range(1, t.points[world, f]):

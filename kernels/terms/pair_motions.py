@@ -1,4 +1,4 @@
-"""What contact between bodies adds to the matrix of their rigid motions: its cross terms, see solvers/motions.py."""
+"""Cross terms of pair contact in the matrix of rigid-body modes, see kernels/solvers/motions.py."""
 
 import functools
 import types as _types
@@ -31,8 +31,8 @@ def pair_motion_kernels(dtype: str) -> _types.SimpleNamespace:
         stiffness: wp.array2d(dtype=sym), weight: wp.array3d(dtype=T), listed: wp.array2d(dtype=wp.int32),
         active: wp.array(dtype=wp.int32), lanes: int, parts: wp.array4d(dtype=mat33d),
     ):  # fmt: skip
-        """R_s^T K R_m of the points of a contact, a lane's sum: moves with moves, moves with turns, turns with moves,
-        turns with turns of slave and master."""
+        """R_s^T K R_m of the points of a contact, partial sum of a lane, as blocks: translation-translation,
+        translation-rotation, rotation-translation, rotation-rotation of slave and master."""
         world, index, lane = wp.tid()
         if active[world] == 0:
             return
@@ -80,8 +80,7 @@ def pair_motion_kernels(dtype: str) -> _types.SimpleNamespace:
         parts: wp.array4d(dtype=mat33d), dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32),
         matrix: wp.array3d(dtype=T),
     ):  # fmt: skip
-        """matrix -= (dq/dv) the sums of each pair of bodies; `source`: a contact, and whether its slave is the
-        second."""
+        """matrix -= (dq/dv) sums of each pair of bodies; `source`: contact, and 1 if its slave is the second body."""
         world, index, block = wp.tid()
         if active[world] == 0:
             return

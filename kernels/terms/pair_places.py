@@ -1,4 +1,4 @@
-"""Where a point is on a master facet: polynomials of its coordinates, their jets, and Newton's method on them."""
+"""Position of a point on a master facet: polynomials of its coordinates, their derivatives, Newton's method on them."""
 
 import functools
 import types as _types
@@ -10,29 +10,29 @@ from .pair_data import master_struct
 __all__ = ["HOLD", "INNER", "OUTER", "place_functions"]
 
 TURNS = 16
-"""Newton's steps of a place, at most."""
+"""Maximum number of Newton steps for the facet coordinates."""
 FEET = 12
-"""Most steps to the foot of a perpendicular: each gains a factor of gap times curvature."""
+"""Maximum number of projection steps: each reduces the error by gap times curvature."""
 OUTER = 0.05
-"""Part of a side by which a place may lie beyond a facet: the outward vectors of two elements differ, and a point on a
-border does not change facets from iterate to iterate."""
+"""Distance over a side by which a point may lie outside of its facet: outward vectors of two elements differ, and a
+point on a border must not change facets from iterate to iterate."""
 INNER = 1e-9
 QUADRATIC = 1e-8
-"""A step so small is the last: what it leaves is its square."""
+"""Step size below which Newton's method stops: the remaining error is its square."""
 HOLD = 0.5
-"""In an attempt a point stays on the surface so far beyond its border: it slides off between steps, for a force that
-ends at an iterate has no potential."""
+"""Distance over a side beyond the surface's boundary up to which a point keeps contact in an attempt: it leaves between
+steps, since a force that ends at an iterate has no potential."""
 
 
 @functools.cache
 def place_functions(dtype: str) -> _types.SimpleNamespace:
-    """Device functions in one precision of the displacements; all of them are float64."""
+    """Device functions in one precision of the displacements; evaluated in float64."""
     Masters = master_struct(dtype)
     f64, vec3d = wp.float64, wp.vec3d
 
     @wp.struct
     class Jet:
-        """A place and its derivatives by the three coordinates."""
+        """Position and its derivatives by the three coordinates."""
 
         x: vec3d
         a: vec3d
@@ -41,7 +41,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def power(x: f64, n: int) -> f64:
-        """x^n; mostly n <= 2, which takes no loop."""
+        """x^n; without a loop for n <= 2."""
         if n == 0:
             return f64(1.0)
         out = x
@@ -53,7 +53,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def monomial(mas: Masters, kind: int, m: int, spot: vec3d) -> f64:
-        """Monomial m of a kind of facet at a place."""
+        """Monomial m of a kind of facet at given coordinates."""
         return power(spot[0], mas.power[kind, m][0]) * power(spot[1], mas.power[kind, m][1])
 
     @wp.func
@@ -72,7 +72,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
     def jet(
         mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d
     ) -> Jet:  # fmt: skip
-        """The place of coordinates `spot`."""
+        """Position and derivatives at the coordinates `spot`."""
         out = Jet()
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):
@@ -94,7 +94,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
     def moved(
         mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d
     ) -> vec3d:  # fmt: skip
-        """The polynomial with coefficients C + z D alone, such as the displacement there."""
+        """Polynomial with coefficients C + z D alone, e.g. the displacement."""
         out = vec3d()
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):
@@ -107,7 +107,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), C0: wp.array2d(dtype=vec3d),
         D0: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d,
     ) -> vec3d:  # fmt: skip
-        """Displacement of a place by C and D less that by C0 and D0."""
+        """Displacement at given coordinates by C and D minus that by C0 and D0."""
         out = vec3d()
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):
@@ -120,7 +120,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
     def way(
         mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, old: vec3d, new: vec3d
     ) -> vec3d:  # fmt: skip
-        """x(new) - x(old), with a rounding of its own size: a sum of differences of powers."""
+        """x(new) - x(old) with round-off relative to its own size: a sum of differences of powers."""
         out = vec3d()
         kind = mas.kind[f]
         step = new - old
@@ -136,7 +136,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def coordinates(t: Jet, r: vec3d) -> vec3d:
-        """d with a d_0 + b d_1 + c d_2 = r; 0 where the three lie in a plane."""
+        """Solution d of a d_0 + b d_1 + c d_2 = r; 0 where a, b, c are coplanar."""
         n = wp.cross(t.a, t.b)
         det = wp.dot(n, t.c)
         if wp.abs(det) <= f64(1.0e-12) * wp.length(n) * wp.length(t.c):
@@ -145,7 +145,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def outside(corners: int, s: vec3d) -> f64:
-        """How far a place lies beyond the sides of the unit triangle or square; 0 on the facet."""
+        """Distance of coordinates outside of the unit triangle or square; 0 on the facet."""
         out = wp.max(-s[0], -s[1])
         if corners == 3:
             out = wp.max(out, s[0] + s[1] - f64(1.0))
@@ -155,7 +155,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def middle(corners: int) -> vec3d:
-        """The middle of a facet."""
+        """Coordinates of the midpoint of a facet."""
         part = wp.where(corners == 3, f64(1.0) / f64(3.0), f64(0.5))
         return vec3d(part, part, f64(0.0))
 
@@ -163,7 +163,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
     def locate(
         mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, x: vec3d, first: vec3d
     ) -> wp.vec4d:  # fmt: skip
-        """Coordinates of x, sought from `first`, and 1 where they were found."""
+        """Coordinates of x by Newton's method from `first`, and 1 if converged."""
         spot = first
         last = f64(1.0e300)
         for _ in range(TURNS):
@@ -186,8 +186,8 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, first: vec3d,
         motion: vec3d,
     ) -> wp.vec4d:  # fmt: skip
-        """Coordinates of a point that was at `first` and has moved by `motion`, and 1 where they were found; changes
-        are rounded as the motion is."""
+        """Coordinates of a point that was at `first` and has moved by `motion`, and 1 if converged; round-off of the
+        change is relative to the motion."""
         spot = first
         last = f64(1.0e300)
         for _ in range(TURNS):
@@ -208,23 +208,23 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def outward(t: Jet) -> vec3d:
-        """Unit normal of the layer through a place."""
+        """Unit normal of the layer through a position."""
         return wp.normalize(wp.cross(t.a, t.b))
 
     @wp.struct
     class Foot:
-        """The closest place on a facet to one that is off it: gap = rise x (coordinate off the facet) + rest."""
+        """Projection of a point onto a facet: gap = rise x (coordinate along the outward vector) + rest."""
 
         spot: vec3d
-        n: vec3d  # normal there
+        n: vec3d  # normal at the projection
         rise: f64
-        rest: f64  # m, of a facet that is curved
+        rest: f64  # m, nonzero on a curved facet
 
     @wp.func
     def foot_of(
         mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d
     ) -> Foot:  # fmt: skip
-        """The foot of the perpendicular from a place."""
+        """Orthogonal projection of a position."""
         out = Foot()
         base = vec3d(spot[0], spot[1], f64(0.0))
         off = jet(mas, C, D, world, f, base).c
@@ -248,7 +248,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
     def curved(
         mas: Masters, C: wp.array2d(dtype=vec3d), world: int, f: int, spot: vec3d, n: vec3d
     ) -> vec3d:  # fmt: skip
-        """Second derivatives of a facet along n: by the first coordinate, by the second, by both."""
+        """Second derivatives of a facet along n: (11, 22, 12)."""
         out = vec3d()
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):
@@ -265,7 +265,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def slopes(mas: Masters, f: int, i: int, spot: vec3d) -> wp.vec2d:
-        """Derivatives of the function of slot i by the coordinates of a place on a facet."""
+        """Derivatives of the shape value of slot i by the facet coordinates."""
         out = wp.vec2d()
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):
@@ -280,7 +280,7 @@ def place_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def weigh(mas: Masters, f: int, i: int, spot: vec3d) -> f64:
-        """Function of slot i of a facet at a place."""
+        """Shape value of slot i of a facet at given coordinates."""
         out = f64(0.0)
         kind = mas.kind[f]
         for m in range(mas.terms[kind]):

@@ -1,7 +1,7 @@
-"""Which master facet a point of another body is at, and where on it: boxes, tree, and the search within it.
+"""Master facet and coordinates of each slave point: boxes, tree, and search within it.
 
-A point in contact stays on its facet, or passes to the one that its place belongs to. Another one is in contact where
-it is inside of a facet now and was outside of it as the step began; no candidate is kept from step to step but boxes.
+A point in contact stays on its facet, or passes to the one that contains it. Another point is in contact if it is
+inside of a facet now and was outside of it at the start of the step; only boxes persist from step to step.
 """
 
 import functools
@@ -21,20 +21,20 @@ from .pair_places import HOLD, OUTER, place_functions
 __all__ = ["MARGIN", "THROUGH", "seek_kernels"]
 
 THROUGH = -2
-"""Seat of a point that has left through another side."""
+"""Facet of a point that has left through the opposite side."""
 TURNED = 0.1
-"""Least cosine of the normals of two facets that a point in contact passes between: not around the edge of a box."""
+"""Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
 LOST = 0.25
-"""A point that no facet holds any more went through if it is deeper than this part of the depth that is allowed."""
+"""Depth over the allowed depth above which a point without a facet has passed through."""
 OPPOSES = 0.5
-"""Cosine of a facet's normal and the slave's own, one reversed, from which on they face each other; below minus that
-they face the same way."""
+"""Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
+face the same way."""
 ALIKE = 2.0
-"""A point that comes in from beside a facet is in contact if its depth is at most so many times what there is."""
+"""Largest depth of a point that enters from beside a facet, over the deepest active penetration."""
 LEAN = 2.0
-"""Most tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
+"""Maximum tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
 GLANCE = 0.5
-"""A place that the tangent plane in the middle of a facet puts so far beyond its sides is not on it."""
+"""Parametric margin for rejecting a facet by the tangent plane at its midpoint."""
 
 
 @functools.cache
@@ -57,23 +57,23 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.struct
     class Seat:
-        """Where a point may be in contact."""
+        """Candidate facet of a point."""
 
-        facet: wp.int32  # -1: nowhere
+        facet: wp.int32  # -1: none
         spot: vec3d
-        off: f64  # beyond the sides of the facet; 0 within its `lean`
-        beyond: f64  # likewise, without that
-        height: f64  # beside it
+        off: f64  # distance beyond the sides of the facet; 0 within its `lean`
+        beyond: f64  # distance beyond the sides without that margin
+        height: f64  # height above the facet
         rank: wp.int32  # see `admits`
         entered: wp.bool  # the point passed a side of the body
-        loose: wp.bool  # it must have, to be seated here
+        loose: wp.bool  # it must have, for this facet to be accepted
 
     @wp.func
     def approach(
         mas: Masters, facets: Facets, t: Touching, v: wp.array2d(dtype=vec3), world: int, q: int, item: int, f: int,
         spot: vec3d, n: vec3d,
     ) -> f64:  # fmt: skip
-        """Speed of a point towards a facet as the attempt began."""
+        """Approach speed of a point towards a facet at the start of the attempt, m/s."""
         foot = vec3d(spot[0], spot[1], f64(0.0))
         return wp.dot(n, moved(mas, t.V0, t.V0, world, f, foot) - along(facets, v, world, q, item))
 
@@ -82,7 +82,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock, at: Attempt, t: Touching,
         v_n: wp.array2d(dtype=vec3), world: int, q: int, item: int, point: int, f: int, start: vec3d,
     ):  # fmt: skip
-        """Measure the motion of a point from a facet: its place on it as the attempt began, depth and speed then."""
+        """Set the facet that a point's motion is relative to: start coordinates on it, depth and approach speed at the
+        start."""
         found = locate(mas, t.C0, t.D0, world, f, t.x0[world, point], start)
         spot = vec3d(found[0], found[1], found[2])
         live = his.speed[world, point] > f64(0.0)
@@ -91,7 +92,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
                 return
             spot = start
         if live and outside(mas.corners[mas.kind[f]], spot) > f64(OUTER):
-            return  # it has slid off the surface
+            return  # it has left the surface
         foot = foot_of(mas, t.C0, t.D0, world, f, spot)
         t.first[world, point] = f + 1
         t.spot0[world, point] = spot
@@ -108,7 +109,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt,
         t: Touching,
     ):  # fmt: skip
-        """Where points are as an attempt begins, and of those in contact their depth and approach speed."""
+        """Start positions of the points; depth and approach speed of those in contact."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
@@ -144,7 +145,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), reaching: f64, t: Touching,
     ):  # fmt: skip
-        """Whether a box of a master facet is near a slave facet; where none is, the box in which that holds."""
+        """Flag slave facets with a master facet's box nearby; for the others store the box without master facets."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -184,7 +185,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def crosses(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d) -> bool:
-        """Whether a point went in through a facet on its way, and deep."""
+        """True if a point entered through a facet during the step, and deep."""
         kind = mas.kind[f]
         m = middle(mas.corners[kind])
         old = jet_of(t.middle0[world, f])
@@ -204,7 +205,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def frame(s: Jet) -> wp.mat33d:
-        """Columns: along the first side of a facet, across, outward."""
+        """Columns: first tangent of a facet, second tangent, outward normal."""
         n = wp.normalize(wp.cross(s.a, s.b))
         a = wp.normalize(s.a)
         return wp.matrix_from_cols(a, wp.cross(n, a), n)
@@ -215,7 +216,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         v_n: wp.array2d(dtype=vec3), world: int, c: int, q: int, item: int, point: int, f: int, spot: vec3d,
         shift: vec3d, settling: f64,
     ):  # fmt: skip
-        """What a point at a place of a facet has: depth, that as the attempt began, normal, motion."""
+        """Contact data of a point on a facet: depth now and at the start of the attempt, normal, motion."""
         foot = foot_of(mas, t.C, t.D, world, f, spot)
         now = reach(con, his, world, c, point, clock.new_time[world], f64(0.0))
         t.seat[world, point] = f
@@ -231,7 +232,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
             first = t.first[world, point] - 1
             from0 = t.spot0[world, point]
             motion -= carried(mas, t.C, t.D, t.C0, t.D0, world, first, from0)
-            if f == first:  # a sum of motions, not a difference of places
+            if f == first:  # sum of motions: a difference of positions would lose digits
                 before = t.stretch[world, point]
                 rise = (spot[2] - from0[2]) * foot.rise + from0[2] * (foot.rise - before[0]) + (foot.rest - before[1])
                 t.depth[world, point] = at.depth[world, point] + (now - at.reach[world, point]) - rise
@@ -248,8 +249,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def apart(mas: Masters, t: Touching, world: int, f: int, x: vec3d, x0: vec3d, pad: f64) -> bool:
-        """Whether a point is above a facet by more than `pad`, or did not move far and is beside it: by the tangent
-        plane in its middle."""
+        """True if a point is above a facet by more than `pad`, or moved little and is beside it, by the tangent plane
+        at its midpoint."""
         corners = mas.corners[mas.kind[f]]
         s = jet_of(t.middle[world, f])
         if wp.dot(x - s.x, outward(s)) > f64(2.0) * pad + t.swell[world, f]:
@@ -261,7 +262,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def in_front(mas: Masters, t: Touching, world: int, f: int, x: vec3d, pad: f64) -> bool:
-        """Whether a point is above a facet by more than `pad` and within its sides."""
+        """True if a point is above a facet by more than `pad` and within its sides."""
         corners = mas.corners[mas.kind[f]]
         found = locate(mas, t.C, t.D, world, f, x, middle(corners))
         within = outside(corners, vec3d(found[0], found[1], found[2])) == f64(0.0)
@@ -269,7 +270,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def opposite(facets: Facets, t: Touching, world: int, item: int, corners: wp.vec3i) -> vec3d:
-        """Normal of a slave facet as the attempt began, inward; 0 where it has none."""
+        """Inward normal of a slave facet at the start of the attempt; 0 if undefined."""
         if corners[0] < 0:
             return vec3d()
         point = facets.point + item * facets.points
@@ -278,16 +279,15 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def lean(mas: Masters, f: int, spot: vec3d) -> f64:
-        """By how much of a side a place inside of an edge may lie beyond a facet: outward vectors lean there."""
+        """Tolerance beyond a side, over its length, for points below an edge, where outward vectors are inclined."""
         return wp.max(-f64(LEAN) * spot[2] / mas.size[f], f64(0.0))
 
     @wp.func
     def from_beside(
         mas: Masters, at: Attempt, t: Touching, world: int, c: int, point: int, f: int, spot: vec3d, gap: f64
     ) -> bool:  # fmt: skip
-        """Whether a point is at a facet now and was beside it as the attempt began, below its plane by no more than
-        what the bodies are in contact with: it slid under the edge of a body that has sunk in.
-        """
+        """True if a point is at a facet now, was beside it at the start of the attempt, and was below its plane by at
+        most the penetration of the bodies' contact: it slid under the edge of a body that has sunk in."""
         kind = mas.kind[f]
         most = wp.max(t.deepest[world, mas.bodies[c][0]], t.deepest[world, mas.bodies[c][1]])
         depth = at.reach[world, point] - gap
@@ -303,14 +303,13 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, at: Attempt, t: Touching, world: int, c: int, point: int, f: int, spot: vec3d, pad: f64,
         left: f64, anchored: bool, facing: vec3d, settling: f64,
     ) -> int:  # fmt: skip
-        """-1 where a place on a facet may not be the seat of a point: by its depth, by the facet that it was on, or by
-        the side that it was on as the attempt began. Else larger for facets that face the slave's; of others, for one
-        that the point came to from beside."""
+        """Rank of a facet for a point, -1: rejected by depth, by the previous facet, or by the side at the start of the
+        attempt. Higher for facets that face the slave's; among others, for one that the point reached from beside."""
         s = jet(mas, t.C, t.D, world, f, spot)
         n = outward(s)
         cosine = wp.dot(n, facing)
         gap = spot[2] * wp.dot(n, s.c)
-        if -gap > mas.limit[f] or gap > pad:  # boxes vary with what other worlds do
+        if -gap > mas.limit[f] or gap > pad:  # boxes depend on the other worlds: this test does not
             return -1
         if anchored:
             return wp.where(cosine > f64(TURNED), 0, -1)
@@ -331,7 +330,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, at: Attempt, t: Touching, world: int, c: int, point: int, f: int, x: vec3d, pad: f64, left: f64,
         anchored: bool, facing: vec3d, settling: f64, seat: Seat,
     ) -> Seat:  # fmt: skip
-        """The better one of a seat and of that which a facet has for a point."""
+        """The better of a candidate and another facet for a point."""
         out = seat
         corners = mas.corners[mas.kind[f]]
         found = locate(mas, t.C, t.D, world, f, x, middle(corners))
@@ -362,8 +361,8 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         u: wp.array2d(dtype=vec3d), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settling: f64,
         at: Attempt, t: Touching, trio: wp.array(dtype=wp.vec3i),
     ):  # fmt: skip
-        """The seat of each point at an iterate. `settling`: above 0 there is no step; what is inside, no deeper than
-        that, m, is in contact. `trio`: three points of each slave facet, or -1."""
+        """Facet of each point at an iterate. `settling` > 0: no step; inner points up to that depth, m, are in contact.
+        `trio`: three points of each slave facet, or -1."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
@@ -379,7 +378,7 @@ def seek_kernels(dtype: str) -> _types.SimpleNamespace:
         x0 = t.x0[world, point]
         seat = Seat(-1, vec3d(), f64(OUTER), f64(OUTER), f64(1.0e300), -1, False, False)
         if settling > f64(0.0):
-            seat.off = f64(0.0)  # what lies before one face of a body is beside another
+            seat.off = f64(0.0)  # no tolerance: a point in front of one face may be beside another
         inside = allowance(con, his, world, c, point, clock.time[world])
         pad = settling + inside + wp.abs(con.offset[c]) + f64(1.0e-6) * wp.length(x)
         through = bool(False)

@@ -1,4 +1,4 @@
-"""Contact between bodies at a state: gap, elastic force and place of every point, for fields and checks."""
+"""Contact between bodies at a state: gap, elastic force and facet of every point, for fields and checks."""
 
 import functools
 import types as _types
@@ -18,11 +18,11 @@ __all__ = ["found_struct", "survey_kernels"]
 
 @functools.cache
 def found_struct():
-    """What a survey finds, [world, point]."""
+    """Result of the evaluation, [world, point]."""
 
     @wp.struct
     class Found:
-        gap: wp.array2d(dtype=wp.float64)  # m, 1e30: no facet is near
+        gap: wp.array2d(dtype=wp.float64)  # m, 1e30: no facet nearby
         normal: wp.array2d(dtype=wp.float64)  # force, N
         force: wp.array2d(dtype=wp.vec3d)  # on the slave, N
         facet: wp.array2d(dtype=wp.int32)  # -1: none
@@ -48,7 +48,7 @@ def survey_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def nearest(mas: Masters, t: Touching, world: int, surface: int, x: vec3d, far: f64) -> wp.vec4d:
-        """Coordinates of x on the facet of a surface that it is closest to, and that facet; -1: none is within far."""
+        """Coordinates of x on the closest facet of a surface, and that facet; -1: none within `far`."""
         out = wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(-1.0))
         height = far
         off = f64(OUTER)
@@ -77,7 +77,7 @@ def survey_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, time: wp.array(dtype=f64),
         u: wp.array2d(dtype=vec3d), far: f64, at: Attempt, t: Touching, out: Found,
     ):  # fmt: skip
-        """Points in contact at their seats, others on the closest facet: gaps; forces are elastic, without motion."""
+        """Gaps of points in contact on their facets, of others on the closest facet; elastic forces, without motion."""
         world, item, q = wp.tid()
         c = facets.contact[item]
         point = facets.point + item * facets.points + q

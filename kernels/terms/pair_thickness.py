@@ -1,4 +1,4 @@
-"""How thick a body is behind the facets of a surface, and how deep places are in it."""
+"""Thickness of a body behind the facets of a surface, and depth of points in it."""
 
 import functools
 
@@ -9,21 +9,21 @@ from ..common.types import kernel_module
 __all__ = ["depth_kernel", "thickness_kernel"]
 
 SIDES = 8
-"""Sides that a ray may meet."""
+"""Maximum number of ray intersections."""
 
 
 @functools.cache
 def thickness_kernel() -> wp.Kernel:
-    """The kernel; lengths are over the size of the body."""
+    """Kernel; lengths over the size of the body."""
     module = kernel_module("pair_thickness")
 
     @wp.kernel(module=module)
     def thickness(
         mesh: wp.uint64, x: wp.array(dtype=wp.vec3), n: wp.array(dtype=wp.vec3), out: wp.array(dtype=float)
     ):  # fmt: skip
-        """Distance from x along -n to the other side of a closed mesh.
+        """Distance from x along -n to the opposite side of a closed mesh.
 
-        Of a curved face the triangle that stands for it may lie below x: a side that the ray comes in by is passed.
+        The triangle approximating a curved face may lie below x: an intersection where the ray enters is skipped.
         """
         i = wp.tid()
         skip = float(1.0e-5)
@@ -43,12 +43,12 @@ def thickness_kernel() -> wp.Kernel:
 
 @functools.cache
 def depth_kernel() -> wp.Kernel:
-    """The kernel; lengths are over the size of the body."""
+    """Kernel; lengths over the size of the body."""
     module = kernel_module("pair_depth")
 
     @wp.kernel(module=module)
     def depth(mesh: wp.uint64, x: wp.array(dtype=wp.vec3), out: wp.array(dtype=float)):
-        """Distance from x to the nearest place of a closed mesh that x is in, else 0."""
+        """Distance from x inside a closed mesh to its nearest point, else 0."""
         i = wp.tid()
         found = wp.mesh_query_point_sign_winding_number(mesh, x[i], float(10.0))
         out[i] = float(0.0)

@@ -1,9 +1,9 @@
-"""Contact of points of a body with facets of another: forces, their tangent, and what an accepted step keeps and books.
+"""Contact of points of a body with facets of another: forces, tangent, frozen friction quantities.
 
-The law is that of contact with obstacles. Depth is the distance from the closest place on the master's facet: the
-normal force, its derivative, acts there by the functions of the facet, along a line through the point. Friction acts at
-the place of the point itself, by the functions of the master's material there. So sum and moment vanish, and the force
-is that of a potential of the iterate, which hardly jumps where a point passes to the next facet, whatever the strains.
+The law is that of contact with obstacles. Depth is the distance from the projection on the master's facet: the normal
+force, its derivative, acts there by the shape functions of the facet, along a line through the point. Friction acts at
+the point's own coordinates, by the shape functions of the master's material there. So force and moment balance, and the
+force is that of a potential of the iterate, nearly continuous where a point passes to the next facet, for any strain.
 """
 
 import functools
@@ -26,7 +26,7 @@ __all__ = ["pair_functions", "pair_kernels"]
 
 @functools.cache
 def pair_functions(dtype: str) -> _types.SimpleNamespace:
-    """The device function touch_of."""
+    """Device function touch_of."""
     f64 = wp.float64
     Contacts, Attempt, Touching = contact_struct(False), attempt_struct(dtype), touching_struct(dtype)
     k, normal_law = touch_functions(dtype, False), law_functions().normal_law
@@ -34,7 +34,7 @@ def pair_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def touch_of(con: Contacts, at: Attempt, t: Touching, world: int, c: int, point: int, inv_h: f64) -> Touch:
-        """A point at its seat."""
+        """A point on its facet."""
         out = Touch()
         out.n = t.normal[world, point]
         out.depth = t.depth[world, point]
@@ -72,7 +72,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt, t: Touching,
     ):  # fmt: skip
-        """Forces at the state that the attempt begins from, of contacts that are treated so."""
+        """Forces of explicit contacts at the state that the attempt begins from."""
         world, item, q = wp.tid()
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
@@ -96,7 +96,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
         point: int, f: int,
     ) -> vec3d:  # fmt: skip
-        """Displacement of a point relative to the held functions of a facet."""
+        """Displacement of a point relative to a facet, by the frozen shape values."""
         out = k.along(facets, u, world, q, item)
         for i in range(mas.conn.shape[0]):
             out -= f64(t.held_weight[world, point, i]) * vec3d(u[world, mas.conn[i, f]])
@@ -107,7 +107,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
         point: int, f: int,
     ):  # fmt: skip
-        """Motions of friction are told from here on by the functions that are held."""
+        """Freeze the shape values of friction: store motion and relative displacement at this iterate."""
         t.held_motion[world, point] = t.motion[world, point]
         t.held_whole[world, point] = t.whole[world, point]
         t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
@@ -118,7 +118,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), flags: wp.array(dtype=wp.int32), at: Attempt,
         t: Touching,
     ):  # fmt: skip
-        """Friction acts by the functions of the iterate from now on."""
+        """Update the shape values of friction to those of the iterate."""
         world, item, q = wp.tid()
         point = facets.point + item * facets.points + q
         if flags[world] == 0 or at.state[world, point] != STIFF:
@@ -130,11 +130,12 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def lean_on(mas: Masters, t: Touching, world: int, point: int, f: int, gap: f64, force: f64):
-        """What the second derivative of the depth needs in products: the facet turns under a force, and its foot moves.
+        """Geometric stiffness of the normal force: rotation of the facet under a force, and motion of the projection.
 
-        With the relative displacement d at the foot, e_a = n.(change of the tangent a_a), t_a = a_a.d, b the curvature,
-        M = a - gap b and m its inverse, it is 2 t m e + gap e m e + t a^-1 b m t (Wriggers, Computational Contact
-        Mechanics, 2006, 4.1, with the facet's curvature). `lean`: force m a; `bend`: force gap m, and M a^-1 b / force.
+        With the relative displacement d at the projection, e_a = n.(change of the tangent a_a), t_a = a_a.d, b the
+        curvature, M = a - gap b and m its inverse, it is 2 t m e + gap e m e + t a^-1 b m t (Wriggers, Computational
+        Contact Mechanics, 2006, 4.1, with the facet's curvature). `lean`: force m a; `bend`: force gap m, and M a^-1 b
+        / force.
         """
         spot = t.foot[world, point]
         n = t.normal[world, point]
@@ -149,7 +150,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         t.lean[world, point, 1] = vec3()
         t.bend[world, point] = sym()
         if force <= f64(0.0) or det <= f64(0.1) * wp.determinant(A):
-            return  # beyond the centre of curvature the foot is none
+            return  # no projection beyond the centre of curvature
         m = force * wp.inverse(M)
         t.lean[world, point, 0] = vec3(m[0, 0] * s.a + m[0, 1] * s.b)
         t.lean[world, point, 1] = vec3(m[1, 0] * s.a + m[1, 1] * s.b)
@@ -159,7 +160,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def put_dead(mas: Masters, at: Attempt, t: Touching, world: int, point: int, f: int, share: f64):
-        """The explicit force of a point, where it was as the attempt began."""
+        """Explicit force of a point, applied at its position at the start of the attempt."""
         work = -share * wp.dot(at.dead[world, point], t.motion[world, point])
         at.state[world, point] = LOADED
         at.force[world, point] = -share * at.dead[world, point]
@@ -173,7 +174,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
         u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
     ):  # fmt: skip
-        """Forces on points, their stiffness and potential; caps, and the functions that friction acts by, are held."""
+        """Forces on points, their stiffness and potential; friction limits and shape values of friction are frozen."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
@@ -210,7 +211,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             at.next_plane[world, point] = s.m
             at.next[world, point] = new
             m = at.plane[world, point]
-            if wp.dot(m, s.m) <= f64(0.5):  # it has passed to another facet since
+            if wp.dot(m, s.m) <= f64(0.5):  # the point has passed to another facet since
                 m = s.m
                 at.plane[world, point] = m
             for i in range(mas.conn.shape[0]):
@@ -220,7 +221,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                     t.held_weight[world, point, i] = T(weigh(mas, f, i, t.spot[world, point]))
             if fresh != 0:
                 hold_functions(mas, facets, t, u, world, q, item, point, f)
-            if held[0] > f64(0.0):  # by functions that are held, it has a potential
+            if held[0] > f64(0.0):  # frozen shape values: friction has a potential
                 shift = relative(mas, facets, t, u, world, q, item, point, t.held_facet[world, point])
                 s.motion = t.held_motion[world, point] + (shift - t.held_shift[world, point])
                 s.whole = t.held_whole[world, point] + (shift - t.held_shift[world, point])
@@ -318,7 +319,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, last: int, at: Attempt,
         t: Touching, pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
-        """Their sums on the slots of the points' own facets, and of master facets where the launch goes on to these."""
+        """Sums of the products on the slots of the slave facets, and of master facets where the launch includes
+        them."""
         world, index = wp.tid()
         if active[world] == 0:
             return
@@ -351,7 +353,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     def diagonal_masters(
         mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=sym)
     ):  # fmt: skip
-        """3x3 blocks on the diagonal of master facets."""
+        """3x3 diagonal blocks of master facets."""
         world, f, i = wp.tid()
         if active[world] == 0:
             return
