@@ -180,9 +180,9 @@ def test_clamped_slots(name, slots, kinds):
 @pytest.mark.parametrize(
     ("name", "known"),
     [
-        ("beam", "3243 knows 'position', 'axis', 'section', 'all'"),
-        ("plate", "3443 knows 'position', 'surface', 'director', 'all'"),
-        ("FN", "FN knows 'position', 'gradients', .*'all'"),
+        ("beam", "element 3243: 'position', 'axis', 'section', 'all'"),
+        ("plate", "element 3443: 'position', 'surface', 'director', 'all'"),
+        ("FN", "element FN: 'position', 'gradients', .*'all'"),
     ],
 )
 def test_unknown_slots(name, known):

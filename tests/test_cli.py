@@ -296,7 +296,7 @@ def test_density_is_asked_for_where_it_counts(folder, capfd):
     for words in (["run", *STATIC[1:2], *STATIC[3:], *LIGHT], [*STATIC, *LIGHT[:2]]):
         code, _, err = run(capfd, *words)
         assert code == 2
-        assert "'part': the material SVK has no density" in err
+        assert "'part': missing density of SVK" in err
 
 
 # materials

@@ -147,8 +147,8 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
     if callable(value):
         name = getattr(value, "__name__", type(value).__name__).replace("<lambda>", "a lambda")
         raise ModelError(
-            f"{what}: {name} is a Python function, and no device runs it: sample it, (times, [f(t) for t in times]) "
-            "with times = np.linspace(0, t_end, 201), or write a def with @wp.func above it"
+            f"{what}: {name} is a Python function; Python functions do not run on the device: sample it, "
+            "(times, [f(t) for t in times]) with times = np.linspace(0, t_end, 201), or write a def with @wp.func above it"
         )
     read = _samples if isinstance(value, (tuple, list)) and len(value) == 2 and _is_row(value[0]) else _constant
     times, values = read(value, what, () if scalar else (3,))

@@ -25,5 +25,5 @@ def find_device(device: Any = None) -> wp.Device:
         except Exception:
             pass
         names = ", ".join(str(known) for known in wp.get_devices())
-    hint = ", and no CUDA GPU with a driver; take 'cpu', or leave the device out" if bare else ""
-    raise ModelError(f"device {device!r} is not there; Warp finds {names}{hint}")
+    hint = " (no CUDA GPU with a driver); use 'cpu', or omit the device" if bare else ""
+    raise ModelError(f"device {device!r} not found; available: {names}{hint}")

@@ -27,8 +27,8 @@ def enough_memory(what: str, device: Any) -> Iterator[None]:
         if found is None:
             raise
         count = int(found[1]) if found[1] else 0
-        asked = f"another {count} bytes ({size(count)})" if count else "what it needs"
-        text = f"{what}: device {device} has no room for {asked}{_room(device)}{REMEDY}"
+        asked = f": {count} bytes ({size(count)}) requested" if count else ""
+        text = f"{what}: out of memory on {device}{asked}{_room(device)}{REMEDY}"
         raise CapacityError(text, bytes=count) from error
 
 
@@ -39,4 +39,4 @@ def _room(device: Any) -> str:
     """How much of a GPU's memory is free."""
     if not getattr(device, "is_cuda", False):
         return ""
-    return f": {size(device.free_memory)} of {size(device.total_memory)} are free"
+    return f", {size(device.free_memory)} of {size(device.total_memory)} are free"

@@ -48,10 +48,10 @@ def chosen_worlds(what: str, mask: Any, worlds: int) -> np.ndarray:
         return chosen
     if flags:
         one, other = out.astype(bool).tolist(), chosen.tolist()
-        raise ModelError(f"{what}: mask = {mask!r} may be flags of the worlds or their numbers; write {one} or {other}")
+        raise ModelError(f"{what}: mask = {mask!r} is ambiguous (flags or world indices): write {one} or {other}")
     raise ModelError(
-        f"{what}: mask = {mask!r} must be ({worlds},) of True and False, one per world, or the numbers of some of the "
-        f"worlds 0 to {worlds - 1}"
+        f"{what}: mask = {mask!r} must be ({worlds},) of True and False, one per world, or world indices "
+        f"from 0 to {worlds - 1}"
     )
 
 

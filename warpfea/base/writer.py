@@ -71,7 +71,7 @@ def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise OutputError(f"{target}: the folder {folder} takes no files ({error.strerror or error})") from error
+        raise OutputError(f"{target}: cannot write to folder {folder} ({error.strerror or error})") from error
 
 
 def temporary_beside(target: pathlib.Path) -> pathlib.Path:

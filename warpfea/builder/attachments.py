@@ -82,8 +82,8 @@ class Attachment:
         lost = np.linalg.norm(n - self.known @ n)
         if lost > 1e-6:
             raise ModelError(
-                f"{what}: {self.label} does not tell how the direction {np.round(n, 6).tolist()} turns; give a "
-                "surface, a material point, or more nodes that span it"
+                f"{what}: {self.label} does not determine the rotation of direction {np.round(n, 6).tolist()}: give "
+                "a surface, a material point, or more nodes"
             )
 
     def weakness(self, n: np.ndarray) -> float:

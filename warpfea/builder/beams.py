@@ -150,7 +150,7 @@ def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal:
     """(3, 3) columns: tangent (as it is), width and height vectors."""
     length = float(np.linalg.norm(tangent))
     if not (math.isfinite(length) and length > 0.0):
-        raise ModelError(f"body {name!r}: the curve stands still or is not finite at s = {s:.4g}")
+        raise ModelError(f"body {name!r}: the curve has a zero or non-finite tangent at s = {s:.4g}")
     t = tangent / length
     try:
         up = np.asarray(normal(s) if callable(normal) else normal, dtype=float)

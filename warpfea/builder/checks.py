@@ -114,9 +114,9 @@ def warn_implausible(model: Any) -> None:
         what = f"is {size:.3g} m long" + ("" if mass is None else f" and weighs {mass:.3g} kg")
         hint = "lengths are in metres, density in kg/m^3"
         if body.mesh.path is not None:
-            hint = f"was {body.mesh.label} scaled twice? Its lengths are read in metres"
+            hint = f"check scale= of {body.mesh.label}: lengths are in metres"
             if large:
-                hint = f"is {body.mesh.label} in mm? Then give scale=1e-3 (--scale 1e-3); it is read in metres"
+                hint = f"lengths are in metres; if {body.mesh.label} is in mm, give scale=1e-3 (--scale 1e-3)"
         warnings.warn(f"body {body.name!r} {what}: {hint}", MeshWarning, stacklevel=3)
 
 
@@ -130,15 +130,15 @@ def _warn_of_constants(body: Body) -> None:
         if dense and E < LEAST_E and (low := float(np.min(material.density))) > METAL:
             speed = math.sqrt(E / low)
             warnings.warn(
-                f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3 is a metal as soft as rubber "
-                f"(waves run at {speed:.2g} m/s). Is E in MPa? Steel is E=2.1e11, density=7850",
+                f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3: implausible wave speed "
+                f"{speed:.2g} m/s for a metal: is E given in MPa? Steel is E=2.1e11, density=7850",
                 ModelWarning,
                 stacklevel=4,
             )
         if body.family.solid and nu > LARGEST_NU:
             warnings.warn(
-                f"body {body.name!r}: {law} with nu = {nu:.6g} locks: elements are far too stiff beyond {LARGEST_NU}; "
-                "take nu=0.49, or a finer mesh and see whether the result stays",
+                f"body {body.name!r}: {law} with nu = {nu:.6g}: volumetric locking above {LARGEST_NU}: use nu=0.49, "
+                "or refine the mesh until the result is stable",
                 ModelWarning,
                 stacklevel=4,
             )

@@ -122,7 +122,9 @@ def _driven(
         assert travel is not None
         return Row(DOT, *travel, law=law)
     if angle is None:
-        raise ModelError(f"{what}: {P.label} and {Q.label} do not tell the angle about the axis; give more nodes")
+        raise ModelError(
+            f"{what}: rotation angle about the axis undetermined by {P.label} and {Q.label}: give more nodes"
+        )
     first, second, turned = angle
     return Row(TURN, first, turned, 1.0, second, law, angular=True)
 
@@ -209,8 +211,8 @@ def _anchor(what: str, P: Attachment, Q: Attachment, anchor: Any) -> np.ndarray:
         apart = float(np.linalg.norm(P.X - Q.X))
         if apart > COINCIDENT * max(P.size, Q.size):
             raise ModelError(
-                f"{what}: {P.label} and {Q.label} are {apart:.6g} m apart; say where: anchor=, which keeps the gap (to "
-                "close it, pin both with value=(0, 0, 0) and call solve_static)"
+                f"{what}: {P.label} and {Q.label} are {apart:.6g} m apart: give anchor= to keep the offset, or pin both "
+                "with value=(0, 0, 0) and call solve_static to close it"
             )
     return at
 
@@ -220,7 +222,7 @@ def _distance(what: str, name: str, P: Attachment, Q: Attachment, anchor: Any, l
     for side in (P, Q):
         if side.body is None and np.isnan(side.X).any():
             if anchor is None:
-                raise ModelError(f"{what}: say where on the ground the rod ends: anchor=")
+                raise ModelError(f"{what}: missing anchor=: the end point of the rod on the ground")
             ends.append(constant(vector(anchor, f"{what}: anchor")))
         else:
             ends.append(side.position(side.X, what))

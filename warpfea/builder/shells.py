@@ -71,7 +71,7 @@ def _directors(label: str, mesh: Mesh, normal: np.ndarray, given: Any) -> np.nda
     length = np.linalg.norm(out, axis=1, keepdims=True)
     flat = np.flatnonzero(length[mesh.used_nodes, 0] < 1e-9)
     if len(flat):
-        raise ModelError(f"{label}: node {int(mesh.used_nodes[flat[0]])} of {mesh.label} has no normal")
+        raise ModelError(f"{label}: the normal at node {int(mesh.used_nodes[flat[0]])} of {mesh.label} is zero")
     return out / np.where(length > 0.0, length, 1.0)
 
 

@@ -103,12 +103,12 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     if rest:
         known = commands.choices[words[0]]._option_string_actions if words[0] in commands.choices else ()
         hint = did_you_mean(rest[0].partition("=")[0], known) if rest[0].startswith("-") else ""
-        raise UsageError(f"unrecognized arguments: {' '.join(rest)}{hint} (warpfea {words[0]} --help tells more)")
+        raise UsageError(f"unknown option: {' '.join(rest)}{hint} (see warpfea {words[0]} --help)")
     arguments.words = list(words)
     if not hasattr(arguments, "command"):
         top.print_help()
         names = "run, scenes, info, render, bench, study, stress, profile"
-        raise UsageError(f"give a command: {names} ({top.prog} --help tells more)")
+        raise UsageError(f"give a command: {names} (see {top.prog} --help)")
     return arguments
 
 

@@ -161,8 +161,8 @@ def _check_look(options: argparse.Namespace) -> None:
             raise UsageError(f"--{option} is for {what}: give {outputs} too")
     if options.resume and options.gif and pathlib.Path(options.gif).exists():
         raise UsageError(
-            f"--gif {options.gif}: is there, and a GIF can't be gone on with after --resume; give another name, or "
-            "draw the whole motion of --usd with warpfea render"
+            f"--gif {options.gif}: already exists, and a GIF can't be extended after --resume: choose another name, or "
+            "render the --usd file with warpfea render"
         )
 
 
@@ -170,10 +170,7 @@ def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> N
     """UsageError for an end at the start, and for a picture of what is not reached."""
     fixed = not (options.static or options.resume or isinstance(source.dt, str))
     if fixed and t_end <= SAME_TIME * float(source.dt):
-        raise UsageError(
-            f"--t-end {t_end:g}: no step would be done, for it is within {SAME_TIME:g} of a step from the start; give "
-            "a later --t-end"
-        )
+        raise UsageError(f"--t-end {t_end:g}: less than {SAME_TIME:g} of a step after the start: give a later end time")
     if options.png_time is not None and not 0.0 <= options.png_time <= t_end * (1.0 + 1e-9):
         raise UsageError(f"--png-time {options.png_time:g}: the run lasts from 0 to t = {t_end:g} s")
 

@@ -115,8 +115,7 @@ def _check_suffix(what: str) -> None:
     if not suffix:
         return
     formats = ", ".join(f"{end} ({name})" for end, name in FORMATS.items())
-    text = f"{what}: {suffix} is not a format of meshes that is read, nor a scene; meshes are read from {formats}, "
-    text += "scenes from .py"
+    text = f"{what}: unsupported file type {suffix}: neither a scene (.py) nor a mesh ({formats})"
     if suffix.lower() in SURFACES:
         text += f"; {suffix} describes a surface or a shape, not elements: fill it with tetrahedra, in Gmsh for example"
     raise UsageError(text)

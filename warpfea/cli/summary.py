@@ -170,18 +170,18 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
         reached = s["steps"] - s["rough_steps"]
         tol = number(sim.solver.tolerance(s["dtype"]))
         rows.append(
-            ["NOT CONVERGED", f"{reached} of {s['steps']} steps ({reached / steps:.0%}) reached the tolerance {tol}"]
+            ["NOT CONVERGED", f"tolerance {tol} reached in {reached} of {s['steps']} steps ({reached / steps:.0%})"]
         )
     e = s["energies"]
     parts = [f"{name} {_text(e[name])}" for name in ("kinetic", "strain", "potential", "work", "viscous") if name in e]
     rows.append(["energy", f"{', '.join(parts)} J"])
     if s["load"] is None:
         lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
-        rows.append(["", f"lost by the integrator {lost} J, unbalanced {left} J"])
+        rows.append(["", f"numerical dissipation {lost} J, energy imbalance {left} J"])
         rows += _suggestion(sim)
         if s["contacts"]:
             stored = _text((e["contact"] or 0.0) + (e["contact_pairs"] or 0.0))
-            lost = f"lost to restitution {_text(e['contact_loss'])}, to friction {_text(e['friction'])} J"
+            lost = f"dissipated: impact {_text(e['contact_loss'])}, friction {_text(e['friction'])} J"
             moved = f", done by colliders {_text(e['collider_work'])} J" if sim.model.description.colliders else ""
             rows.append(["", f"in contact {stored} J, {lost}{moved}"])
     for name, values in s["probes"].items():
@@ -273,7 +273,7 @@ def _joints(sim: Simulation) -> list[list[str]]:
             text += f", force {_text(force)} N, moment {_text(moment)} N m"
         rows.append([f"joint {joints[k].name}", text])
     if len(rows) < len(joints):
-        rows.append(["joints", f"{len(joints)} in all, of which these are violated most"])
+        rows.append(["joints", f"{len(joints)} joints; largest violations shown"])
     return rows
 
 

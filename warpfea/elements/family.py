@@ -175,7 +175,7 @@ class Family:
         for name in str(names).split("+"):
             if name not in known:
                 raise ModelError(
-                    f"slots = {names!r}: element {self.name} knows {', '.join(map(repr, known))}, and several of them "
+                    f"slots = {names!r}: valid slots of element {self.name}: {', '.join(map(repr, known))}, or several "
                     f"joined by '+'{did_you_mean(name, known)}"
                 )
             out |= set(known[name])

@@ -169,8 +169,8 @@ def require_density(bodies: Iterable[Discretisation], what: str) -> None:
                 law = f"{type(material).__name__} of group {group!r}" if group else type(material).__name__
                 without = ", or gravity=(0, 0, 0)" if what == "gravity" else ""
                 raise ModelError(
-                    f"body {body.name!r}: the material {law} has no density, which {what} needs; give it density=..., "
-                    f"kg/m^3 (steel 7850, water 1000){without}"
+                    f"body {body.name!r}: missing density of {law}, required by {what}: give it density=..., kg/m^3 "
+                    f"(steel 7850, water 1000){without}"
                 )
 
 

@@ -106,7 +106,7 @@ class MaterialParameters:
         laws = [body.materials[k][1] for body, k in owners[owner]]
         kinds = " and ".join(dict.fromkeys(type(law).__name__ for law in laws))
         if what in SHARED:
-            return f"all worlds share {SHARED[what]}, of which {what!r} is a part; build a model of its own for another"
+            return f"shared by all worlds ({SHARED[what]}): build a separate model"
         if what in RATES:
             return f"the material {kinds} has no damping, so its kernels were left out; give it KelvinVoigt(eta=0)"
         for law in laws:
@@ -166,8 +166,8 @@ class MaterialParameters:
         keys = [(self._index(body), k, name) for body, k in members]
         if self.begun and any(key not in self.values for key in keys):
             raise ModelError(
-                f"set_parameter: a Simulation of this model was made with one value of '{owner}.{name}' for all "
-                "worlds; call this once before the first Simulation, and later as often as wanted"
+                f"set_parameter: '{owner}.{name}' was uniform when a Simulation of this model was made: set it before the "
+                "first Simulation"
             )
         fresh = dict(self.values)
         for key, (body, k) in zip(keys, members):

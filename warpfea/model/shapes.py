@@ -302,7 +302,7 @@ def _direction(shape: Shape, name: str) -> np.ndarray:
     out = _array(shape, name, (3,), "three finite numbers that are not all zero")
     length = np.linalg.norm(out)
     if not length > 0.0:
-        raise ModelError(f"{_name(shape)}: {name} = {out.tolist()} is zero; it must point out of the solid")
+        raise ModelError(f"{_name(shape)}: {name} = {out.tolist()} is zero; give the outward normal")
     return out / length
 
 

@@ -109,9 +109,9 @@ def check_static_supports(model: Any) -> None:
             first = loose[0]
             body = next(b for b in model.bodies if b.slot_offset <= first < b.slot_offset + b.slot_count)
             raise ModelError(
-                f"{_piece(body, loose)} is not supported: supports, joints and terms leave {free} rigid "
-                f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "
-                f"not counted): clamp or drive more nodes, {held_by}or let a damped dynamic run come to rest"
+                f"{_piece(body, loose)} has {free} unconstrained rigid-body mode{'s' * (free > 1)}: no unique static "
+                f"equilibrium (gravity does not count as a support): clamp or drive more nodes, {held_by}or let a "
+                "damped dynamic run come to rest"
             )
 
 

@@ -161,14 +161,14 @@ class TriMesh(Shape):
         one, other = order[:-1][same], order[1:][same]
         for k in np.flatnonzero(start[one] == start[other])[:1]:
             raise ModelError(
-                f"TriMesh: {self._edge(one[k])} is run through in one direction by triangles {one[k] // 3} and "
-                f"{other[k] // 3}; turn one of them round"
+                f"TriMesh: inconsistent orientation of triangles {one[k] // 3} and {other[k] // 3} at "
+                f"{self._edge(one[k])}: flip one"
             )
         normal = self._cross / np.linalg.norm(self._cross, axis=1, keepdims=True)
         folded = np.linalg.norm(normal[one // 3] + normal[other // 3], axis=1) < FOLD
         for k in np.flatnonzero(folded)[:1]:
-            raise ModelError(f"TriMesh: at {self._edge(one[k])} triangles {one[k] // 3} and {other[k] // 3} lie on "
-                             "each other: the surface folds back on itself")  # fmt: skip
+            raise ModelError(f"TriMesh: coincident triangles {one[k] // 3} and {other[k] // 3} at "
+                             f"{self._edge(one[k])}: the surface folds back on itself")  # fmt: skip
         out = np.full(t.size, -1)
         out[one], out[other] = other // 3, one // 3
         return out.reshape(-1, 3)

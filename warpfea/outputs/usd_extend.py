@@ -79,7 +79,7 @@ def read_earlier(
     time, now = codes[-1] / wanted["fps"], time_of(sim)
     slack = 1e-6 * max(1.0 / wanted["fps"], abs(now))
     if time > now + slack:
-        raise _refused(target, f"it goes on to t = {time:.6g} s, and the run is resumed at t = {now:.6g} s")
+        raise _refused(target, f"its last frame, t = {time:.6g} s, is later than the checkpoint, t = {now:.6g} s")
     if time < now - slack - 1.001 / wanted["fps"]:
         raise _refused(
             target, f"it ends at t = {time:.6g} s, and the run is resumed at t = {now:.6g} s: frames are missing"
