@@ -146,7 +146,7 @@ BAD = {
     "explicit": (contact(treatment="explicit"), r"treatment = 'explicit' is for law = 'paper' only, not 'default'"),
     "points": (contact(points=6), r"'pad': points = 6: the faces of body 'block' \(T10\) are triangles.* 3, 7 points"),
     "points text": (contact(points="many"), r"'pad': points = 'many': the faces"),
-    "smoothing": (contact(smoothing=1e-3), r"'pad': smoothing = 0.001: applies to law = 'paper' or 'smooth' only"),
+    "smoothing": (contact(smoothing=1e-3), r"'pad': smoothing = 0.001 applies to law = 'paper' or 'smooth' only"),
     "depth": (contact(law="paper", smoothing=0.0), r"'pad': smoothing = 0.0 must be a positive depth, m"),
     "pair": (contact(law="smooth", smoothing=1e-3), r"smoothing = 0.001 must be two positive numbers \(eps in N"),
     "pair of 0": (contact(law="smooth", smoothing=(0, 1)), r"smoothing = \(0, 1\) must be two positive numbers"),

@@ -463,7 +463,7 @@ def test_the_first_value_precedes_the_simulation():
     m.set_parameter("body.E", 2e6)
     wf.Simulation(m, dt=1e-3)
     m.set_parameter("body.E", [1e6, 2e6])
-    with pytest.raises(wf.ModelError, match=r"with one value of 'body.nu' .* call this once before the first"):
+    with pytest.raises(wf.ModelError, match=r"'body.nu' was uniform .* before the first Simulation"):
         m.set_parameter("body.nu", 0.2)
 
 

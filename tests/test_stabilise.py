@@ -86,5 +86,5 @@ def test_bad_stiffness(value):
 
 def test_a_density_is_needed():
     model, _ = block(density=None)
-    with pytest.raises(wf.ModelError, match="no density, which stabilise needs"):
+    with pytest.raises(wf.ModelError, match="missing density of SVK, required by stabilise"):
         wf.solve_static(model, stabilise=True)

@@ -1,4 +1,4 @@
-"""Device memory that does not suffice, as one error that says how much was asked for and what to do."""
+"""Out-of-memory errors with the requested size and remedies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _REFUSED = re.compile(r"Failed to allocate (?:(\d+) bytes|memory)|out of memory"
 
 @contextmanager
 def enough_memory(what: str, device: Any) -> Iterator[None]:
-    """Turn a refused allocation within, on a Warp device or on the host, into a CapacityError about `what`."""
+    """Convert a failed allocation within, on a Warp device or the host, to a CapacityError about `what`."""
     try:
         yield
     except MemoryError as error:
@@ -36,7 +36,7 @@ REMEDY = "; take fewer worlds, a coarser mesh, dtype='float32' or a device with 
 
 
 def _room(device: Any) -> str:
-    """How much of a GPU's memory is free."""
+    """Free and total memory of a GPU as text."""
     if not getattr(device, "is_cuda", False):
         return ""
     return f", {size(device.free_memory)} of {size(device.total_memory)} are free"

@@ -1,4 +1,4 @@
-"""Colliders and contacts as a builder records them; the methods of ModelBuilder say what they mean."""
+"""Colliders and contacts as recorded by a builder; documented at the methods of ModelBuilder."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def contact_surface(thing: Body | SurfaceSet) -> SurfaceSet:
     """A surface, or all outer faces of a body.
 
     Raises:
-        ModelError: no faces, faces inside of the body, or the same face twice.
+        ModelError: no faces, interior faces, or a repeated face.
     """
     body = thing if isinstance(thing, Body) else thing.body
     surface = SurfaceSet(body, body.boundary) if isinstance(thing, Body) else thing
@@ -144,7 +144,7 @@ def make_pair(
 
 
 def _checked(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any]:
-    """The options of a contact with None replaced where it stands for a value. ModelError names what is wrong."""
+    """Contact options with None replaced by defaults. ModelError names the invalid one."""
     for option, known in (("law", CONTACT_LAWS), ("treatment", TREATMENTS), ("model", CONTACT_MODELS),
                           ("overlap", OVERLAPS)):  # fmt: skip
         if o[option] not in known:
