@@ -188,7 +188,7 @@ def test_clamped_slots(name, slots, kinds):
 def test_unknown_slots(name, known):
     b, body = scene(name)
     for call in (b.clamp, functools.partial(b.drive, displacement=(0, 0, 1))):
-        with pytest.raises(wf.ModelError, match=f"slots = 'position.twist': valid slots of element {known}, or several"):
+        with pytest.raises(wf.ModelError, match=f"'position.twist': valid slots of element {known}, or several"):
             call(body.nodes([0]), slots="position+twist")
 
 

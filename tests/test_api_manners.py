@@ -73,7 +73,7 @@ def test_a_mesh_in_mm_is_asked_about(tmp_path):
 
 
 def test_gravity_without_density_asks_for_the_density_alone():
-    with pytest.raises(wf.ModelError, match="missing density of .*, required by gravity") as told:
+    with pytest.raises(wf.ModelError, match=r"missing density of .*, required by gravity") as told:
         builder(None, gravity=(0, 0, -9.81))[0].finalize(device="cpu")
     assert "gravity=(0, 0, 0)" not in str(told.value)
 

@@ -163,7 +163,10 @@ def metal() -> wf.ModelBuilder:
     return b
 """)
     assert main(["run", str(path), "--device", "cpu", "--quiet"]) == 0
-    assert "warpfea: warning: body 'bar': SVK with E = 2.1e+05 Pa and 7850 kg/m^3: implausible wave speed" in capsys.readouterr().err
+    assert (
+        "warpfea: warning: body 'bar': SVK with E = 2.1e+05 Pa and 7850 kg/m^3: implausible wave speed"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_hook_keeps_its_energy():

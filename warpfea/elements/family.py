@@ -168,7 +168,7 @@ class Family:
 
     @property
     def has_gradients(self) -> bool:
-        """Whether nodes carry gradient slots."""
+        """True if nodes carry gradient slots."""
         return any(k > 0 for kinds in self.node_slots for k in kinds)
 
     def kinds(self, names: str) -> set[int]:
