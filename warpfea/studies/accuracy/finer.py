@@ -108,7 +108,7 @@ def finer_motion(
     told: dict[str, Any] = {}
 
     def add(label: str, settings: list[Setting], low: float, high: float) -> None:
-        """Add the error in one direction, from runs that are coarser in it, the nearest first."""
+        """Add the error in one direction, from coarser runs in it, the nearest first."""
         runs = [_done(run, s) for s in settings]
         near = distances(runs[0], motion)
         far = distances(runs[1], run_motion(runs[0], names, "")) if len(runs) > 1 else None
