@@ -30,8 +30,7 @@ def mixed(
         width: of their section, m.
         height: of their section, along gravity, m.
         gap: between two bars, m.
-        cells: along the length; of the solids each is one hexahedron or six tetrahedra, of the T10 bar there are
-        twice
+        cells: along the length; of the solids each is one hexahedron or six tetrahedra, of the T10 bar there are twice
             as many.
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.

@@ -24,11 +24,9 @@ def rollup(
     eta: float = 2e6,
     integration: Literal["tied", "split", "full"] = "tied",
 ) -> wf.ModelBuilder:
-    """A built-in beam of 3243 elements is rolled up by a moment at its end, turns x 2 pi E I / length; 1 is a
-    circle.
+    """A built-in beam of 3243 elements is rolled up by a moment at its end, turns x 2 pi E I / length; 1 is a circle.
 
-    The moment grows linearly during `duration` and is then held; damping keeps the motion near equilibrium. The axis
-    of
+    The moment grows linearly during `duration` and is then held; damping keeps the motion near equilibrium. The axis of
     the moment is fixed in space, and beyond a quarter of a turn a beam under such a moment would buckle out of its
     plane: here all nodes are constrained to the plane. With nu > 0 integration "full" locks, and the beam stays
     open.

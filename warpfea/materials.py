@@ -83,8 +83,7 @@ class KelvinVoigt:
         eta: shear viscosity, Pa s.
         lambda_v: bulk-like viscosity, Pa s.
         form: discretisation of Edot. "incremental" (default): the difference of E over the step; vanishes for any
-            rigid rotation and has a potential. "rate": Eq. (58) with F and Fdot at the end of the step, as Paper I;
-            a
+            rigid rotation and has a potential. "rate": Eq. (58) with F and Fdot at the end of the step, as Paper I; a
             spinning body expands. "explicit": Eq. (58) at the start of the step, a force held during it.
 
     Raises:
@@ -201,8 +200,7 @@ class SVK(Material):
     Args:
         E: Young's modulus, Pa.
         nu: Poisson's ratio, -1 < nu < 0.5.
-        density: kg/m^3 of the reference configuration; a number, one per element, or f(X (n, 3)) -> (n,). There is
-        no
+        density: kg/m^3 of the reference configuration; a number, one per element, or f(X (n, 3)) -> (n,). There is no
             default: motion, gravity, body forces and the mass matrix need one; statics without gravity does not.
         damping: KelvinVoigt or None.
 

@@ -7,8 +7,7 @@ adaptive also substeps, for each scene, integrator and requested error.
 An error is the largest distance of a position from the reference at eight common instants, over the model's size.
 `cost` is the Newton iterations over those of the best fixed step with the same true error, interpolated between the
 runs of `fixed`; beyond them extrapolated with the order of the scheme (`extrapolated`). The impacts of `impact` and
-`contact` last a hundredth of the run; `soft_contact` has neither a short impact nor a smooth motion. Parts go on
-from
+`contact` last a hundredth of the run; `soft_contact` has neither a short impact nor a smooth motion. Parts go on from
 the parts before them.
 """
 

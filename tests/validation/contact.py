@@ -510,8 +510,7 @@ def stack_case(
 ) -> dict[str, Any]:  # fmt: skip
     """Stack at rest with the last cube `top` times as heavy; creep is measured from a tenth of the duration on.
 
-    A stack is a column whose joints turn: with springs of k = 3.3 10^-2 stiffness E side in the joints those of E =
-    1e7
+    A stack is a column whose joints turn: with springs of k = 3.3 10^-2 stiffness E side in the joints those of E = 1e7
     buckle by their weight at `stiffness` 1 (q L^3/EI = 16 > 7.84 of Greenhill's column), and not at 20 (2.2).
     """
     b = wf.ModelBuilder(gravity=(0, 0, -G))

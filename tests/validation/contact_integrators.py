@@ -1,7 +1,6 @@
 """Shortened contact scenes with every integrator.
 
-rows    error of the probes against a finer run, over their travel, and changes of terms of the energy ledger over
-the
+rows    error of the probes against a finer run, over their travel, and changes of terms of the energy ledger over the
         run, over the largest energy exchanged: `integrator` (positive: the scheme dissipates), `contact_loss`
         (restitution and damping of contacts) and `friction`.
 orders  in the step, of each curve, by least squares over its resolved rows.

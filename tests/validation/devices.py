@@ -1,5 +1,4 @@
-"""A CUDA device against the CPU on the same models, in both precisions: every kind of element, law, load,
-constraint.
+"""A CUDA device against the CPU on the same models, in both precisions: every kind of element, law, load, constraint.
 
 h = 1e-3 s; differences over the tip's travel. The tests run the same cases if a device is available.
 """

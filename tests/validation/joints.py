@@ -1,12 +1,10 @@
 """Cost and stability of constraints.
 
-cost        a chain of m links and m revolute joints that hangs and swings to the side, m = 10, 100, 1000: ms per
-step
+cost        a chain of m links and m revolute joints that hangs and swings to the side, m = 10, 100, 1000: ms per step
             and iterations (outer: multiplier updates), for the default (multipliers with every Newton step,
             constraint directions deflated), for either alone, and for the classical augmented Lagrangian on block
             Jacobi ("before").
-stability   mass ratios to 1e4, E from 1e4 to 1e12 Pa, steps from 1e-5 to 1e-2 s; a door on four hinges; a
-parallelogram
+stability   mass ratios to 1e4, E from 1e4 to 1e12 Pa, steps from 1e-5 to 1e-2 s; a door on four hinges; a parallelogram
             linkage driven through its dead points. A case passes if every step is accepted and the violation stays
             within 1e-8 of the model's size, or when a named error of warpfea ends it.
 """

@@ -117,8 +117,7 @@ def rigid_slider_crank(run: Run) -> Iterator[Row]:
 def double_pendulum(run: Run) -> Iterator[Row]:
     """Two stiff links swinging for 2 s from rest, bdf2, against rigid ones with the boxes' mass, centre and inertia.
 
-    Errors are the largest distances of elbow and tip over the length of both links. From the horizontal (1.571 rad)
-    the
+    Errors are the largest distances of elbow and tip over the length of both links. From the horizontal (1.571 rad) the
     links swing to -2.19 and 2.07 rad, from 45 degrees (0.785 rad) within 0.83 rad; neither turns over.
     """
     level, low = np.pi / 2, np.pi / 4
@@ -245,8 +244,7 @@ def no_drift(run: Run) -> Iterator[Row]:
     """Violation over 1e5 steps of 1 ms of bdf2: a soft double pendulum of two 3243 elements swings in space.
 
     `violation_*` are the joints' records at every step, over the model's size; `gap_*` is that of the pinned
-    ends from their positions alone, `crossing` of the hinge from deformation gradients, every 100 steps since
-    resumed.
+    ends from their positions alone, `crossing` of the hinge from deformation gradients, every 100 steps since resumed.
     First and last: of the first and the last tenth.
     """
     sim, joints = swing(run.device)
@@ -504,11 +502,9 @@ def _beside_an_impact(device, tie, integrator):
 
 
 def free_fall(run: Run) -> Iterator[Row]:
-    """Two bodies tied by a joint fall as one, against the scheme's recursion; backward Euler's q = g h^2 n (n + 1) /
-    2.
+    """Two bodies tied by a joint fall as one, against the scheme's recursion; backward Euler's q = g h^2 n (n + 1) / 2.
 
-    fall: all nodes of a pair let go at rest, over the fall. spin: the centre of mass of a pair thrown spinning at
-    8.3
+    fall: all nodes of a pair let go at rest, over the fall. spin: the centre of mass of a pair thrown spinning at 8.3
     rad/s, 20 steps of 1/8 turn per 10 ms at most; with max_newton steps are halved; `moment_balance` is the change
     of angular momentum by the joint's forces in a step, over it; `kept` is L_end / L_start. beside an impact: steps
     halved by another body. welded: `kept` of the pair against one body of both, `from_one_body` their difference

@@ -1,7 +1,6 @@
 """Round-off limit of the error in float32, for each family.
 
-The problem `small_body` with BDF2 in float64 and float32, each with the solver's own tolerance, over a range of
-steps.
+The problem `small_body` with BDF2 in float64 and float32, each with the solver's own tolerance, over a range of steps.
 `float64` and `float32` are the errors of the tip against a finer float64 run, the root of the mean square over time
 over its travel; `least` is the smallest of float32 over the steps.
 """

@@ -22,8 +22,7 @@ class Output:
     `close` completes the file, also after an interrupted run. `abort` discards the output of the run and keeps an
     older target file. A writer may be reopened after either.
 
-    Adaptive steps end where a frame is due: `rate` is frames per simulated second, None without a rate; `moments`
-    are
+    Adaptive steps end where a frame is due: `rate` is frames per simulated second, None without a rate; `moments` are
     single times, s.
     """
 

@@ -76,10 +76,8 @@ class ModelBuilder:
             element: "T4" or "T10", by default that of the cells; "ENMC", "FN" or "FN18", the ANCF tetrahedra, on
                 tetrahedra (of T10 cells the corner nodes, renumbered; ENMC keeps the curved shape); "H3843",
                 the ANCF brick, on hexahedra.
-            quadrature: name of the force rule of all elements; T10: "tet4", "tet5_paper", "tet8", "tet14"; T4:
-            "tet1",
-                "tet4"; ENMC, FN, FN18: "tet14", "conical4"; H3843: "3x3x3", "4x4x4". By default T10 takes "tet4"
-                where
+            quadrature: name of the force rule of all elements; T10: "tet4", "tet5_paper", "tet8", "tet14"; T4: "tet1",
+                "tet4"; ENMC, FN, FN18: "tet14", "conical4"; H3843: "3x3x3", "4x4x4". By default T10 takes "tet4" where
                 straight and "tet8" where curved, T4 "tet1", the others their first.
             scale: factor on the coordinates of the file.
             transform: (4, 4) matrix, or (rotation (3, 3), translation (3,)), applied after `scale`.
@@ -109,10 +107,8 @@ class ModelBuilder:
             normal: (3,), or a function of s; made perpendicular to the axis. A turning normal makes a twisted beam.
             material: one law.
             integration: "tied" (default with SVK; remedies against Poisson, shear and thickness locking, and the
-                section's shear and torsion factors), "split" (the Poisson part on the axis alone, as Project
-                Chrono),
-                "full" (5x3x3 points, as Paper I; default with the other laws), or "3x2x2" points of the full law;
-                see
+                section's shear and torsion factors), "split" (the Poisson part on the axis alone, as Project Chrono),
+                "full" (5x3x3 points, as Paper I; default with the other laws), or "3x2x2" points of the full law; see
                 warpfea.elements.ancf_beam.
             corners: "error", or "weld": a rigid corner, where both sides share the deformation gradient (Shabana and
                 Mikkola 2003).
@@ -173,13 +169,10 @@ class ModelBuilder:
 
         Args:
             nodes: nodes to clamp.
-            slots: "all" (built in), or "position" (pinned), "position+axis", or other names joined by "+": "axis"
-            and
+            slots: "all" (built in), or "position" (pinned), "position+axis", or other names joined by "+": "axis" and
                 "section" of beams, "surface" and "director" of shells, "gradients" of ANCF solids, or one of them,
-                "gradient-x", "gradient-y", "gradient-z". Holding the gradient along the axis at a built-in end adds
-                a
-                little stiffness; "position+section" does not. On a plane wall of an ANCF solid hold the positions
-                and
+                "gradient-x", "gradient-y", "gradient-z". Holding the gradient along the axis at a built-in end adds a
+                little stiffness; "position+section" does not. On a plane wall of an ANCF solid hold the positions and
                 the gradients along the wall.
             components: letters of "xyz" to clamp, global axes.
 
@@ -243,8 +236,7 @@ class ModelBuilder:
         """A force per mass b(x, t), N/kg, at the current position (Eq. 23).
 
         Args:
-            field: wp.func (x: vec3, t: scalar) -> vec3, in the model's precision or in float32 or float64 as
-            annotated.
+            field: wp.func (x: vec3, t: scalar) -> vec3, in the model's precision or in float32 or float64 as annotated.
             bodies: bodies it acts on; by default all added so far.
         """
         loads.check_field(field)
@@ -282,8 +274,7 @@ class ModelBuilder:
         """Connect two bodies, or a body and the ground, by a joint.
 
         Args:
-            kind: "spherical", "universal", "revolute", "cylindrical", "translational", "fixed", or "distance" (a rod
-            of
+            kind: "spherical", "universal", "revolute", "cylindrical", "translational", "fixed", or "distance" (a rod of
                 constant length between two points).
             parent, child: wf.GROUND, a material point (body.at), nodes (body.nodes, beam.end), or a surface,
                 represented by its mean position and rotation. Attach rotational joints of solids to a surface or
@@ -315,8 +306,7 @@ class ModelBuilder:
         """A single basic constraint between points (Paper I, section 5.4).
 
         Args:
-            kind: "DP1", (Q - P).(T - R) = f m^2; "DP2", the same with R on the body of P and Q; "DIST", |P - Q| = f
-            m,
+            kind: "DP1", (Q - P).(T - R) = f m^2; "DP2", the same with R on the body of P and Q; "DIST", |P - Q| = f m,
                 positive; "PIN", P - Q = f (3,) m.
             points: P, Q (, R, T): material points, nodes or surfaces (their mean), or fixed places (x, y, z), m.
             value: f, a time law; by default 0 of DP1, DP2 and PIN, and the reference distance of DIST.
@@ -339,8 +329,7 @@ class ModelBuilder:
         own section deformations are constrained. The first should be the coarser side.
 
         Args:
-            first: a surface; beam.start, beam.end or a named edge of a shell (plate.edge) stand for their faces.
-            Other
+            first: a surface; beam.start, beam.end or a named edge of a shell (plate.edge) stand for their faces. Other
                 nodes are pinned one by one.
             second: the body, or a surface of it, that contains the first.
             name: unique name.
@@ -429,8 +418,7 @@ class ModelBuilder:
             worlds: number of independent copies of the scene.
 
         Raises:
-            ModelError: no bodies, unknown device or precision, or gravity or a body force on a body whose material
-            has
+            ModelError: no bodies, unknown device or precision, or gravity or a body force on a body whose material has
                 no density.
             CapacityError: the device has too little memory.
 

@@ -192,8 +192,7 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
 
     Args:
         values: (3,) uniform; a function X (n, 3) -> (n, 3), whose gradient is taken by central
-            differences with steps that follow the size of the cells; or (nodes, 3), for bodies without gradient
-            slots.
+            differences with steps that follow the size of the cells; or (nodes, 3), for bodies without gradient slots.
 
     Raises:
         ModelError: another shape, values that are not finite, or nodal values on a body with gradient slots.

@@ -84,8 +84,7 @@ def read_reference(path: str | pathlib.Path, probe: str) -> Reference:
     """Reference from a file of positions over time.
 
     Args:
-        path: .csv with the columns t, x, y, z and, for several probes, probe; or .json with t (n,) and probes, a
-        dict
+        path: .csv with the columns t, x, y, z and, for several probes, probe; or .json with t (n,) and probes, a dict
             of positions (n, 3), and optionally about and error (m). SI units.
         probe: name of the probe of a .csv without the column `probe`.
 

@@ -82,15 +82,13 @@ def summarize(
     `analysis` is "dynamic" or "static"; `t_end` the time reached, in statics `load` the load factor, 0 to 1, with
     `steps` load steps; `substeps` are the accepted ones of dt="auto", whose `steps` are intervals, else null;
     `mass` is null if a density is missing, `bounding_box` that of the reference; `wall_s` are the seconds from
-    building to the closing of files: `setup_s` until the first step, of which `compile_s` to make the simulation
-    with
+    building to the closing of files: `setup_s` until the first step, of which `compile_s` to make the simulation with
     its kernels, `output_s` to write files, `solve_s` the rest; `min_J` is the smallest det F of any step, null if
     there is none; `rough_steps` are those accepted short of the tolerance (Jacobi), `floored_steps` those whose
     residual rounding stopped above it, and `max_floor` the largest error that was estimated there
     (`StepReport.floor`),
     0 without such steps; energies and probes are the last values, of statics the strain energy alone; `violation` is
-    the largest of the constraints in any step, m; `contacts` has by name the largest normal_force, N, and
-    penetration,
+    the largest of the constraints in any step, m; `contacts` has by name the largest normal_force, N, and penetration,
     m, of any step, and the last force, N, area, m^2, and stick; `stable` is the stability of the static equilibrium,
     null if unknown.
     """

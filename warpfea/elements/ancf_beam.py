@@ -1,5 +1,4 @@
-"""ANCF beam 3243: two nodes, each with position and three gradients (Paper I, 1.3.1), and its remedies against
-locking.
+"""ANCF beam 3243: two nodes, each with position and three gradients (Paper I, 1.3.1), and its remedies against locking.
 
 On the parent xi in [0, 1], eta, zeta in [-1/2, 1/2] the basis [1, u, v, w, uv, uw, u^2, u^3] of Eq. (2) is: Hermite
 cubics along the axis, linear in the section. Slot 1 is the gradient along the beam's axis, slots 2 and 3 are those
@@ -10,21 +9,18 @@ Locking, and the remedies of the integrations:
   stiffness of uniaxial *strain*: 1.35 E for nu = 0.3. The part D0 of the SVK law without coupling of the normal
   strains is integrated over the volume, the Poisson part D - D0 on the axis alone (Gerstmayr, Matikainen, Mikkola
   2008, Multibody Syst. Dyn. 20:359); bending then has E, tension the full law.
-- shear: section vectors turn linearly along an element, the slope of a cubic axis does not. Shear at the Gauss
-points
+- shear: section vectors turn linearly along an element, the slope of a cubic axis does not. Shear at the Gauss points
   makes both agree there, and the axis loses its cubic part. "tied" takes the transverse shear at the nodes, shared
   by neighbours. The deviation b of the axis from the sections in the middle of the element gets the energy of its
   curvature, missing in bending under a moment that varies linearly along the element (the residual
   bending flexibility of MacNeal 1978, Comput. Struct. 8:175).
 - thickness: a section vector interpolated between two directions is too short in between; "tied" takes the strain in
   the section at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
-- torsion and shear of a plane section (not locking, but too stiff as well): "tied" takes the section's own
-constants.
+- torsion and shear of a plane section (not locking, but too stiff as well): "tied" takes the section's own constants.
 "tied" has all remedies, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I). Limits
 of "tied": it passes the patch test under tension, not under shear tractions or pressure on its sides, which disturb
 the
-gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft
-by
+gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft by
 about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Rejected:
 curvature extrapolated from the middle and the ends, exact to fourth order in that angle, but with an error of 0.4
 (h/R)^2 by exchange of stretch and curvature of the axis's gradient, not reduced by the mesh.

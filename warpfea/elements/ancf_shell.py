@@ -1,5 +1,4 @@
-"""ANCF shell 3443: four nodes, each with position and three gradients (Paper I, 1.3.2), and remedies against
-locking.
+"""ANCF shell 3443: four nodes, each with position and three gradients (Paper I, 1.3.2), and remedies against locking.
 
 On the parent xi, eta in [0, 1] (mid-surface) and zeta in [-1/2, 1/2] (thickness) the basis is that of Eq. (3) with
 u = xi, w = eta and v = zeta: twelve functions of the mid-surface, and functions bilinear in the surface times the
@@ -7,10 +6,8 @@ thickness. Slots 1 and 2 are gradients along the surface, slot 3 along the direc
 shared nodes make the surface continuous also on distorted quads.
 
 Locking and its remedies, by the choice of strains and integration points ("tied"):
-- Poisson (thickness): a director that is one vector per point can't strain linearly through the thickness, so
-bending
-  is (1-nu)^2/(1-2nu) times too stiff (1.225 for nu = 0.3). The law is split into plane stress, integrated through
-  the
+- Poisson (thickness): a director that is one vector per point can't strain linearly through the thickness, so bending
+  is (1-nu)^2/(1-2nu) times too stiff (1.225 for nu = 0.3). The law is split into plane stress, integrated through the
   thickness, which needs no such strain, and the part that couples the thickness to the surface, integrated on the
   mid-surface alone (the split of Gerstmayr, Matikainen, Mikkola 2008 for beams, taken to shells).
 - shear: the bilinear director can't follow the slopes of the cubic surface, so a thin plate would have to bend with
@@ -24,20 +21,15 @@ bending
   strongly bent shell the spurious strain energy exceeds that of bending (a thin quarter arc of 16 elements bends
   0.13 of the exact value). The strain
   across the thickness is taken at the nodes and interpolated (Betsch and Stein 1995, Commun. Numer. Methods Eng.
-  11:899). The strains in the surface that it is coupled to are taken at 2x2 points, which integrate their variations
-  on
+  11:899). The strains in the surface that it is coupled to are taken at 2x2 points, which integrate their variations on
   any flat quad; at the nodes alone they do not balance those of plane stress, and the pressure of a pressed plate on
   a flat collider varies by 1e-3. Means of the surface gradients at the nodes, in place of strains at
-  points, lock a thin arc (0.83 of the deflection with 16 elements, 0.37 with 8). Strains averaged to the nodes do
-  not,
+  points, lock a thin arc (0.83 of the deflection with 16 elements, 0.37 with 8). Strains averaged to the nodes do not,
   but make the surface stiffer (Cook's membrane, nu = 0.49, 4x4 elements: by 6 %).
-- membrane: needs no remedy. The cubic surface follows an arc without stretching to fourth order in its angle; with
-the
-  thickness strain out of the way a thin arc (R/t = 1000) bends as a thick one does: plane stress stays at 4x4
-  points.
+- membrane: needs no remedy. The cubic surface follows an arc without stretching to fourth order in its angle; with the
+  thickness strain out of the way a thin arc (R/t = 1000) bends as a thick one does: plane stress stays at 4x4 points.
 "full" is Paper I's law at 4x4x2 points, without remedies. Limits of "tied": it passes the patch test under plane
-stress and a pressure on both faces on any mesh, and under uniform transverse shear on parallelograms; on general
-quads
+stress and a pressure on both faces on any mesh, and under uniform transverse shear on parallelograms; on general quads
 that is off by a few percent of the shear. "full" passes all of these.
 """
 

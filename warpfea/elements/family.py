@@ -23,8 +23,7 @@ class Tying:
     Attributes:
         points: (n, 3) parent coordinates.
         pairs: (n, 2) directions a, b of each strain: parent lines (e is covariant), or the axes of a framed part.
-        coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q),
-        the
+        coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q), the
             rule, the material, the body's section) -> A (E, n, width).
         width: A couples the points of each run of `width` points.
         uses: material constants in A.
@@ -45,8 +44,7 @@ class Part:
         name: name in reports.
         rule: quadrature of the integral.
         law: function Material -> (device law, coefficients), or None for the material's own.
-        framed: the strains are along axes of the element: its first parent line, and the others made orthonormal to
-        it.
+        framed: the strains are along axes of the element: its first parent line, and the others made orthonormal to it.
         tying: the energy is that of strains at tying points, and the law gives mu (or another modulus in its place);
             None: of strains at the rule.
     """
@@ -111,15 +109,13 @@ class Family:
         faces: parent corners of each face, (3, 3) triangles or (4, 3) quadrilaterals, outward; mesh cells of solids
             count their faces in the same order.
         face_rule: rule on the unit triangle or square, exact for a pressure on a flat face.
-        divisions: parts (a, b) into which each face is cut along its two sides for drawing; triangles take the
-        first.
+        divisions: parts (a, b) into which each face is cut along its two sides for drawing; triangles take the first.
         node_samples: (n, k, 3) parent points at each element node where fields are evaluated for drawing.
         lattice: drawing of an element in VTK.
         schemes: integrations of several parts by name; each force rule is also one of a single part.
         output_schemes: integrations that are for stress output only: "shear stress" in place of a tied part "shear".
         slot_sets: slot kinds by the name under which supports may hold them.
-        spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's
-        axis
+        spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
             or a shell's surface offers almost no rotational stiffness at a point, and must not carry it.
         solid: the mesh cell is the body itself; False for beams and shells, which add a section or a thickness.
     """

@@ -144,12 +144,10 @@ def bernstein(lam: np.ndarray) -> np.ndarray:
 
 
 def bezier_map(c: float | None = None) -> np.ndarray:
-    """Control points from nodal coordinates in volume slots, M of S = B M: (20, 20) of ENMC, or (20, 16) of FN with
-    c.
+    """Control points from nodal coordinates in volume slots, M of S = B M: (20, 20) of ENMC, or (20, 16) of FN with c.
 
     Derived from the meaning of control points, not from A.1: r_i at corners, r_i + r_(i -> j) / 3 on edges, and on
-    faces the point that puts the cubic's centroid at r_c; for FN, r_c = sum r_i / 3 + c sum r_(i -> j) over the
-    face.
+    faces the point that puts the cubic's centroid at r_c; for FN, r_c = sum r_i / 3 + c sum r_(i -> j) over the face.
     """
     M = np.zeros((20, 20 if c is None else 16))
     for i in range(4):

@@ -68,8 +68,7 @@ class ContactPoints:
 def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:
     """The points of a surface, corners included.
 
-    Triangles have 7 points (degree 3, area weights 1/20, 2/15, 9/20 of vertices, mid-sides and centre),
-    quadrilaterals
+    Triangles have 7 points (degree 3, area weights 1/20, 2/15, 9/20 of vertices, mid-sides and centre), quadrilaterals
     Lobatto's 4 x 4 (degree 5 along each side).
 
     Args:

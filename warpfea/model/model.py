@@ -361,8 +361,7 @@ class Model:
         """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2; for the worlds of `mask` (worlds,).
 
         Raises:
-            ModelError: wrong shape, a value that is not finite, a material without a density, or a model built
-            without
+            ModelError: wrong shape, a value that is not finite, a material without a density, or a model built without
                 gravity.
         """
         self.set_parameter("gravity", gravity, mask=mask)
@@ -383,8 +382,7 @@ class Model:
         """Set a parameter in all or some worlds; simulations use the new values from their next step on.
 
         Args:
-            name: "B.E" with the name B of a body, or "B.G.E" with a group G that has a material of its own: a
-            constant
+            name: "B.E" with the name B of a body, or "B.G.E" with a group G that has a material of its own: a constant
                 of the material (E and nu if made from them, else those of the law), eta and lambda_v of its damping,
                 kept if 0, or density, kg/m^3; density_factor for densities given as a function or per element. Set
                 such a name for the first time before making simulations.

@@ -61,8 +61,7 @@ class TriMesh(Shape):
         scale: m per unit of the points.
 
     Raises:
-        ModelError: a file that can't be read, no triangles, a triangle without an area, a point number out of range
-        or
+        ModelError: a file that can't be read, no triangles, a triangle without an area, a point number out of range or
             a value that is not finite; an edge of more than two triangles, inconsistent orientation, or coincident
             triangles at an edge; an inverted closed mesh.
     """

@@ -1,8 +1,7 @@
 """Common parts of output writers: protocol, frame times, file replacement, drawn surface.
 
 A writer receives the simulation and reads `time` (B,), of statics `load` (B,), `dt`, `model.bodies`,
-`model.worlds`, `model.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for nodal
-formats,
+`model.worlds`, `model.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for nodal formats,
 `positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
 """
 

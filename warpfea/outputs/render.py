@@ -110,8 +110,7 @@ class PNGWriter(_Drawing):
         color_range: (low, high) of the colours, by default the extremes of the drawn values.
         spacing: of worlds (m). ground: True to draw the ground at the lowest point.
 
-    ModelError: a bad size, view or field. OutputError: a bad colour range, a bad suffix or folder (at `open`), a
-    file
+    ModelError: a bad size, view or field. OutputError: a bad colour range, a bad suffix or folder (at `open`), a file
     that can't be written (at `close`).
     """
 

@@ -69,8 +69,7 @@ def known_motion(reference: Reference, chosen: Sequence[str] | None, run: Outcom
     """Reference as a Motion; `run`: any finished run, for the probes and their initial positions.
 
     Raises:
-        ModelError: a chosen probe is not in the reference, it has none of the scene, ends early, or its positions
-        are
+        ModelError: a chosen probe is not in the reference, it has none of the scene, ends early, or its positions are
             not (n, 3) and finite.
     """
     names = list(chosen) if chosen is not None else [name for name in reference.probes if name in run.probes]

@@ -36,8 +36,7 @@ class StudyOptions:
         measure: the error used: "l2", "end", "energy" or "field".
         target: requested error of the cheapest setting: in time and, without a swept mesh, including the mesh
             estimate of `split`.
-        split: parts of the error: of the "best" row (the answer to the target, else that with most digits of
-        efficacy),
+        split: parts of the error: of the "best" row (the answer to the target, else that with most digits of efficacy),
             of "all" rows, or "none".
         repeat: runs of each setting for the times; those longer than 2 s are not repeated.
         limit: time limit of a run, s.

@@ -1,7 +1,6 @@
 """Parts of an error, by differences of runs.
 
-For a run u with the step h, cells of the size H, the tolerance tau and the precision of its dtype, |.| the distance
-of
+For a run u with the step h, cells of the size H, the tolerance tau and the precision of its dtype, |.| the distance of
 `motion.py` (l2, largest of the probes, over the reference's travel):
 
     time      |u(h) - u(h/2)| 2^p / (2^p - 1), p the order of the method; for steps adapted to a requested error e
@@ -11,8 +10,7 @@ of
     rounding  |u(float32) - u(float64)| for a float32 run; for float64 times 2^-29, the ratio of both unit round-offs
 
 A part is empty if unavailable: no parameter of the scene refines the mesh, the finer run was not
-accepted, or float32 can't hold the case. The parts may have different signs: their sum bounds the error, with that
-of
+accepted, or float32 can't hold the case. The parts may have different signs: their sum bounds the error, with that of
 the model itself (element, law) left out.
 """
 

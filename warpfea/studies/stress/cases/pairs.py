@@ -1,5 +1,4 @@
-"""Contact between bodies: fast impacts, stiff on soft, vertices, edges and faces, exact touch, thin bodies,
-extremes.
+"""Contact between bodies: fast impacts, stiff on soft, vertices, edges and faces, exact touch, thin bodies, extremes.
 
 Criteria for both bodies: in every step the change of momentum equals the impulse of the recorded forces and the
 weight; friction is at most mu N; no energy is gained; no centre of mass passes the other body.

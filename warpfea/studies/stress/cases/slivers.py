@@ -39,8 +39,7 @@ def _mesh(element: str) -> Any:
 @case("slivers", "Meshes", values=("T4", "T10", "ENMC", "FN18"), quick="both",
       refusal={"float32": ("float32 can't hold this case",)})  # fmt: skip
 def slivers(setting: Setting, element: str) -> Answer:
-    """The boundary of a cube with a layer of slivers, aspect 1e4, is moved affinely; inner nodes start off their
-    place.
+    """The boundary of a cube with a layer of slivers, aspect 1e4, is moved affinely; inner nodes start off their place.
 
     The offset is a third of a sliver's height, 0.03 for gradients. Criterion: relative stress error.
     """
