@@ -55,7 +55,7 @@ def static(b: wf.ModelBuilder, device: Any, **options: Any) -> tuple[StaticResul
 
 
 def static_beam(run: Run) -> Iterator[Row]:
-    """Cantilever 1 x 0.1 x 0.1 m, F L^2 / E I = 1, all 12 slots of the root held, beside Project Chrono's rows."""
+    """Cantilever 1 x 0.1 x 0.1 m, F L^2 / E I = 1, all 12 slots of the root clamped, beside Project Chrono's rows."""
     chrono = reference("chrono_3243_3443")["static_beam"]["results"]
     names = {"split": "3243_enhanced_3x2x2(default)", "full": "3243_full_5x3x3"}
     for integration in ("tied", "split", "full"):

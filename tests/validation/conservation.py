@@ -50,7 +50,7 @@ CASES = [
     *((f"3443 {integration}", "svk") for integration in ("tied", "full")),
     *((f"{family} full", law) for family in ("3243", "3443") for law in ("mooney_rivlin", "neo_hookean")),
 ]
-"""Family, with its integration where there is a choice, and law."""
+"""Family, with its integration if selectable, and law."""
 STEEL = {"E": 2e11, "density": 7870.0, "slider_mass": 0.0755}
 MECHANISMS: dict[str, tuple[dict[str, Any], float]] = {
     "pendulum": ({"E": 2e7}, 1.25e-3),

@@ -2,13 +2,13 @@
 
 hertz      a rigid sphere on a quarter block 60 contact radii deep: contact radius and peak pressure, from a line
            through the squares of the points' pressures, beside those of the force.
-mindlin    the same on a half block with friction, then sideways: stiffness ratio, and where all slips.
+mindlin    the same on a half block with friction, then sideways: stiffness ratio, and onset of full slip.
 rebound    an elastic ball on a plane: restitution and duration, and those of a quarter of the step and half the mesh.
-wall       a cube pressed to a wall: how far it moves in 10 s, after 10 s of settling.
-turntable  a cube on a plate that turns: how far it moves on it in ten turns; the paper's law walks.
+wall       a cube pressed to a wall: its motion in 10 s, after 10 s of settling.
+turntable  a cube on a plate that turns: its motion on the plate in ten turns; the paper's law creeps.
 balls      two elastic balls with meshes that do not match: contact radius, peak pressure and approach beside Hertz.
 cylinders  two cylinders in plane strain: width and pressure beside Hertz.
-stack      ten cubes on each other: how far they move in 10 s, also under a last one of a thousand times the mass.
+stack      ten cubes on each other: their motion in 10 s, also under a last one of a thousand times the mass.
 
 Each row has its iterations and time.
 """

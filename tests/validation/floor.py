@@ -1,7 +1,7 @@
 """Error estimate `StepReport.floor` in float32, compared with the true error.
 
 Random strips of 1 m, 2 to 10 times as long as wide and 2 to 80 times as wide as thick, loaded at one end mostly in
-their plane, where bending across it is soft: T4, T10, H3843, 3243 and 3443 elements, E = 1e6 to 2e11 Pa, two static
+their plane, with soft bending across it: T4, T10, H3843, 3243 and 3443 elements, E = 1e6 to 2e11 Pa, two static
 load steps or ten steps of BDF2 of a twentieth of the first period. Cases are drawn from one seed until `CASES` of them
 have a reference in float64 (tol 1e-10) whose tangent is positive definite at each step, by a Cholesky factorisation;
 past a bifurcation a motion follows any disturbance, so the others are separate rows (`stable` false).

@@ -411,7 +411,7 @@ def cuts(count, dt):
 
 def best_fall(integrator, halvings, dt, v0, distance):
     """Smallest distance to the fall of the substeps that these steps may have had, which are far apart from each other;
-    None where they are too many to try."""
+    None for too many to try."""
     choices = [cuts(n, dt) for n in halvings]
     if np.prod([float(len(c)) for c in choices]) > 64.0:
         return None

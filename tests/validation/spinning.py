@@ -2,7 +2,7 @@
 
 A T10 bar of 0.5 x 0.2 x 0.1 m spins by |w| rad/s, free about (1, 2, 10) or on a revolute joint at its end, in 300 steps
 of h. `growth` is the largest kinetic and strain energy, from the mass matrix and the strain energy of the model, over
-that of the start, and `end` that of the last step; a run ends where it exceeds `MOST`, or where a step is refused.
+that of the start, and `end` that of the last step; a run ends if it exceeds `MOST`, or at a refused step.
 """
 
 from __future__ import annotations

@@ -47,8 +47,7 @@ class Attachment:
         slots, weights, gradients: (n,), (n,), (n, 3): x = sum weights e, F = sum e gradients^T.
         known: (3, 3) projector on the directions n with known F n.
         weak: (3, 3) projector on those that a point constrains with almost no stiffness: a beam's axis, a shell's
-        tangents;
-            in part (`ACROSS`) of a solid's face.
+            tangents; in part (`ACROSS`) of a solid's face.
         label: for messages.
         child: the joint's child side.
     """

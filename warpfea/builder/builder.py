@@ -139,7 +139,7 @@ class ModelBuilder:
                 warpfea.elements.ancf_shell.
             normals: directors at the nodes, (nodes, 3) or a function X (n, 3) -> (n, 3), more accurate than the
                 quads of a curved surface; by default the mean of the quads' normals.
-            corners: "error" where normals differ by more than 30 degrees, or "weld": a rigid corner.
+            corners: "error" if normals differ by more than 30 degrees, or "weld": a rigid corner.
             scale, transform: as for add_solid.
             initial: initial positions, a function X (n, 3) -> (n, 3), if different from the stress-free reference.
             name: unique name; by default the mesh's.

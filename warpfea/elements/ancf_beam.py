@@ -19,9 +19,8 @@ Locking, and the remedies of the integrations:
 - torsion and shear of a plane section (not locking, but too stiff as well): "tied" takes the section's own constants.
 "tied" has all remedies, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I). Limits
 of "tied": it passes the patch test under tension, not under shear tractions or pressure on its sides, which disturb
-the
-gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft by
-about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Rejected:
+the gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft
+by about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Rejected:
 curvature extrapolated from the middle and the ends, exact to fourth order in that angle, but with an error of 0.4
 (h/R)^2 by exchange of stretch and curvature of the axis's gradient, not reduced by the mesh.
 """

@@ -12,9 +12,8 @@ Locking and its remedies, by the choice of strains and integration points ("tied
   mid-surface alone (the split of Gerstmayr, Matikainen, Mikkola 2008 for beams, taken to shells).
 - shear: the bilinear director can't follow the slopes of the cubic surface, so a thin plate would have to bend with
   constant curvature in each direction: it locks (a clamped 8x8 plate of t/L = 1e-3 deflects 3 % of the exact value,
-  with
-  3x3 points as with 4x4). The covariant transverse shears are taken at the corners and the middles of the edges they
-  run along, shared by neighbours, and interpolated (assumed natural strain, Dvorkin and Bathe 1984, Eng. Comput.
+  with 3x3 points as with 4x4). The covariant transverse shears are taken at the corners and the middles of the edges
+  they run along, shared by neighbours, and interpolated (assumed natural strain, Dvorkin and Bathe 1984, Eng. Comput.
   1:77; here quadratically along the edges, as the slopes of their Hermite cubics): two conditions per node and one
   per edge remain, fewer than unknowns. Reissner's factor 5/6 accounts for the shear stress vanishing at the faces.
 - curvature thickness: a director interpolated between two directions is too short in between; on a curved or

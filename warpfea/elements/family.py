@@ -115,7 +115,7 @@ class Family:
         schemes: integrations of several parts by name; each force rule is also one of a single part.
         output_schemes: integrations that are for stress output only: "shear stress" in place of a tied part "shear".
         slot_sets: slot kinds by the name under which supports may hold them.
-        spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
+        spin_vectors: rotated by a moment: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
             or a shell's surface offers almost no rotational stiffness at a point, and must not carry it.
         solid: the mesh cell is the body itself; False for beams and shells, which add a section or a thickness.
     """

@@ -53,7 +53,7 @@ class ContactPoints:
         area: (F, P) reference area of each point, m^2; their sum is the area of the surface. Faces with fewer points
             than others repeat their last one with area 0.
         X: (F, P, 3) reference places, m.
-        normal: (F, P, 3) outward unit normals in the reference; 0 where a face has no tangent plane.
+        normal: (F, P, 3) outward unit normals in the reference; 0 for degenerate faces.
         faces: (F, 2) rows (element, local face).
     """
 

@@ -116,7 +116,7 @@ class Model:
 
     @property
     def mass(self) -> float | None:
-        """kg, of the first world; None where a material has no density."""
+        """Mass, kg, of the first world; None for a material without density."""
         laws = [law for body in self.bodies for _, law in body.materials]
         if any(law.density is None for law in laws):
             return None
@@ -223,7 +223,7 @@ class Model:
         """Pairs of slots that share an element."""
         return assembly.slot_graph([b.connectivity for b in self.blocks], self.slots)
 
-    # what users call
+    # public methods
 
     @property
     def free_slots(self) -> np.ndarray:
@@ -387,7 +387,7 @@ class Model:
                 kept if 0, or density, kg/m^3; density_factor for densities given as a function or per element. Set
                 such a name for the first time before making simulations.
                 "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
-                ModelBuilder.add_contact; where mu_static equals mu, it follows mu. "K.offset" with the name K of a
+                ModelBuilder.add_contact; mu_static follows mu if equal to it. "K.offset" with the name K of a
                 collider: of a HalfSpace the offset of its plane, m; of other shapes the outward offset of the
                 surface, m. A surface moved into a body pushes it out. "gravity", as set_gravity.
             values: a number, or (worlds,), on the host or on a device; of gravity (3,) or (worlds, 3).

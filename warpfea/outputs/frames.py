@@ -107,7 +107,7 @@ class FrameClock:
         return True
 
     def code(self, time: float) -> float:
-        """Time code of `time`: time * fps, as a whole number where it is one but for round-off."""
+        """Time code of `time`: time * fps, rounded to a whole number within round-off."""
         frame = time * self.fps
         nearest = float(np.round(frame))
         return nearest if abs(frame - nearest) <= 1e-6 + 1e-12 * abs(frame) else frame

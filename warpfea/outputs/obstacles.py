@@ -1,8 +1,7 @@
 """Collider meshes and poses for output.
 
 A simulation with contact has `collider_poses()`: positions (B, K, 3), m, rotations (B, K, 3, 3) whose columns are
-the
-local axes, and outward offsets of the surfaces (B, K), m. Others have no colliders to draw.
+the local axes, and outward offsets of the surfaces (B, K), m. Others have no colliders to draw.
 """
 
 from __future__ import annotations

@@ -8,8 +8,7 @@ Layout of a stage (metres, kilograms):
     /World/world_0000/<body>/skin   Mesh; points, normals, extent and fields per frame, about that centre
     /World/world_0000/<collider>        Xform; translate and orient, per frame of one that moves
     /World/world_0000/<collider>/shape  Mesh in the shape's own axes; customData["warpfea:collider"]: its kind;
-                                        of a half-space a square
-    /World/Camera /World/Sky /World/Sun
+    of a half-space a square /World/Camera /World/Sky /World/Sun
 
 Points are float32 relative to the body's centre, accurate far from the origin. The time code of a sample is its time
 times `fps`, fractional if no step ended at the frame's time. In statics the time is the load factor, 0 to 1.

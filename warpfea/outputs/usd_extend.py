@@ -15,7 +15,7 @@ from warpfea.outputs.frames import Surface, is_static, time_of
 __all__ = ["Earlier", "read_earlier"]
 
 SAME = 1e-4
-"""Distance, over the size of what is drawn, at which the last frame and the present state are not one motion."""
+"""Largest distance of the last frame from the current state, over the size of the drawn surface."""
 
 
 @dataclass(frozen=True, eq=False)

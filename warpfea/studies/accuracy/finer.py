@@ -53,8 +53,7 @@ def finer_setting(group: Sequence[Setting], axes: Axes, given: Mapping[str, Any]
 
     The step is an eighth of the smallest, with a method of order 2; swept meshes are twice as fine as the finest; of
     swept names (element, integration) the last one is used; float64, and a hundredth of the smallest tolerance.
-    `given`
-    options and parameters override these.
+    `given` options and parameters override these.
     """
     first = group[0]
     methods = [first.method, *(s.method for s in group)]

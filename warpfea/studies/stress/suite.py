@@ -137,7 +137,7 @@ def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
 
 
 def _judge(case: Case, answer: Answer) -> tuple[str, bool, str]:
-    """Outcome, whether it passes, and a note."""
+    """Outcome, passed or not, and a note."""
     if case.must:
         return FAILED, False, f"accepted what is to be refused; {answer.note}".rstrip("; ")
     if answer.passed:

@@ -69,8 +69,8 @@ FEATURES: dict[str, tuple[Callable[[], wf.TriMesh], Callable[[], np.ndarray]]] =
 
 @case("contact-mesh", GROUP, values=tuple(FEATURES), quick="float64", refusal=SINGLE)
 def features(setting: Setting, which: str) -> Answer:
-    """A turned cube falls at 1 m/s with its vertex or edge on one of a mesh, 40 steps: it stays before the mesh, the
-    change of its momentum is the impulse, and no energy comes from nowhere."""
+    """A turned cube falls at 1 m/s with its vertex or edge on one of a mesh, 40 steps: no penetration, the
+    change of its momentum is the impulse, and no energy is gained."""
     shape, turn = FEATURES[which]
     s = scene(shape(), E=1e6, turn=turn(), place=(0, 0, 5e-4), mu=0.3, restitution=0.5, stiffness=10.0)
     s.builder.set_initial(s.body, velocity=(0, 0, -1.0))

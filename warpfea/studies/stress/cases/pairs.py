@@ -79,8 +79,7 @@ def pair(
 
 class WatchedPair(Watched):
     """Results of a motion of two bodies: pulled for level contact; through: depth of the upper centre of mass below
-    that of
-    the lower one, over the side.
+    that of the lower one, over the side.
     """
 
     def limits(self, setting: Setting) -> dict[str, tuple[float, float]]:
