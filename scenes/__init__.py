@@ -1,1 +1,1 @@
-"""Ready scenes: the module <name> defines the scene <name>. Each is imported when it is asked for."""
+"""Scenes of warpfea: the module <name> defines the scene <name>, imported on demand."""

@@ -23,7 +23,7 @@ def ball_on_plate(
     density: float = 1000.0,
     plate_E: float = 5e6,
 ) -> wf.ModelBuilder:
-    """A soft ball falls on a plate that is clamped at its sides; both bend and spread, and it comes up again.
+    """A soft ball falls on a plate that is clamped at its sides; both bend and spread, and it rebounds.
 
     Args:
         radius: of the ball, m.
@@ -33,7 +33,7 @@ def ball_on_plate(
         cells: across the ball, even.
         across: cells of the plate along each side.
         mu: coefficient of friction.
-        restitution: of the contact; vibrations take energy beside it.
+        restitution: of the contact; vibrations dissipate further energy.
         stiffness: of the contact, over that of the default law.
         E: Young's modulus of the ball (neo-Hookean), Pa.
         nu: Poisson's ratio of both.

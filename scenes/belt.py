@@ -19,9 +19,9 @@ def belt(
     nu: float = 0.3,
     density: float = 1000.0,
 ) -> wf.ModelBuilder:
-    """A belt starts under a block at rest; friction mu m g drags the block until it moves along.
+    """A belt starts under a block at rest; friction mu m g drags the block until it moves with the belt.
 
-    The block lags behind the belt by speed^2 / (2 mu g) in the end.
+    Its final lag behind the belt is speed^2 / (2 mu g).
 
     Args:
         mu: coefficient of friction.

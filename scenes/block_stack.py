@@ -25,9 +25,9 @@ def block_stack(
     nu: float = 0.3,
     density: float = 1000.0,
 ) -> wf.ModelBuilder:
-    """Blocks fall by a gap each on a slab, and stand on each other by friction.
+    """Blocks with gaps fall onto a slab, and form a stack held by friction.
 
-    Each is turned against the one below, so that their meshes do not match.
+    Each is rotated against the one below: non-matching meshes.
 
     Args:
         blocks: in the stack.

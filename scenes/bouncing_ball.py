@@ -18,9 +18,9 @@ def bouncing_ball(
     density: float = 1100.0,
     stiffness: float = 0.02,
 ) -> wf.ModelBuilder:
-    """A ball falls on a floor, and comes up to restitution^2 of the height that it fell from.
+    """A ball falls on a floor and rebounds to restitution^2 of its initial height.
 
-    Contact is lumped (`model="sphere"`) and softer than the ball, so that little of its energy goes into vibrations.
+    Contact is lumped (`model="sphere"`) and softer than the ball, so that little energy is lost to vibrations.
 
     Args:
         restitution: speed after the impact over that before.

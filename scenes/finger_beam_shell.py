@@ -22,7 +22,7 @@ def finger_beam_shell(
 ) -> wf.ModelBuilder:
     """A finger of soft T10 hangs from a carriage, pushes a beam over a shell, bends, and drops it over the edge.
 
-    The shell is held along one side.
+    The shell is clamped along one side.
 
     Args:
         travel: of the carriage, m.

@@ -27,7 +27,7 @@ def gears(
     nu: float = 0.35,
     density: float = 1200.0,
 ) -> wf.ModelBuilder:
-    """A driven wheel with a wavy rim takes another one along by its teeth.
+    """A driven wheel with a wavy rim drives another one by its teeth.
 
     Rims are r = R + (tooth/2) cos(n angle); wheels of T10 turn about hinges through their hubs.
 
@@ -49,7 +49,7 @@ def gears(
     material = wf.SVK(E=E, nu=nu, density=density)
     apart = 2.0 * radius + clearance
     wheels = []
-    # a tooth of the first stands in a gap of the second
+    # a tooth of the first fits into a gap of the second
     for name, x, phase in (("driver", 0.0, 0.0), ("wheel", apart, math.pi * (teeth + 1))):
         mesh = wf.mesh.cylinder(radius, width, cells=(teeth, 1), name=name)
         r, angle = np.hypot(mesh.points[:, 0], mesh.points[:, 1]), np.arctan2(mesh.points[:, 1], mesh.points[:, 0])

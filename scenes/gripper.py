@@ -43,7 +43,7 @@ def gripper(
     b.add_contact(block.surface("z-"), floor, mu=0.3, restitution=0.3, name="base")
     apart, thick = 0.01, 0.02  # of jaws and block at the start; of a jaw, m
     for name, sign in (("left", -1.0), ("right", 1.0)):
-        # the jaws reach beyond the block's top: edges that press into its side would lift it without friction
+        # the jaws reach beyond the block's top: edges pressing into its side would lift it without friction
         center = (sign * (half + apart + 0.5 * thick), 0.0, 0.65 * side)
         close = -sign * (apart + 0.5 * squeeze)
         path = [(0, 0, 0), (close, 0, 0), (close, 0, 0), (close, 0, lift), (close, 0, lift)]

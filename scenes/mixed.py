@@ -23,7 +23,7 @@ def mixed(
     """Five cantilevers of one size and material bend under gravity: beam 3243, shell 3443, ENMC, H3843 and T10.
 
     All are bodies of one model, built in at x = 0 and let go at t = 0; their tips (a probe each) move together. The
-    wall holds all slots but the gradient along the bar, which is the strain there and not for a wall to prescribe.
+    wall clamps all slots except the gradient along the bar, the strain there, which a wall does not prescribe.
 
     Args:
         length: of the bars, m.

@@ -19,9 +19,9 @@ def pendulum(
     density: float = 7200.0,
     integration: Literal["tied", "split", "full"] = "tied",
 ) -> wf.ModelBuilder:
-    """A flexible pendulum of 3243 beams, pinned at one end and let go from the horizontal, bends as it falls.
+    """A flexible pendulum of 3243 beams, pinned at one end and released from the horizontal, bends as it falls.
 
-    Only the position of the start node is held, so the beam turns freely there.
+    Only the position of the start node is clamped, so the beam rotates freely there.
 
     Args:
         length: of the beam, m.

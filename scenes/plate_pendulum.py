@@ -21,7 +21,7 @@ def plate_pendulum(
 ) -> wf.ModelBuilder:
     """A square plate of 3443 shells, pinned at one corner and let go from the horizontal, folds as it falls.
 
-    Only the position of the corner node is held, so the plate turns freely there.
+    Only the position of the corner node is clamped, so the plate rotates freely there.
 
     Args:
         size: length of the sides, m.

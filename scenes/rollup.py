@@ -28,7 +28,8 @@ def rollup(
 
     The moment grows linearly during `duration` and is then held; damping keeps the motion near equilibrium. The axis of
     the moment is fixed in space, and beyond a quarter of a turn a beam under such a moment would buckle out of its
-    plane: here all nodes are held in the plane. With nu > 0 integration "full" locks, and the beam stays open.
+    plane: here all nodes are constrained to the plane. With nu > 0 integration "full" locks, and the beam stays
+    open.
 
     Args:
         length: of the beam, m.

@@ -20,7 +20,7 @@ def tilting_table(
     nu: float = 0.3,
     density: float = 1000.0,
 ) -> wf.ModelBuilder:
-    """A soft block rests on a table that turns about the y axis, and slips where the tangent of its angle is mu.
+    """A soft block rests on a table rotating about the y axis, and slips at tan(angle) = mu.
 
     Args:
         mu: coefficient of friction.

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 PRINTED = 2.0 / 81.0
-"""The face-centroid coefficient c of A.2, A.4 and A.5; 1/18 in its place holds all quadratics (FN18)."""
+"""Face-centroid coefficient c of A.2, A.4 and A.5; 1/18 in its place reproduces all quadratics (FN18)."""
 
 # A.1 as printed, counting from 1: the slots along edges are g_a/3 - (g_b + g_c)/6 with (a, b, c) of this table, row by
 # corner. A.2 adds c (s_b + s_c) to the same slots.
@@ -81,7 +81,7 @@ POWERS = np.array(
 
 
 def _others(i: int) -> tuple[int, int, int]:
-    """The corners that i's edges lead to, in the order of the slots."""
+    """Corners at the ends of i's edges, in the order of the slots."""
     return (i + 1) % 4, (i + 2) % 4, (i + 3) % 4
 
 
@@ -146,7 +146,7 @@ def bernstein(lam: np.ndarray) -> np.ndarray:
 def bezier_map(c: float | None = None) -> np.ndarray:
     """Control points from nodal coordinates in volume slots, M of S = B M: (20, 20) of ENMC, or (20, 16) of FN with c.
 
-    Not read off A.1 but derived from what control points mean: r_i at corners, r_i + r_(i -> j) / 3 on edges, and on
+    Derived from the meaning of control points, not from A.1: r_i at corners, r_i + r_(i -> j) / 3 on edges, and on
     faces the point that puts the cubic's centroid at r_c; for FN, r_c = sum r_i / 3 + c sum r_(i -> j) over the face.
     """
     M = np.zeros((20, 20 if c is None else 16))

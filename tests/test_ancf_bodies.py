@@ -180,15 +180,15 @@ def test_clamped_slots(name, slots, kinds):
 @pytest.mark.parametrize(
     ("name", "known"),
     [
-        ("beam", "3243 knows 'position', 'axis', 'section', 'all'"),
-        ("plate", "3443 knows 'position', 'surface', 'director', 'all'"),
-        ("FN", "FN knows 'position', 'gradients', .*'all'"),
+        ("beam", "3243: 'position', 'axis', 'section', 'all'"),
+        ("plate", "3443: 'position', 'surface', 'director', 'all'"),
+        ("FN", "FN: 'position', 'gradients', .*'all'"),
     ],
 )
 def test_unknown_slots(name, known):
     b, body = scene(name)
     for call in (b.clamp, functools.partial(b.drive, displacement=(0, 0, 1))):
-        with pytest.raises(wf.ModelError, match=f"slots = 'position.twist': element {known}, and several of them"):
+        with pytest.raises(wf.ModelError, match=f"'position.twist': valid slots of element {known}, or several"):
             call(body.nodes([0]), slots="position+twist")
 
 

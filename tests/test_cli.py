@@ -238,7 +238,7 @@ def test_statics_holds_what_rests_on_contact_with_stabilise(folder, capfd):
     command = ["run", "belt", "--static", "--load-steps", "2", "--device", "cpu", "--json", "-"]
     code, _, err = run(capfd, *command)
     assert code == 2
-    assert "6 rigid motions free" in err
+    assert "6 unconstrained rigid-body modes" in err
     code, out, _ = run(capfd, *command, "--stabilise")
     summary = json.loads(out)
     (contact,) = summary["contacts"].values()
@@ -296,7 +296,7 @@ def test_density_is_asked_for_where_it_counts(folder, capfd):
     for words in (["run", *STATIC[1:2], *STATIC[3:], *LIGHT], [*STATIC, *LIGHT[:2]]):
         code, _, err = run(capfd, *words)
         assert code == 2
-        assert "'part': the material SVK has no density" in err
+        assert "'part': missing density of SVK" in err
 
 
 # materials

@@ -268,7 +268,7 @@ def test_command_line_says_so(tmp_path, capfd):
     out = tmp_path / "a.json"
     assert main([*command, "--solver", "jacobi", "--json", str(out)]) == 0
     text = capfd.readouterr().out
-    assert "NOT CONVERGED  0 of 4 steps (0%) reached the tolerance 1e-08" in text
+    assert "NOT CONVERGED  tolerance 1e-08 reached in 0 of 4 steps (0%)" in text
     assert "8.0 of Jacobi per step" in text
     summary = json.loads(out.read_text())
     assert (summary["steps"], summary["rough_steps"], summary["status"]) == (4, 4, "done")

@@ -102,7 +102,7 @@ def test_an_animation_of_many_worlds_keeps_its_grid(tmp_path):
         ({"fps": 100}, 0.01, "frames per second is 500.0, of this run 100"),
         ({"fps": 500, "fields": []}, 0.01, "fields"),
         ({"fps": 500, "color": "displacement"}, 0.01, "field in colour"),
-        ({"fps": 500}, 0.014, "it goes on to t = 0.014 s, and the run is resumed at t = 0.01 s"),
+        ({"fps": 500}, 0.014, "its last frame, t = 0.014 s, is later than the checkpoint, t = 0.01 s"),
         ({"fps": 500}, 0.004, "it ends at t = 0.004 s.*frames are missing"),
     ],
 )
@@ -176,7 +176,7 @@ def test_usd_speaks_our_words(tmp_path, monkeypatch):
 
     target = pathlib.Path("/proc/o.usdc")
     if target.parent.is_dir():
-        with pytest.raises(OutputError, match=r"/proc/o.usdc: .*(takes no files|not writable)"):
+        with pytest.raises(OutputError, match=r"/proc/o.usdc: .*(cannot write|not writable)"):
             wf.USDWriter(target).open(simulation())
     try:
         Usd.Stage.Open(str(tmp_path / "none.usdc"))
@@ -425,8 +425,8 @@ def test_the_summary_says_that_rounding_set_the_limit():
         (["--fps", "5", "--gif", "a.gif"], "--fps is for animations: give --usd or --vtu too"),
         (["--speed", "5", "--usd", "a.usdc"], "--speed is for an animation: give --gif too"),
         (["--usd", "a.usdc", "--usd", "b.usdc"], "--usd is given twice"),
-        (["--t-end", "1e-9"], "--t-end 1e-09: no step would be done"),
-        (["--foo", "1"], "unrecognized arguments: --foo 1 ("),
+        (["--t-end", "1e-9"], "--t-end 1e-09: less than"),
+        (["--foo", "1"], "unknown option: --foo 1 ("),
     ],
 )
 def test_options_without_effect_are_refused(tmp_path, capfd, monkeypatch, words, text):

@@ -56,7 +56,7 @@ def test_a_simulation_says_what_to_write(sim, case):
     assert sim.steps == 0
 
 
-SAMPLED = r"is a Python function, and no device runs it: sample it, \(times, \[f\(t\) for t in times\]\).*@wp\.func"
+SAMPLED = r"Python functions do not run on the device: sample it, \(times, \[f\(t\) for t in times\]\).*@wp\.func"
 BUILD = {
     "lambda": (
         lambda b, bar: b.add_traction(bar.surface("x+"), lambda t: (0, 0, t)),
@@ -167,8 +167,8 @@ def test_worlds_by_flags_or_numbers(worlds, mask, chosen):
 @pytest.mark.parametrize(
     ("worlds", "mask", "text"),
     [
-        (2, [0, 1], r"may be flags of the worlds or their numbers; write \[False, True\] or \[True, True\]"),
-        (2, [0, 2], r"must be \(2,\) of True and False, one per world, or the numbers of some of the worlds 0 to 1"),
+        (2, [0, 1], r"is ambiguous \(flags or world indices\): write \[False, True\] or \[True, True\]"),
+        (2, [0, 2], r"must be \(2,\) of True and False, one per world, or world indices from 0 to 1"),
         (3, [0, 2, 1], "must be"),  # may be statuses
         (3, [2, 0, 0], "must be"),
         (3, [-1], "must be"),
@@ -335,10 +335,8 @@ def test_a_gpu_that_is_not_there_is_one_line(words, capfd):
     """Fails on 8934ce7: two lines of Warp's library before it, and the head of a table."""
     for device in ("cuda", "cuda:1"):
         assert main([*words, "--device", device]) == 2
-        text = (
-            f"device '{device}' is not there; Warp finds cpu, and no CUDA GPU with a driver; take 'cpu', or leave the "
-        )
-        assert capfd.readouterr() == ("", f"warpfea: error: {text}device out\n")
+        text = f"device '{device}' not found; available: cpu (no CUDA GPU with a driver); use 'cpu', or omit the device"
+        assert capfd.readouterr() == ("", f"warpfea: error: {text}\n")
 
 
 @pytest.mark.skipif(wp.is_cuda_available(), reason="there is a GPU")

@@ -412,11 +412,11 @@ BAD = {
     "text": ("body.E", "stiff", r"E = 'stiff' must be a number"),
     "misspelt": ("body.Eta", 1.0, r"'body.Eta' is unknown; there are: .*; did you mean 'body.eta'"),
     "body": ("bdoy.E", 1.0, r"'bdoy.E' is unknown.*did you mean 'body.E'"),
-    "shared": ("body.frames", 1.0, r"'body.frames' can't be set: all worlds share the reference geometry"),
+    "shared": ("body.frames", 1.0, r"'body.frames' can't be set: shared by all worlds \(the reference geometry"),
     "density": ("body.density", [1.0, 0.0, 2.0], r"density = 0.0 in world 1 must be positive, kg/m\^3"),
     "factor": ("body.density_factor", 1.0, r"'body.density_factor' is unknown.*did you mean 'body.density'"),
-    "mesh": ("body.points", 1.0, r"'body.points' can't be set: all worlds share the mesh"),
-    "section": ("body.section", 1.0, r"all worlds share the reference geometry"),
+    "mesh": ("body.points", 1.0, r"'body.points' can't be set: shared by all worlds \(the mesh"),
+    "section": ("body.section", 1.0, r"shared by all worlds \(the reference geometry"),
     "own": ("body.mu10", 1.0, r"'body.mu10' is unknown"),
     "gravity": ("gravity", [1.0, 2.0], r"gravity has shape \(2,\), expected \(3,\) or \(3, 3\)"),
     "no gravity": ("gravity", (0, np.inf, 0), r"gravity = \[0.0, inf, 0.0\] in world 0 must be finite"),
@@ -471,7 +471,7 @@ def test_the_first_value_precedes_the_simulation():
     m.set_parameter("body.E", 2e6)
     wf.Simulation(m, dt=1e-3)
     m.set_parameter("body.E", [1e6, 2e6])
-    with pytest.raises(wf.ModelError, match=r"with one value of 'body.nu' .* call this once before the first"):
+    with pytest.raises(wf.ModelError, match=r"'body.nu' was uniform .* before the first Simulation"):
         m.set_parameter("body.nu", 0.2)
 
 

@@ -402,9 +402,9 @@ def test_a_bad_mesh_is_a_mesh_error_that_names_file_and_element(tmp_path, capfd)
 
 @pytest.mark.parametrize("device", ["cuda:7", "gpu"])
 def test_a_wrong_device_is_a_model_error_that_lists_those_there_are(device, capfd):
-    with pytest.raises(wf.ModelError, match=rf"device '{device}' is not there; Warp finds cpu"):
+    with pytest.raises(wf.ModelError, match=rf"device '{device}' not found; available: cpu"):
         builder().finalize(device=device)
     code = main(["run", "cantilever", "--device", device, "--t-end", "0.002"])
     out, err = capfd.readouterr()
     assert (code, out) == (2, "")
-    assert f"device '{device}' is not there; Warp finds cpu" in err
+    assert f"device '{device}' not found; available: cpu" in err

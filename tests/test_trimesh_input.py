@@ -37,7 +37,7 @@ def point_meshes():
         "orientation": (
             points,
             turned,
-            r"points \d and \d is run through in one direction by triangles",
+            r"inconsistent orientation of triangles \d and \d at .*points \d and \d: flip one",
         ),
         "three": (
             third,

@@ -113,9 +113,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """`study` and its options, imported on use: no scene, which imports this package, is to depend on the studies.
+    """Lazy import of `study` and its options: scenes import this package and must not depend on the studies.
 
-    What type checkers see stands in `__init__.pyi`.
+    Declarations for type checkers: `__init__.pyi`.
     """
     if name in ("study", "StudyOptions"):
         return getattr(_importlib.import_module(f"{__name__}.studies.accuracy"), name)

@@ -20,16 +20,16 @@ SIZES = {1: "a scalar", 3: "a vector"}
 class Control:
     """A time law whose values the caller writes between steps, in each world its own: `sim.controls[name]`.
 
-    A value is held during a step, and a drive is where it says at the step's end. In statics it grows with the load as
-    a constant does. The same control may drive several things.
+    Zero-order hold during a step; drives reach the value at its end. In statics it grows with the load like a
+    constant. The same control may drive several things.
 
     Args:
-        name: by which `sim.controls` knows it; unique in a model.
-        size: 1 for what is driven by a number (pressure, angle, travel), 3 for a vector.
+        name: key in `sim.controls`; unique in a model.
+        size: 1 for a scalar (pressure, angle, travel), 3 for a vector.
         initial: number, or (size,): the value at the start and after `sim.reset`, in the unit of what it drives.
 
     Raises:
-        ModelError: the name is no text, or size or initial value are out of range.
+        ModelError: the name is not text, or size or initial value are out of range.
     """
 
     name: str
@@ -60,10 +60,10 @@ class TimeLaw:
         times: (n,) s; one for a constant, empty for a function or a control.
         values: (n, 3) in the unit of what the law drives; of scalar laws the first column.
         function: wp.func of t (s), or None.
-        scalar: whether the value is a scalar.
-        control: what holds the values, or None.
+        scalar: True for a scalar value.
+        control: source of the values, or None.
         ramped: a control grows with the load of statics.
-        name: of what it drives, for messages.
+        name: of the driven quantity, for messages.
     """
 
     times: np.ndarray
@@ -84,7 +84,7 @@ def _widen(values: np.ndarray, scalar: bool) -> np.ndarray:
 
 
 def _is_row(value: Any) -> bool:
-    """Whether a value is a flat list of entries; ragged ones are not."""
+    """True for a flat list of entries, False for a ragged one."""
     try:
         return np.ndim(value) == 1
     except ValueError:
@@ -92,7 +92,7 @@ def _is_row(value: Any) -> bool:
 
 
 def _samples(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) and values (n, *width) of a pair of both."""
+    """Times (n,) and values (n, *width) of a pair (times, values)."""
     try:
         times, values = np.asarray(value[0], dtype=float), np.asarray(value[1], dtype=float)
     except (TypeError, ValueError) as error:
@@ -126,7 +126,7 @@ def _constant(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray
 
 
 def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
-    """The time law that a user has given.
+    """Time law from a user's value.
 
     Args:
         value: number or 3-vector; (times (n,), values (n,) or (n, 3)); a wp.func of t; or a Control; times in s.
@@ -147,8 +147,8 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
     if callable(value):
         name = getattr(value, "__name__", type(value).__name__).replace("<lambda>", "a lambda")
         raise ModelError(
-            f"{what}: {name} is a Python function, and no device runs it: sample it, (times, [f(t) for t in times]) "
-            "with times = np.linspace(0, t_end, 201), or write a def with @wp.func above it"
+            f"{what}: {name} is a Python function; Python functions do not run on the device: sample it, "
+            "(times, [f(t) for t in times]) with times = np.linspace(0, t_end, 201), or define it with @wp.func"
         )
     read = _samples if isinstance(value, (tuple, list)) and len(value) == 2 and _is_row(value[0]) else _constant
     times, values = read(value, what, () if scalar else (3,))

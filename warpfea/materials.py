@@ -19,7 +19,7 @@ from .base.names import did_you_mean
 __all__ = ["SVK", "KelvinVoigt", "Material", "MooneyRivlin", "NeoHookean"]
 
 FORMS = ("incremental", "rate", "explicit")
-"""How damping is taken in a step."""
+"""Evaluation of the damping force within a step."""
 
 Density = float | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
@@ -32,9 +32,9 @@ LIMITS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "density": (lambda v: v > 0.0, "positive, kg/m^3"),
     "density_factor": (lambda v: v > 0.0, "positive"),
 }
-"""Which finite values a constant may have, and what to say of others."""
+"""Admissible finite values of a constant, and the text for others."""
 DENSITIES = ("density", "density_factor")
-"""Constants of the mass: the density where it is one number, else a factor on what was given."""
+"""Constants of the mass: the density if it is one number, else a factor on the given one."""
 
 
 def _positive(owner: str, **values: float) -> None:
@@ -82,7 +82,7 @@ class KelvinVoigt:
     Args:
         eta: shear viscosity, Pa s.
         lambda_v: bulk-like viscosity, Pa s.
-        form: how Edot is taken in a step. "incremental" (default): the difference of E over the step; vanishes for any
+        form: discretisation of Edot. "incremental" (default): the difference of E over the step; vanishes for any
             rigid rotation and has a potential. "rate": Eq. (58) with F and Fdot at the end of the step, as Paper I; a
             spinning body expands. "explicit": Eq. (58) at the start of the step, a force held during it.
 
@@ -103,10 +103,10 @@ class KelvinVoigt:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Material:
-    """Base of the laws: a density, which statics without gravity does without, and optional damping.
+    """Base of the laws: density (optional in statics without gravity) and optional damping.
 
-    `own` names the constants that worlds may have values of: numbers from which `coefficients` follow by operations
-    that arrays know as well.
+    `own` names the constants that may differ between worlds: `coefficients` follows from them by operations valid
+    for arrays.
     """
 
     law: ClassVar[str]
@@ -119,7 +119,7 @@ class Material:
     __repr__ = brief_repr
 
     def __new__(cls, *values: Any, **options: Any) -> Self:
-        """ModelError for what a law does not take; where E or nu is given its from_E_nu may be meant."""
+        """ModelError for unknown arguments of a law; suggests from_E_nu if E or nu is given."""
         taken = inspect.signature(cls.__init__).parameters
         if hasattr(cls, "from_E_nu") and not {"E", "nu"} & set(taken) and {"E", "nu"} & set(options):
             name = cls.__name__
@@ -140,7 +140,9 @@ class Material:
 
     @property
     def constants(self) -> dict[str, float]:
-        """Numbers of the law and of the damping by name; a law made by `from_E_nu` has E and nu in place of its own."""
+        """Constants of the law and of the damping by name; a law made by `from_E_nu` has E and nu in place of its
+        own.
+        """
         out = self._made_of or {name: getattr(self, name) for name in self.own}
         out = out | ({"eta": self.damping.eta, "lambda_v": self.damping.lambda_v} if self.damping else {})
         if self.density is None:
@@ -149,7 +151,7 @@ class Material:
         return out | ({"density": float(self.density)} if number else {"density_factor": 1.0})
 
     def with_constants(self, values: Mapping[str, Any]) -> Self:
-        """The material with other `constants`, which are not checked; arrays stand for a value in each world."""
+        """Copy of the material with other `constants`, unchecked; arrays hold one value per world."""
         out = copy.copy(self)
         if "density" in values:
             vars(out)["density"] = values["density"]
@@ -167,7 +169,7 @@ class Material:
 
     @classmethod
     def _made(cls, E: float, nu: float, *, density: Any, damping: KelvinVoigt | None, **options: float) -> Self:
-        """The material of E and nu at rest, which it remembers."""
+        """Material from E and nu at rest, which it stores."""
         out = cls(**cls._from_E_nu(E, nu, **options), density=density, damping=damping)
         vars(out).update(_made_of={"E": E, "nu": nu}, _options=options)
         return out
@@ -191,10 +193,9 @@ class Material:
 class SVK(Material):
     """St. Venant-Kirchhoff: Psi = lambda/2 tr(E)^2 + mu tr(E^2), Eqs. (25)-(28).
 
-    For large rotations and small to moderate strains. In compression it softens: the uniaxial stress falls again
-    below a stretch of 1/sqrt(3) = 0.577 of the length and vanishes under full compression; a mirrored element
-    (F = diag(-1, 1, 1)) has no strain at all. Use a neo-Hookean law where that can happen; a step reports its
-    smallest J.
+    For large rotations and small to moderate strains. It softens in compression: the uniaxial stress decreases below
+    a stretch of 1/sqrt(3) = 0.577 of the length and vanishes under full compression; a mirrored element
+    (F = diag(-1, 1, 1)) has zero strain. Use a neo-Hookean law in such cases; each step reports min J.
 
     Args:
         E: Young's modulus, Pa.
@@ -220,7 +221,7 @@ class SVK(Material):
 
     @classmethod
     def from_E_nu(cls, *, E: float, nu: float, density: Any = None, damping: KelvinVoigt | None = None) -> SVK:
-        """The same as the constructor; every law has it."""
+        """Equivalent to the constructor; every law has it."""
         return cls(E=E, nu=nu, density=density, damping=damping)
 
     @property

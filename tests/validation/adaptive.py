@@ -1,8 +1,8 @@
-"""dt="auto" beside the error that was asked for, and beside fixed steps.
+"""dt="auto" compared with its requested error, and with fixed steps.
 
-references  what errors are measured from, and the estimate of its own error.
+references reference runs, and the estimate of their own error.
 fixed       true error and Newton iterations of fixed steps, in powers of two.
-adaptive    the same and substeps of each scene, integrator and error asked for.
+adaptive also substeps, for each scene, integrator and requested error.
 
 An error is the largest distance of a position from the reference at eight common instants, over the model's size.
 `cost` is the Newton iterations over those of the best fixed step with the same true error, interpolated between the
@@ -85,7 +85,7 @@ def free_flight() -> tuple[wf.ModelBuilder, float]:
 
 
 def contact() -> tuple[wf.ModelBuilder, float]:
-    """A hard damped ball that turns falls on a floor, touches it for a hundredth of the run, and comes up again."""
+    """A hard damped spinning ball falls on a floor, touches it for a hundredth of the run, and rebounds."""
     hard = wf.SVK(E=1e10, nu=0.3, density=1100.0, damping=wf.KelvinVoigt(eta=1e5, lambda_v=1e5))
     b, ball = _ball(hard, stiffness=0.2)
     b.set_initial(ball, angular_velocity=(0.0, 10.0, 0.0))
@@ -93,7 +93,7 @@ def contact() -> tuple[wf.ModelBuilder, float]:
 
 
 def soft_contact() -> tuple[wf.ModelBuilder, float]:
-    """A ball falls on a soft floor, stays in it for two fifths of the run, and comes up again."""
+    """A ball falls on a soft floor, stays in contact for two fifths of the run, and rebounds."""
     b, _ = _ball(wf.SVK(E=1e8, nu=0.3, density=1100.0), stiffness=0.002)
     return b, 0.08
 
@@ -112,26 +112,26 @@ def _ball(material: wf.SVK, *, stiffness: float) -> tuple[wf.ModelBuilder, wf.Bo
 CASES: dict[str, Callable[[], tuple[wf.ModelBuilder, float]]] = {
     f.__name__: f for f in (stiff, impact, dead_points, free_flight, contact, soft_contact)
 }
-"""Name -> function that gives a scene and its end, s."""
+"""Name -> function returning a scene and its end, s."""
 
 
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-5)
 PIECES = 8
 FINE = {"stiff": 2e-7, "impact": 2e-7, "dead_points": 4e-7, "free_flight": 2e-7, "contact": 2e-7, "soft_contact": 2e-7}
-"""Error that references are asked for; the run with four times it gives their own error."""
+"""Error requested of references; the run with four times it gives their own error."""
 FINEST = {"backward_euler": 16384, "bdf2": 8192}
-"""Most fixed steps."""
+"""Maximum number of fixed steps."""
 LEFT_OUT = {
     ("impact", "backward_euler"): (1e-4, 1e-5),
     ("contact", "backward_euler"): (1e-5,),
     ("soft_contact", "backward_euler"): (1e-5,),
 }
-"""Not run: backward Euler would take 3e5 and 3e6 steps, 1e5 of the contacts."""
+"""Skipped: backward Euler would take 3e5 and 3e6 steps, 1e5 of the contacts."""
 _found: dict[Any, Any] = {}
 
 
 def move(name: str, *, steps: int | None = None, error: float | None = None, integrator: str, tol: float = 1e-8) -> Any:
-    """Run a scene with fixed steps or to an error: positions (PIECES, nodes, 3), m; what it took; the size, m."""
+    """Run a scene with fixed steps or to an error: positions (PIECES, nodes, 3), m; cost; size, m."""
     build, end = CASES[name]()
     model = build.finalize(device="cpu")
     options: dict[str, Any] = {"integrator": integrator, "solver": wf.NewtonPCG(tol=tol), "ledger": False}
@@ -184,7 +184,7 @@ def fixed(run: Run) -> Iterator[Row]:
 
 
 def adaptive(run: Run) -> Iterator[Row]:
-    """Errors asked for."""
+    """Requested errors."""
     for name in filter(run.wants, CASES):
         for integrator in FINEST:
             for error in ERRORS:
@@ -200,7 +200,9 @@ def adaptive(run: Run) -> Iterator[Row]:
 
 
 def best_fixed(rows: list[Row], true: float, order: int) -> tuple[float, bool]:
-    """Newton iterations of the cheapest fixed step with a true error, and whether that is below those of the rows."""
+    """Newton iterations of the cheapest fixed step with a given true error, and True if it is below those of the
+    rows.
+    """
     ranked = sorted((row["true"], row["newton"]) for row in rows)
     least, most = ranked[0]
     if true < least:

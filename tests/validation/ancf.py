@@ -1,6 +1,6 @@
-"""The ANCF elements against references that were not made with warpfea, for every integration.
+"""ANCF elements against references independent of warpfea, for every integration.
 
-The references are copies under tests/data (their `source` says where they come from). Every row names the integration;
+The references are copies under tests/data (with their `source`). Every row names the integration;
 "tied" is the default.
 """
 
@@ -32,7 +32,7 @@ X, Z = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 def cantilever(
     elements: int, section: wf.Rectangle, law: wf.SVK, integration: str, length: float = 1.0, slots: str = "all"
 ) -> tuple[wf.ModelBuilder, wf.Body]:
-    """A beam along x without gravity, `slots` of its root held, with the probe "tip"; `length` in m."""
+    """A beam along x without gravity, `slots` of its root clamped, with the probe "tip"; `length` in m."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     beam = b.add_beam([(0, 0, 0), (length, 0, 0)], elements=elements, section=section, normal=Z, material=law,
                       integration=integration)  # fmt: skip
@@ -42,12 +42,12 @@ def cantilever(
 
 
 def keep_plane(b: wf.ModelBuilder, beam: wf.Body, component: str) -> None:
-    """Solve in a plane: all slots of the component held."""
+    """Solve in a plane: all slots of the component clamped."""
     b.clamp(beam.nodes(lambda X: X[:, 0] > -1.0), components=component)
 
 
 def static(b: wf.ModelBuilder, device: Any, **options: Any) -> tuple[StaticResult, float]:
-    """The static result and the seconds that it took, compilation included."""
+    """Static result and its wall time in seconds, compilation included."""
     model = b.finalize(device=device)
     began = clock.perf_counter()
     result = wf.solve_static(model, **options)
@@ -55,7 +55,7 @@ def static(b: wf.ModelBuilder, device: Any, **options: Any) -> tuple[StaticResul
 
 
 def static_beam(run: Run) -> Iterator[Row]:
-    """Cantilever 1 x 0.1 x 0.1 m, F L^2 / E I = 1, all 12 slots of the root held, beside Project Chrono's rows."""
+    """Cantilever 1 x 0.1 x 0.1 m, F L^2 / E I = 1, all 12 slots of the root clamped, beside Project Chrono's rows."""
     chrono = reference("chrono_3243_3443")["static_beam"]["results"]
     names = {"split": "3243_enhanced_3x2x2(default)", "full": "3243_full_5x3x3"}
     for integration in ("tied", "split", "full"):
@@ -262,7 +262,7 @@ def manufactured(run: Run) -> Iterator[Row]:
                 for side in (0.0, 1.0):
                     face = cube.nodes(lambda X, a=axis, s=side: np.abs(X[:, a] - s) < 1e-9)
                     b.clamp(face, slots="position")
-                    if element not in ("T4", "T10"):  # the face's own directions: it stays where it is
+                    if element not in ("T4", "T10"):  # the face's own directions: it keeps its position
                         names = [f"gradient-{c}" for k, c in enumerate("xyz") if k != axis]
                         b.clamp(face, slots="+".join(names))
             b.add_body_force(manufactured_force, bodies=[cube])

@@ -2,8 +2,8 @@
 
 A free body of each family and law is thrown with a spin and stretched at the same time, so that it tumbles and
 pulsates with large strains; mechanisms without damping swing under gravity. Errors are the largest of all steps
-measured, over the first value; of mechanisms the energy less the work of their drives, over the largest of what moves
-and is stored.
+measured, over the first value; of mechanisms the energy less the work of their drives, over the largest kinetic and
+stored energy.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ TURNS = 10_000
 DT = 5e-3
 AXIS = np.array([0.3, 0.5, 1.0])
 RATE = 12.0 * float(np.linalg.norm(AXIS))
-"""Of the spin, rad/s."""
+"""Angular velocity of the spin, rad/s."""
 TOL = 1e-12
 CLOSED = 1e-13
 """Tolerance of joints, over the model's size."""
 QUICK = 100
-"""A trial makes this part of the steps."""
+"""Fraction of the steps in a trial run."""
 EVERY = 10
-"""Momenta and stretches are measured every so many steps, energies at each."""
+"""Interval of steps at which momenta and stretches are measured; energies at each."""
 LAWS = {
     "svk": wf.SVK(E=1e6, nu=0.3, density=1000.0),
     "mooney_rivlin": wf.MooneyRivlin(mu10=1.5e5, mu01=5e4, k=1e6, density=1000.0),
@@ -50,15 +50,16 @@ CASES = [
     *((f"3443 {integration}", "svk") for integration in ("tied", "full")),
     *((f"{family} full", law) for family in ("3243", "3443") for law in ("mooney_rivlin", "neo_hookean")),
 ]
-"""Family, with its integration where there is a choice, and law."""
+"""Family, with its integration if selectable, and law."""
 STEEL = {"E": 2e11, "density": 7870.0, "slider_mass": 0.0755}
 MECHANISMS: dict[str, tuple[dict[str, Any], float]] = {
     "pendulum": ({"E": 2e7}, 1.25e-3),
     "double_pendulum": ({}, 4e-3),
     "slider_crank": (STEEL, 2e-4),
 }
-"""Scenes without damping, what differs from their own values, and steps, s. Softer ones gather vibration, as nothing
-takes it away, until the tip of the pendulum turns inside out after 2.5 s."""
+"""Scenes without damping, changed parameters, and steps, s. Softer ones accumulate undamped vibration, until the tip
+of the pendulum inverts after 2.5 s.
+"""
 
 
 def _body(b: wf.ModelBuilder, family: str, law: str) -> wf.Body:
@@ -83,7 +84,7 @@ def _body(b: wf.ModelBuilder, family: str, law: str) -> wf.Body:
 def tumble(
     family: str, law: str, device: Any = "cpu", dtype: str = "float64", worlds: int = 1, stretch: float = 10.0
 ) -> wf.Model:
-    """A free body that spins at RATE, flies, and stretches by so much a second, 1/s."""
+    """A free body that spins at RATE, translates, and stretches at the given rate, 1/s."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = _body(b, family, law)
     spin = RATE * AXIS / np.linalg.norm(AXIS)
@@ -97,7 +98,7 @@ def tumble(
 
 
 class Conserved:
-    """Energy and both momenta of a free body, and what has become of them.
+    """Energy and both momenta of a free body, and their errors.
 
     Attributes:
         energy, linear, angular: largest errors so far, over the first values.
@@ -130,7 +131,7 @@ class Conserved:
         return np.linalg.norm(x[i] - x[j], axis=1)
 
     def measure(self) -> None:
-        """Compare the present with the start."""
+        """Compare the current values with the initial ones."""
         sim, (energy, linear, angular) = self.sim, self.first
         self.energy = max(self.energy, abs(self._energy(sim) - energy) / energy)
         self.strain = max(self.strain, float(sim.energies()["strain"][0]) / energy)
@@ -142,7 +143,7 @@ class Conserved:
             self.stretch = max(self.stretch, float(change.max()))
 
     def row(self) -> dict[str, Any]:
-        """Largest errors, and the energy that the ledger assigns to the integrator."""
+        """Largest errors, and the energy assigned to the integrator by the ledger."""
         e, size = self.sim.energies(), self.first[0]
         return {
             "energy": self.energy, "linear": self.linear, "angular": self.angular, "strain": self.strain,
@@ -179,7 +180,7 @@ def free(run: Run, family: str) -> Iterator[Row]:
 
 
 def constrained(run: Run) -> Iterator[Row]:
-    """Energy of mechanisms less the work of their drives, over the largest of what moves and is stored, 1e4 steps."""
+    """Energy of mechanisms less the work of their drives, over the largest kinetic and stored energy, 1e4 steps."""
     for name, (_, dt) in MECHANISMS.items():
         sim = _sim(mechanism(name, run.device), dt, constraint_tol=CLOSED)
         first, size, error, violation, halvings, newton = _mechanical(sim), 0.0, 0.0, 0.0, 0, []
@@ -214,7 +215,7 @@ def _mechanical(sim: wf.Simulation) -> float:
 
 
 def revolutions(run: Run) -> Iterator[Row]:
-    """Errors after 1e4 revolutions of two bodies, and the largest of all hundredths of the way since resumed."""
+    """Errors after 1e4 revolutions of two bodies, and the largest of all hundredths of the run since resumed."""
     for family in ("T10", "3243 tied"):
         start = _sim(tumble(family, "svk", run.device), DT)
         sim = _sim(start.model, DT, state=start.model.state())

@@ -2,13 +2,13 @@
 
 hertz      a rigid sphere on a quarter block 60 contact radii deep: contact radius and peak pressure, from a line
            through the squares of the points' pressures, beside those of the force.
-mindlin    the same on a half block with friction, then sideways: stiffness ratio, and where all slips.
+mindlin    the same on a half block with friction, then sideways: stiffness ratio, and onset of full slip.
 rebound    an elastic ball on a plane: restitution and duration, and those of a quarter of the step and half the mesh.
-wall       a cube pressed to a wall: how far it moves in 10 s, after 10 s of settling.
-turntable  a cube on a plate that turns: how far it moves on it in ten turns; the paper's law walks.
+wall       a cube pressed to a wall: its motion in 10 s, after 10 s of settling.
+turntable  a cube on a plate that turns: its motion on the plate in ten turns; the paper's law creeps.
 balls      two elastic balls with meshes that do not match: contact radius, peak pressure and approach beside Hertz.
 cylinders  two cylinders in plane strain: width and pressure beside Hertz.
-stack      ten cubes on each other: how far they move in 10 s, also under a last one of a thousand times the mass.
+stack      ten cubes on each other: their motion in 10 s, also under a last one of a thousand times the mass.
 
 Each row has its iterations and time.
 """
@@ -34,9 +34,9 @@ __all__ = ["TABLE", "hertz_case", "rebound_case", "stack_case", "turntable_case"
 
 E = 1e6
 A = 0.01
-"""Contact radius that is aimed at, m; the sphere's is 1 m."""
+"""Intended contact radius, m; the sphere's radius is 1 m."""
 WIDTH = 1.3
-"""Half of the evenly meshed zone, contact radii."""
+"""Half width of the evenly meshed zone, contact radii."""
 
 
 def grading(inner: int, outer: int, depth: float) -> Any:
@@ -218,17 +218,19 @@ def mindlin_case(
 
 
 PAIR_RADIUS = 2.0
-"""Of each surface, m: of both together 1 m."""
+"""Radius of each surface, m: effective radius 1 m."""
 MODULI = (E, 2.0 * E)
-"""Of the lower body and of the upper one, Pa."""
+"""Moduli of the lower body and of the upper one, Pa."""
 
 
 FLAT = 10.0
-"""Beyond so many contact radii faces level off: 5 10^-5 of the curvature there, and far elements keep their shape."""
+"""Distance, contact radii, beyond which faces level off: 5 10^-5 of the curvature, so that far elements keep their
+shape.
+"""
 
 
 def _curved(place: Any, inner: int, flip: bool, across: tuple[int, ...]) -> Any:
-    """A graded block whose upper face is a paraboloid, or a parabolic cylinder; turned over for the upper body.
+    """A graded block whose upper face is a paraboloid, or a parabolic cylinder; inverted for the upper body.
 
     Edges are curved in the evenly meshed zone only: far elements are too long for it.
     """
@@ -376,7 +378,7 @@ def rebound_case(
 ) -> dict[str, Any]:
     """A ball of T10 that falls on a half-space without gravity, damping or friction; `steps` per Hertz's duration.
 
-    The speed after it is that of the centre of mass, by the impulse of the contact's records. The duration is between
+    The rebound speed is that of the centre of mass, by the impulse of the contact's records. The duration is between
     the times at which the force first exceeds and last falls below 1 % of its largest, linearly between steps.
     """
     b = wf.ModelBuilder(gravity=(0, 0, 0))
@@ -424,11 +426,11 @@ def rebound_case(
 
 EDGE, G = 0.1, 9.81
 CUBE = {"edge": EDGE, "mass": 1.0, "nu": 0.3, "tol": 1e-10}
-"""Of 1000 kg/m^3."""
+"""Balls of 1000 kg/m^3."""
 PRESSED, DT = 20.0, 1e-2
 SPEED, TURN_STEPS = 10.0, 200
 REST, RAMP = 200, 20
-"""Steps before the plate turns, and those in which it comes to its speed."""
+"""Steps before the plate rotates, and those of its acceleration."""
 
 
 def _cube(b: wf.ModelBuilder, element: str, E: float, origin: tuple[float, float, float]) -> Any:
@@ -441,7 +443,7 @@ def _simulation(b: wf.ModelBuilder, dt: float, device: Any) -> wf.Simulation:
 
 
 def _cost(sim: wf.Simulation, began: float) -> dict[str, Any]:
-    """Steps, iterations, residual of the ledger and seconds of a run."""
+    """Steps, iterations, ledger residual and seconds of a run."""
     return {
         "steps": sim.steps, "newton": int(sim.totals["newton"][0]), "pcg": int(sim.totals["pcg"][0]),
         "ledger_residual": float(sim.energies()["ledger_residual"][0]), "seconds": clock.perf_counter() - began,
@@ -449,8 +451,9 @@ def _cost(sim: wf.Simulation, began: float) -> dict[str, Any]:
 
 
 def wall_case(element: str, *, settle: float = 10.0, hold: float = 10.0, device: Any = "cpu") -> dict[str, Any]:
-    """A cube of E = 1e6 Pa that 20 N press to a wall of mu = 1 under its weight: how far any node moves in `hold` s
-    after `settle` s from rest, m, and what the wall bears, N."""
+    """A cube of E = 1e6 Pa that 20 N press to a wall of mu = 1 under its weight: largest motion of a node in `hold`
+    s after `settle` s from rest, m, and the force on the wall, N.
+    """
     b = wf.ModelBuilder(gravity=(0, 0, -G))
     body = _cube(b, element, 1e6, (0.0, 0.0, 0.0))
     b.add_traction(body.surface("x+"), (-PRESSED / EDGE**2, 0, 0))
@@ -469,8 +472,9 @@ def wall_case(element: str, *, settle: float = 10.0, hold: float = 10.0, device:
 
 
 def turntable_case(law: str, *, turns: int = 10, device: Any = "cpu") -> dict[str, Any]:
-    """A cube of E = 1e8 Pa on a plate that turns at 10 rad/s, 200 steps a turn: by how much its nodes have moved on the
-    plate from the end of the first turn to that of the last, over its edge."""
+    """A cube of E = 1e8 Pa on a plate that turns at 10 rad/s, 200 steps a turn: motion of its nodes on the plate
+    from the end of the first turn to that of the last, over its edge.
+    """
     dt = 2.0 * math.pi / SPEED / TURN_STEPS
     first = REST + RAMP
     times = dt * np.arange(first + TURN_STEPS * turns + 1)
@@ -497,14 +501,14 @@ def turntable_case(law: str, *, turns: int = 10, device: Any = "cpu") -> dict[st
 
 SIDE = 0.1
 STACK = {"side": SIDE, "density": DENSITY, "nu": 0.3, "mu": 0.5, "element": "T4", "cells": 1}
-"""Of the cubes; the lowest is clamped below."""
+"""Size of the cubes; the lowest is clamped below."""
 
 
 def stack_case(
     E: float, top: float, *, cubes: int = 10, duration: float = 10.0, dt: float = 1e-2, stiffness: float = 20.0,
     device: Any = "cpu",
 ) -> dict[str, Any]:  # fmt: skip
-    """Let a stack rest whose last cube is `top` times as heavy; creep is counted from a tenth of the duration on.
+    """Stack at rest with the last cube `top` times as heavy; creep is measured from a tenth of the duration on.
 
     A stack is a column whose joints turn: with springs of k = 3.3 10^-2 stiffness E side in the joints those of E = 1e7
     buckle by their weight at `stiffness` 1 (q L^3/EI = 16 > 7.84 of Greenhill's column), and not at 20 (2.2).
@@ -560,7 +564,7 @@ CASES: dict[str, tuple[str, Callable[..., Row], list[Row]]] = {
     "stack": ("equal cubes, and a last one of a thousand times the mass, each soft and hard", stack_case,
               [{"E": E, "top": top} for E, top in ((1e7, 1.0), (1e10, 1.0), (2e9, 1e3), (1e10, 1e3))]),
 }  # fmt: skip
-"""Part -> its rows in words, function of a row, its arguments."""
+"""Part -> text of its rows, function of a row, its arguments."""
 PARTS: dict[str, Part] = {name: cases(about, case, rows) for name, (about, case, rows) in CASES.items()}
 OUT = "--out tests/results/"
 TABLE = Table(

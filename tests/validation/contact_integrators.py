@@ -1,7 +1,7 @@
-"""the contact scenes, shortened, with every integrator.
+"""Shortened contact scenes with every integrator.
 
 rows    error of the probes against a finer run, over their travel, and changes of terms of the energy ledger over the
-        run, over the most energy that was exchanged: `integrator` (positive: the scheme dissipates), `contact_loss`
+        run, over the largest energy exchanged: `integrator` (positive: the scheme dissipates), `contact_loss`
         (restitution and damping of contacts) and `friction`.
 orders  in the step, of each curve, by least squares over its resolved rows.
 """
@@ -55,7 +55,7 @@ def rows(run: Run) -> Iterator[Row]:
 
 
 def orders(run: Run) -> list[Row]:
-    """Of each scene and integrator that `rows` ran."""
+    """Orders of each scene and integrator of `rows`."""
     return list(_orders)
 
 

@@ -1,6 +1,6 @@
 """A CUDA device against the CPU on the same models, in both precisions: every kind of element, law, load, constraint.
 
-h = 1e-3 s; differences over the tip's travel. The tests run the same cases where there is a device.
+h = 1e-3 s; differences over the tip's travel. The tests run the same cases if a device is available.
 """
 
 # mypy: disable-error-code="index"
@@ -30,12 +30,12 @@ DAMPING = {form: wf.KelvinVoigt(3e3, 4.5e3, form=form) for form in ("incremental
 
 @wp.func
 def swirl(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
-    """A body force about the z axis, with a part that swings with time; N/kg."""
+    """A body force about the z axis, with a part oscillating in time; N/kg."""
     return wp.vec3d(-x[1], x[0], wp.sin(t))
 
 
 def s3_mesh():
-    """The S3 cantilever, from a file that needs no mesh reader."""
+    """The S3 cantilever, from a file without a mesh reader."""
     table = np.load(data_file("S3_cantilever.npz"))
     return wf.mesh.Mesh(table["points"], table["cells"], "tetra10", name="s3")
 
@@ -125,7 +125,7 @@ def mechanism():
 
 
 def chain():
-    """Links of one T10 cell on revolute joints: more coupled rows than one inverse takes, swept by colour."""
+    """Links of one T10 cell on revolute joints: more coupled rows than fit one inverse, swept by colour."""
     b = wf.ModelBuilder()
     law = wf.SVK(E=1e7, nu=0.3, density=1000.0)
     end: Any = wf.GROUND
@@ -163,7 +163,9 @@ CASES: dict[str, Callable[[], tuple[wf.ModelBuilder, wf.Body]]] = {
 
 STEPS = 100
 CONSTRAINT_TOL = {"float64": 1e-13, "float32": None}
-"""Rows of a weld are almost dependent: what the default leaves of them, 1e-8 of the size, depends on the way there."""
+"""Tolerance for nearly dependent rows of a weld: the default's residual violation, 1e-8 of the size, is path
+dependent.
+"""
 
 
 def simulate(case, device, dtype="float64", steps=100, integrator="backward_euler", tol=None, worlds=1, dt=1e-3):
@@ -180,7 +182,7 @@ def simulate(case, device, dtype="float64", steps=100, integrator="backward_eule
 
 
 def compare(case, integrator="backward_euler", steps=STEPS, cuda="cuda:0"):
-    """One row: how far CUDA is from the CPU in both precisions, relative to the tip's travel."""
+    """One row: difference of CUDA and CPU in both precisions, relative to the tip's travel."""
     row = {"case": case, "integrator": integrator, "steps": steps, "tol_float64": 1e-12}
     reference, _, wall, _ = simulate(case, "cpu", steps=steps, integrator=integrator)
     travel = np.abs(reference).max()

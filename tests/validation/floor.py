@@ -1,11 +1,12 @@
-"""The error that `StepReport.floor` gives in float32, beside the true one.
+"""Error estimate `StepReport.floor` in float32, compared with the true error.
 
 Random strips of 1 m, 2 to 10 times as long as wide and 2 to 80 times as wide as thick, loaded at one end mostly in
-their plane, where bending across it is soft: T4, T10, H3843, 3243 and 3443 elements, E = 1e6 to 2e11 Pa, two static
+their plane, with soft bending across it: T4, T10, H3843, 3243 and 3443 elements, E = 1e6 to 2e11 Pa, two static
 load steps or ten steps of BDF2 of a twentieth of the first period. Cases are drawn from one seed until `CASES` of them
 have a reference in float64 (tol 1e-10) whose tangent is positive definite at each step, by a Cholesky factorisation;
-past a bifurcation a motion follows whatever disturbs it, so those that are not are rows of their own (`stable` false).
-Errors are the largest of any node over the largest displacement; of a motion they stand beside the sum of its floors.
+past a bifurcation a motion follows any disturbance, so the others are separate rows (`stable` false).
+Errors are the largest of any node over the largest displacement; for a motion compared with the sum of its
+estimates.
 """
 
 from __future__ import annotations
@@ -29,12 +30,13 @@ DENSITY = 1000.0
 REFERENCE = 1e-10
 """Tolerance of the references."""
 STEPS, PERIODS = 10, 20
-"""Steps of a motion, and into how many a period is divided."""
+"""Steps of a motion, and steps per period."""
 
 
 def draw(rng: np.random.Generator) -> dict[str, Any]:
-    """A random case: lengths in m, E in Pa; `tilt` and `axial`: what bends it across its plane and draws it along,
-    over what bends it in its plane by `sag`."""
+    """A random case: lengths in m, E in Pa; `tilt` and `axial`: transverse and axial load over the in-plane load
+    that bends it by `sag`.
+    """
     width = 10 ** -rng.uniform(0.3, 1.0)
     element = str(rng.choice(ELEMENTS))
     return {
@@ -72,7 +74,7 @@ def strip(case: dict[str, Any]) -> wf.ModelBuilder:
 
 
 def positive(sim: wf.Simulation) -> bool:
-    """True where the tangent is positive definite on the free components."""
+    """True if the tangent is positive definite on the free components."""
     free = sim.model.free_slots.ravel()
     K = sim.model.tangent_matrix(sim.state)[free][:, free].toarray()
     d = 1.0 / np.sqrt(np.abs(K.diagonal()))
@@ -86,7 +88,7 @@ def positive(sim: wf.Simulation) -> bool:
 def solved(
     case: dict[str, Any], device: Any, dtype: str, tol: float | None = None
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Displacements of the nodes at the end (nodes, 3), m, and the report; of a reference whether it is stable."""
+    """Final displacements of the nodes (nodes, 3), m, and the report; of a reference also its stability."""
     model = strip(case).finalize(device=device, dtype=dtype)
     stable, floors = True, []
     if case["motion"]:
@@ -106,7 +108,7 @@ def solved(
 
 
 def tried(case: dict[str, Any], device: Any) -> dict[str, Any]:
-    """A row: what float32 reported of a case, and its error."""
+    """A row: float32 report of a case, and its error."""
     row: dict[str, Any] = {**case, "stable": None, "outcome": "no reference", "floor": None, "error": None}
     try:
         exact, report = solved(case, device, "float64", REFERENCE)
@@ -123,7 +125,7 @@ def tried(case: dict[str, Any], device: Any) -> dict[str, Any]:
 
 
 def rows(run: Run) -> Iterator[Row]:
-    """Rows until so many cases have a stable reference."""
+    """Rows until `CASES` cases have a stable reference."""
     rng = np.random.default_rng(SEED)
     found = 0
     while found < (QUICK if run.quick else CASES):

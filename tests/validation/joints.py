@@ -5,7 +5,7 @@ cost        a chain of m links and m revolute joints that hangs and swings to th
             constraint directions deflated), for either alone, and for the classical augmented Lagrangian on block
             Jacobi ("before").
 stability   mass ratios to 1e4, E from 1e4 to 1e12 Pa, steps from 1e-5 to 1e-2 s; a door on four hinges; a parallelogram
-            linkage driven through its dead points. A case passes when every step is accepted and the violation stays
+            linkage driven through its dead points. A case passes if every step is accepted and the violation stays
             within 1e-8 of the model's size, or when a named error of warpfea ends it.
 """
 
@@ -102,7 +102,7 @@ def simulate(
     worlds: int = 1,
     **solver: Any,
 ) -> dict[str, Any]:
-    """Step, and tell what it took; a named error is an outcome."""
+    """Do steps and return their cost; a named error is an outcome."""
     model = builder.finalize(device=device, dtype=dtype, worlds=worlds)
     equations = sum(joint["rows"] for joint in model.info()["joints"])
     row: dict[str, Any] = {"unknowns": int(model.free_slots.sum()), "rows": equations, "dt": dt}

@@ -1,7 +1,7 @@
-"""Joints against mechanisms that were computed without warpfea: rigid ones, closed forms, recursions of the scheme.
+"""Joints against mechanisms computed without warpfea: rigid ones, closed forms, recursions of the scheme.
 
-All options of the solver are the defaults unless a row names others. no_drift takes long: it keeps a checkpoint beside
---out, and the same command goes on from it after an interruption.
+Solver options are the defaults unless named by a row. no_drift takes long: it keeps a checkpoint beside --out, and
+the same command resumes from it.
 """
 
 from __future__ import annotations
@@ -88,10 +88,11 @@ def deflection(sim):
 
 
 def rigid_slider_crank(run: Run) -> Iterator[Row]:
-    """A slider-crank so stiff that it follows the closed form, over a turn and a bit; no gravity, bdf2.
+    """A stiff slider-crank against the closed form, over slightly more than a turn; no gravity, bdf2.
 
     Errors are over the length of crank + rod; `deformation` is the largest of the rod's bending and stretch over its
-    length and of the crank's stretch over its own."""
+    length and of the crank's stretch over its own.
+    """
     r, L = STANDARD["crank"], STANDARD["rod"]
     cases = [(15.0, E, 400) for E in (2e10, 2e11, 2e12, 2e13, 2e14)] + [(15.0, 2e13, 100), (150.0, 2e15, 400)]
     for speed, E, count in [(15.0, 2e13, 100)] if run.quick else cases:
@@ -114,10 +115,11 @@ def rigid_slider_crank(run: Run) -> Iterator[Row]:
 
 
 def double_pendulum(run: Run) -> Iterator[Row]:
-    """Two stiff links that swing for 2 s from rest, bdf2, against rigid ones with the boxes' mass, centre and inertia.
+    """Two stiff links swinging for 2 s from rest, bdf2, against rigid ones with the boxes' mass, centre and inertia.
 
     Errors are the largest distances of elbow and tip over the length of both links. From the horizontal (1.571 rad) the
-    links swing to -2.19 and 2.07 rad, from 45 degrees (0.785 rad) within 0.83 rad; neither turns over."""
+    links swing to -2.19 and 2.07 rad, from 45 degrees (0.785 rad) within 0.83 rad; neither turns over.
+    """
     level, low = np.pi / 2, np.pi / 4
     cases = [("time", "3243", 2e12, dt, level) for dt in (2e-3, 1e-3, 5e-4, 2.5e-4)]
     cases += [("stiffness", "3243", E, 2.5e-4, level) for E in (2e9, 2e10, 2e11)]
@@ -142,7 +144,7 @@ def double_pendulum(run: Run) -> Iterator[Row]:
 
 
 def chain(device, kind, element, links, E):
-    """Links 10 cm long that hang straight down from the ground: model, joints from the top, weight of a link (N)."""
+    """Links 10 cm long hanging from the ground: model, joints from the top, weight of a link (N)."""
     length, h = 0.1, 0.01
     b = wf.ModelBuilder()
     law = wf.SVK(E=E, nu=0.3, density=STEEL)
@@ -172,9 +174,10 @@ def chain(device, kind, element, links, E):
 def hanging_chain(run: Run) -> Iterator[Row]:
     """Reaction of every joint of a chain of 10 steel links that hangs at rest, against the weight below it.
 
-    By solve_static (one load step), where the joints leave no rigid motion, and by 20 steps of 10 ms of backward Euler
-    from the straight unstressed chain, which its damping settles. `force_error` is the largest of |F - W| / W,
-    `moment_error` of the moment over weight x link length."""
+    By solve_static (one load step) if the joints leave no rigid mode, and by 20 steps of 10 ms of backward Euler,
+    damped, from the straight unstressed chain. `force_error` is the largest of |F - W| / W,
+    `moment_error` of the moment over weight x link length.
+    """
     stiff = {"max_pcg": 20000}
     cases: list[tuple[str, str, str, dict[str, Any]]] = [
         ("static", "fixed", "3243", {}),
@@ -240,9 +243,10 @@ def crossing(sim):
 def no_drift(run: Run) -> Iterator[Row]:
     """Violation over 1e5 steps of 1 ms of bdf2: a soft double pendulum of two 3243 elements swings in space.
 
-    `violation_*` are what the joints record at every step, over the model's size; `gap_*` is that of the pinned
+    `violation_*` are the joints' records at every step, over the model's size; `gap_*` is that of the pinned
     ends from their positions alone, `crossing` of the hinge from deformation gradients, every 100 steps since resumed.
-    First and last: of the first and the last tenth."""
+    First and last: of the first and the last tenth.
+    """
     sim, joints = swing(run.device)
     target, checkpoint = DRIFT_STEPS // 100 if run.quick else DRIFT_STEPS, run.checkpoint("no_drift")
     if checkpoint is not None and checkpoint.exists():
@@ -361,7 +365,7 @@ class Pair:
         return model.reference + position * origin + u
 
     def motion(self, state):
-        """Displacement and velocity of the centre of mass; places and velocities (slots, 3) about it; L about it."""
+        """Displacement and velocity of the centre of mass; positions and velocities (slots, 3) about it; L about it."""
         m, own = self.model, self.mask
         u, v = (array.numpy()[0].astype(float) for array in (state.displacement, state.velocity))
         lumped, position = m.lumped_host[own], (m.slot_kind[own] == 0)[:, None]
@@ -399,7 +403,7 @@ def attempt(row, sim, steps):
 
 
 def cuts(count, dt):
-    """All lists of substeps that a step may have had which was halved so many times: a half may be halved again."""
+    """All possible lists of substeps of a step with this number of halvings: a half may be halved again."""
     if count == 0:
         return [[dt]]
     return [a + b for k in range(count) for a in cuts(k, dt / 2) for b in cuts(count - 1 - k, dt / 2)]
@@ -407,7 +411,7 @@ def cuts(count, dt):
 
 def best_fall(integrator, halvings, dt, v0, distance):
     """Smallest distance to the fall of the substeps that these steps may have had, which are far apart from each other;
-    None where they are too many to try."""
+    None for too many to try."""
     choices = [cuts(n, dt) for n in halvings]
     if np.prod([float(len(c)) for c in choices]) > 64.0:
         return None
@@ -421,7 +425,7 @@ SOLVERS = [{}, {"penalty": 1.0}, {"penalty": 1e4}, {"max_newton": 1, "max_pcg": 
 
 
 def fall_of_a_pair(device, E, tie, second, integrator, options, steps=30, dt=1e-2):
-    """The row of a pair that is let go at rest; None as its error where the substeps are unknown."""
+    """Row of a pair released at rest; None as its error if the substeps are unknown."""
     pair = Pair(device, tie, E=E, second=second)
     sim = wf.Simulation(pair.model, dt=dt, integrator=integrator, solver=wf.NewtonPCG(**options))
     row = {"case": "fall", "joint": tie, "second": second, "integrator": integrator, "E": E, "dt": dt,
@@ -429,7 +433,7 @@ def fall_of_a_pair(device, E, tie, second, integrator, options, steps=30, dt=1e-
     halvings = attempt(row, sim, steps)
     if halvings is None:
         return row
-    if integrator == "backward_euler" and not any(halvings):  # the same, summed
+    if integrator == "backward_euler" and not any(halvings):  # summed
         u, _ = fall(integrator, [dt] * steps, np.zeros(3))
         assert np.allclose(u, GRAVITY * dt**2 * steps * (steps + 1) / 2, rtol=1e-13, atol=0.0)
     row["error"] = best_fall(integrator, halvings, dt, np.zeros(3), lambda u: pair.points_error(sim, u))
@@ -468,8 +472,9 @@ def _spinning(device, E, tie, second, integrator, options, steps=20, dt=1e-2):
 
 
 def _beside_an_impact(device, tie, integrator):
-    """The pair beside a soft box that runs against its clamp, which halves the steps of all, and a lone box that falls
-    with the pair: same displacement everywhere; with backward Euler the velocity is n h g whatever the substeps."""
+    """The pair, a soft box running against its clamp, which halves all steps, and a lone box falling with the pair:
+    same displacement everywhere; with backward Euler the velocity is n h g for any substeps.
+    """
     lone = []
 
     def extra(b):
@@ -500,10 +505,11 @@ def free_fall(run: Run) -> Iterator[Row]:
     """Two bodies tied by a joint fall as one, against the scheme's recursion; backward Euler's q = g h^2 n (n + 1) / 2.
 
     fall: all nodes of a pair let go at rest, over the fall. spin: the centre of mass of a pair thrown spinning at 8.3
-    rad/s, 20 steps of 1/8 turn per 10 ms at most; where max_newton is named it halves steps; `moment_balance` is what
-    the joint's forces do to the angular momentum in a step, over it; `kept` is L_end / L_start. beside an impact: steps
-    halved by another body. welded: `kept` of the pair against one body of both, `from_one_body` their difference over
-    what is lost."""
+    rad/s, 20 steps of 1/8 turn per 10 ms at most; with max_newton steps are halved; `moment_balance` is the change
+    of angular momentum by the joint's forces in a step, over it; `kept` is L_end / L_start. beside an impact: steps
+    halved by another body. welded: `kept` of the pair against one body of both, `from_one_body` their difference
+    over the loss.
+    """
     device, quick, schemes, soft, stiff = run.device, run.quick, ("backward_euler", "bdf2"), 1e5, 2e9
     for tie, scheme in itertools.product(TIES, schemes[: 1 if quick else 2]):
         falls = [(soft, "T10", o) for o in SOLVERS] + [(stiff, s, o) for s in ("T10", "3243") for o in SOLVERS[:3]]

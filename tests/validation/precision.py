@@ -1,4 +1,4 @@
-"""at which error rounding ends the curve of float32, for each family.
+"""Round-off limit of the error in float32, for each family.
 
 The problem `small_body` with BDF2 in float64 and float32, each with the solver's own tolerance, over a range of steps.
 `float64` and `float32` are the errors of the tip against a finer float64 run, the root of the mean square over time

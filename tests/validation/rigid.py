@@ -1,6 +1,7 @@
-"""Reference models of planar rigid mechanisms, made without warpfea: numpy and scipy only, SI units, angles in rad.
+"""Reference models of planar rigid mechanisms, independent of warpfea: numpy and scipy only, SI units, angles in
+rad.
 
-A slider-crank in closed form; two rigid links under gravity. The checks that the docstrings quote were made at 51a4e5d.
+A slider-crank in closed form; two rigid links under gravity. The checks quoted in the docstrings date from 51a4e5d.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ STANDARD: dict[str, Any] = {"crank": 0.15, "rod": 0.30, "speed": 150.0, "E": 2.0
 
 
 def slider_crank_kinematics(angle: Any, crank: float, rod: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Place of an in-line slider-crank: crank pivot in the origin, slider on the x axis at positive x.
+    """Positions of an in-line slider-crank: crank pivot in the origin, slider on the x axis at positive x.
 
     pin = crank (cos angle, sin angle), sin psi = -crank sin(angle) / rod with cos psi >= 0,
     slider = crank cos(angle) + rod cos(psi).
@@ -38,8 +39,8 @@ def slider_crank_kinematics(angle: Any, crank: float, rod: float) -> tuple[np.nd
         crank, rod: lengths, m.
 
     Returns:
-        Crank pin (..., 2), slider's x (...) and rod angle psi (...): of the direction from crank pin to slider, from x.
-        Slider and rod angle are nan where the rod does not reach the axis.
+        Crank pin (..., 2), slider's x (...) and rod angle psi (...): direction from crank pin to slider, from x.
+        Slider and rod angle are nan if the rod does not reach the axis.
     """
     angle = np.asarray(angle, dtype=float)
     pin = crank * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -59,7 +60,7 @@ def slider_crank_velocities(
     Returns:
         Of the crank pin (..., 2), m/s; of the slider along x (...), m/s; of the rod's angle (...), rad/s.
 
-    Checked: central differences of the places agree to 1e-10 of the largest value.
+    Checked: central differences of the positions agree to 1e-10 of the largest value.
     """
     angle = np.asarray(angle, dtype=float)
     psi = slider_crank_kinematics(angle, crank, rod)[2]
@@ -128,12 +129,12 @@ def double_pendulum_places(angles: Any, lengths: Any) -> tuple[np.ndarray, np.nd
 
 
 def integrate(rhs: Any, start: np.ndarray, times: np.ndarray, rtol: float, atol: Any) -> np.ndarray:
-    """States (n, ...) at the times, of which time 0 has the start."""
+    """States (n, ...) at the times; the start is at time 0."""
     if times.ndim != 1 or times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
         raise ValueError("times must ascend from 0 or later")
     if times[-1] == 0.0:
         return start[None]
-    # DOP853's dense output is of order 7, the steps of order 8: both are below what the tests compare to
+    # DOP853's dense output is of order 7, its steps of order 8: both below the tolerances of the tests
     solution = solve_ivp(rhs, (0.0, times[-1]), start, method="DOP853", t_eval=times, rtol=rtol, atol=atol)
     if not solution.success:
         raise RuntimeError(solution.message)

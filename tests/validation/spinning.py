@@ -1,8 +1,8 @@
-"""Energy that generalized-alpha adds to bodies that spin, for each rho_inf.
+"""Energy gain of spinning bodies under generalized-alpha, for each rho_inf.
 
 A T10 bar of 0.5 x 0.2 x 0.1 m spins by |w| rad/s, free about (1, 2, 10) or on a revolute joint at its end, in 300 steps
 of h. `growth` is the largest kinetic and strain energy, from the mass matrix and the strain energy of the model, over
-that of the start, and `end` that of the last step; a run ends where it exceeds `MOST`, or where a step is refused.
+that of the start, and `end` that of the last step; a run ends if it exceeds `MOST`, or at a refused step.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def spinning_body(body: str, E: float, device: Any = "cpu") -> wf.Model:
 
 
 def spin_energies(model: wf.Model, integrator: Any, turn: float, spin: Any, steps: int = STEPS) -> list[float]:
-    """Kinetic and strain energy over that of the start, after each step that was made, until one exceeds `MOST`."""
+    """Kinetic and strain energy over the initial one, after each step, until one exceeds `MOST`."""
     sim = wf.Simulation(model, dt=turn / float(np.linalg.norm(spin)), integrator=integrator, ledger=False, record=False)
     M, state = model.mass_matrix(), sim.state
 

@@ -13,7 +13,7 @@ from warpfea.base.errors import UsageError
 __all__ = ["Part", "Row", "Run", "Table", "cases"]
 
 Row = dict[str, Any]
-"""Numbers and texts that JSON can hold, by name."""
+"""JSON-compatible numbers and texts, by name."""
 
 
 @dataclass
@@ -37,20 +37,20 @@ class Run:
     made: dict[str, Any] = field(default_factory=dict)
 
     def wants(self, label: str) -> bool:
-        """True for a row that --rows names, and for every row without it."""
+        """True for a row named by --rows, and for every row without it."""
         return not self.labels or any(fnmatch.fnmatchcase(label, pattern) for pattern in self.labels)
 
     def checkpoint(self, name: str) -> pathlib.Path | None:
-        """File beside --out that a long run goes on from; None without --out."""
+        """Checkpoint file beside --out of a long run; None without --out."""
         return self.out and self.out.with_suffix(f".{name.replace(' ', '_')}.npz")
 
 
 Part = Callable[[Run], "Iterable[Row] | Mapping[str, Any]"]
-"""Function that gives rows, one by one or all at once, or a single object; its docstring is its help."""
+"""Function returning rows, one by one or all at once, or a single object; its docstring is its help."""
 
 
 def cases(about: str, case: Callable[..., Row], rows: Iterable[Mapping[str, Any]]) -> Part:
-    """A part of one row for each set of arguments of a function, which takes the device as well."""
+    """Part of one row for each set of arguments of a function of the arguments and the device."""
 
     def part(run: Run) -> Iterator[Row]:
         for arguments in rows:
@@ -62,21 +62,21 @@ def cases(about: str, case: Callable[..., Row], rows: Iterable[Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of numbers against references or of costs, which are printed and written as one JSON file.
+    """Rows of results against references or of costs, printed and written as one JSON file.
 
     Attributes:
-        about: what is compared with what, as help; by convention the docstring of its module.
-        parts: name, a key of the file -> function that gives its rows.
-        results: file of tests/results -> command line after `python -m tests.validation` that makes it.
-        settings: constants that the numbers depend on, as the file holds them.
+        about: help text; by convention the docstring of its module.
+        parts: name, a key of the file -> function returning its rows.
+        results: file of tests/results -> its command line after `python -m tests.validation`.
+        settings: constants of influence, as in the file.
         options: further settings that parts read from `Run.options`: numbers, texts or lists of them, changed with
             --set NAME=VALUE.
-        columns: names that are printed; empty for all. The file holds all.
+        columns: printed names; empty for all. The file contains all.
         device: without --device.
-        takes: how long, on two cores.
-        apart: each part is measured on its own, and stands in the file's "parts" with its own command, commit and
+        takes: duration on two cores.
+        apart: each part is measured separately, stored in the file's "parts" with its own command, commit and
             machine; otherwise the file has one origin, and a list of rows for each part.
-        check: refuses a run that can't be done, before any work, by an error of warpfea.
+        check: raises an error of warpfea for an impossible run, before any work.
     """
 
     about: str | None

@@ -1,1 +1,1 @@
-"""What every floor uses: errors, launches, safe writing of files, text for consoles."""
+"""Shared utilities: errors, kernel launches, atomic file writing, console text."""

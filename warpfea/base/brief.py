@@ -11,15 +11,15 @@ import numpy as np
 __all__ = ["FEW", "brief", "brief_repr", "lines"]
 
 WIDTH, LINES = 118, 5
-"""Of a repr."""
+"""Maximum lines of a repr."""
 FEW = 4
-"""Items of an array up to which they are shown."""
+"""Maximum number of array items shown."""
 TEXT = 60
-"""Characters of a value."""
+"""Maximum characters of a value."""
 
 
 def brief(value: Any) -> str:
-    """A value in a few words: of an array of more than 4 items the shape and the range."""
+    """Short text of a value: for arrays of more than 4 items the shape and the range."""
     if isinstance(value, np.ndarray):
         return _array(value)
     if isinstance(value, (tuple, list)) and any(isinstance(item, np.ndarray) for item in value):
@@ -49,13 +49,13 @@ def _number(x: Any) -> str:
 
 
 def lines(text: str) -> str:
-    """A text in at most five lines."""
+    """Text truncated to five lines."""
     out = textwrap.wrap(text, WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
     return "\n".join(out if len(out) <= LINES else [*out[: LINES - 1], "    ..."])
 
 
 def brief_repr(self: Any) -> str:
-    """The repr of a dataclass; fields that are None are left out."""
+    """Repr of a dataclass without the fields that are None."""
     values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.repr}
     shown = ", ".join(f"{name}={brief(value)}" for name, value in values.items() if value is not None)
     return lines(f"{type(self).__name__}({shown})")

@@ -1,4 +1,4 @@
-"""Source checkouts, where `kernels/` and `scenes/` lie beside the package."""
+"""Source checkouts, with `kernels/` and `scenes/` beside the package."""
 
 import importlib.util
 import pathlib
@@ -8,7 +8,7 @@ __all__ = ["map_checkout"]
 
 
 def map_checkout(package: str) -> None:
-    """Bind the two folders of a checkout as sub-packages; nothing is to be done where the package is installed."""
+    """Bind the two folders of a checkout as sub-packages; no effect on an installed package."""
     root = pathlib.Path(__file__).resolve().parents[2]
     if not (root / "pyproject.toml").is_file():
         return

@@ -1,4 +1,4 @@
-"""What options of solvers may be."""
+"""Validation of solver options."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNITS = {
     **dict.fromkeys(("kPa", "kN", "g/cm^3", "g/cm3"), 1e3),
     **{"cm": 1e-2, "MPa": 1e6, "GPa": 1e9},
 }
-"""Units that users write behind numbers, in SI units."""
+"""Units written after numbers, in SI units."""
 
 
 def is_number(value: Any) -> bool:

@@ -1,4 +1,4 @@
-"""What the commands share: a quiet Warp, bars, tables, JSON."""
+"""Shared console output of the commands: quiet Warp, progress bars, tables, JSON."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
 class quiet_warp:
-    """A context in which Warp, started if need be, prints no greeting and no lines about modules.
+    """Context without Warp's greeting and module lines; initialises Warp.
 
-    Warnings and errors still show, and so does all that Warp prints where its user asked for more than it prints by
-    default (`wp.config.log_level` below LOG_INFO, or `wp.config.verbose`). The level is as before afterwards.
+    Warnings and errors are shown, and everything if the user raised the verbosity (`wp.config.log_level` below
+    LOG_INFO, or `wp.config.verbose`). The level is restored on exit.
     """
 
     def __enter__(self) -> None:
@@ -45,7 +45,7 @@ _started: list[bool] = []
 
 
 def _start() -> None:
-    """wp.init; that there is no CUDA driver, which the native library says on descriptor 2, is no news."""
+    """wp.init; suppresses the native library's message (descriptor 2) about a missing CUDA driver."""
     sys.stderr.flush()
     with tempfile.TemporaryFile() as file:
         saved = os.dup(2)
@@ -64,7 +64,7 @@ def _start() -> None:
 
 @contextlib.contextmanager
 def compile_bar(show: bool | None) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar "compiling kernels" on stderr, with how many modules are ready; None: when stderr is a terminal."""
+    """Progress bar "compiling kernels" on stderr with the number of loaded modules; None: if stderr is a terminal."""
     if show is None:
         show = sys.stderr.isatty()
     if not show:
@@ -83,7 +83,7 @@ def compile_bar(show: bool | None) -> Iterator[Callable[[int, int, str], None]]:
 
 
 def table(rows: Sequence[Sequence[str]], *, indent: str = "", right: Sequence[int] = ()) -> str:
-    """Rows in columns two spaces apart; the columns in `right` end at their right side."""
+    """Rows in columns two spaces apart; the columns in `right` are right-aligned."""
     widths = [max(len(row[k]) for row in rows if k < len(row)) for k in range(max(map(len, rows)))]
     lines = []
     for row in rows:
@@ -93,12 +93,12 @@ def table(rows: Sequence[Sequence[str]], *, indent: str = "", right: Sequence[in
 
 
 def number(value: float, digits: int = 4) -> str:
-    """A number for reading."""
+    """Readable number."""
     return f"{value:.{digits}g}"
 
 
 def size(count: int) -> str:
-    """Bytes for reading."""
+    """Readable size in bytes."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= factor:
             return f"{count / factor:.1f} {unit}"
@@ -106,7 +106,7 @@ def size(count: int) -> str:
 
 
 def write_json(target: str, content: dict[str, Any]) -> None:
-    """Write JSON to a file, whole or not at all, or to stdout for "-". OutputError."""
+    """Write JSON to a file (atomically), or to stdout for "-". OutputError."""
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     if target == "-":
         sys.stdout.write(text)
@@ -116,7 +116,7 @@ def write_json(target: str, content: dict[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON can hold it: lists for arrays and tuples, null for numbers that are not finite."""
+    """Convert to JSON types: lists for arrays and tuples, null for non-finite numbers."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):

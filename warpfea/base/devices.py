@@ -1,4 +1,4 @@
-"""Devices by name."""
+"""Device selection by name."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["find_device"]
 
 
 def find_device(device: Any = None) -> wp.Device:
-    """The Warp device of a name, None for the preferred one. ModelError lists those there are."""
+    """The Warp device of a name, None for the preferred one. ModelError lists the available ones."""
     with quiet_warp():
         if device is None:
             return wp.get_preferred_device()
-        # asked for a GPU where there is none, Warp's library prints errors of its own
+        # for a GPU on a machine without one, Warp's library prints its own errors
         bare = str(device).startswith("cuda") and not wp.is_cuda_available()
         try:
             if not bare:
@@ -25,5 +25,5 @@ def find_device(device: Any = None) -> wp.Device:
         except Exception:
             pass
         names = ", ".join(str(known) for known in wp.get_devices())
-    hint = ", and no CUDA GPU with a driver; take 'cpu', or leave the device out" if bare else ""
-    raise ModelError(f"device {device!r} is not there; Warp finds {names}{hint}")
+    hint = " (no CUDA GPU with a driver); use 'cpu', or omit the device" if bare else ""
+    raise ModelError(f"device {device!r} not found; available: {names}{hint}")

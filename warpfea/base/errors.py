@@ -22,34 +22,34 @@ __all__ = [
 
 
 class Error(Exception):
-    """Base of all errors that warpfea raises on purpose."""
+    """Base class of all errors raised by warpfea."""
 
 
 class MeshError(Error):
-    """A mesh file or mesh can't be used; the text names file, element or node, and value."""
+    """Unusable mesh or mesh file; the text names file, element or node, and value."""
 
 
 class ModelWarning(UserWarning):
-    """A model or a run is valid, but looks unintended; the text tells what to write."""
+    """Warning: the input is valid but probably unintended; the text states the correction."""
 
 
 class MeshWarning(ModelWarning):
-    """A mesh was usable, but something in it was left out or looks unintended."""
+    """Warning: a mesh was read, but part of it was omitted or looks unintended."""
 
 
 class ModelError(Error):
-    """The description of a model is wrong; the text names the body, group or parameter."""
+    """Invalid model description; the text names the body, group or parameter."""
 
 
 class ConstraintError(Error):
-    """A constraint or joint can't be satisfied.
+    """Unsatisfiable constraint or joint.
 
     Attributes:
         joints: names of the joints, the most violated first.
-        violations: of each, m.
+        violations: of each joint, m.
         time: time (s) at the start of the refused step.
         world: index of the world.
-        state: the state, unchanged since before the refused step; None where none was made.
+        state: the state before the refused step; None if there is none.
     """
 
     def __init__(
@@ -71,13 +71,12 @@ class ConstraintError(Error):
 
 
 class CapacityError(Error):
-    """A device has too little memory for a model, a simulation or a step.
+    """Too little device memory for a model, a simulation or a step.
 
     Attributes:
-        bytes: size of the array that found no room, or of the simulation that would find none; 0 where that is not
-            known.
-        per_world: bytes that a world of a simulation takes; 0 where that is not known.
-        worlds: the most worlds that fit; 0 where that is not known.
+        bytes: requested size of the array or simulation; 0 if unknown.
+        per_world: bytes per world of a simulation; 0 if unknown.
+        worlds: largest number of worlds that fits; 0 if unknown.
     """
 
     def __init__(self, message: str, *, bytes: int = 0, per_world: int = 0, worlds: int = 0) -> None:
@@ -88,22 +87,22 @@ class CapacityError(Error):
 
 
 class CheckpointError(Error):
-    """A checkpoint can't be written, read, or belongs to another model."""
+    """Checkpoint that can't be written or read, or belongs to another model."""
 
 
 class OutputError(Error):
-    """An output file can't be written or is not valid."""
+    """Output file that can't be written or is invalid."""
 
 
 class ConvergenceError(Error):
-    """A step or a static load step was not accepted.
+    """Rejected time step or static load step.
 
     Attributes:
         time: time (s) at the start of the refused step, of the first failed world.
         world: index of the first failed world.
         residuals: relative residual after each Newton iteration of the last attempt.
         element: index of the element with the largest residual at its nodes (model numbering), or -1.
-        state: the state, unchanged since before the refused step.
+        state: the state before the refused step.
     """
 
     def __init__(
@@ -125,11 +124,11 @@ class ConvergenceError(Error):
 
 
 class PenetrationError(ConvergenceError):
-    """A step of a model with contact was not accepted, and a point of a body went through an obstacle in it."""
+    """Rejected step of a model with contact in which a point of a body passed through an obstacle."""
 
 
 class StabilityError(ConvergenceError):
-    """A static equilibrium is unstable, and `unstable="refuse"` was asked for.
+    """Unstable static equilibrium with `unstable="refuse"`.
 
     Attributes:
         state: the equilibrium. result: the StaticResult.
@@ -139,8 +138,8 @@ class StabilityError(ConvergenceError):
 
 
 class StabilityWarning(UserWarning):
-    """A static equilibrium is unstable: without an imperfection a model stays on it, a real structure leaves it."""
+    """Unstable static equilibrium: without an imperfection the model stays on it, a real structure leaves it."""
 
 
 class UsageError(Error):
-    """The command line is wrong."""
+    """Invalid command line."""

@@ -1,4 +1,4 @@
-"""Launches of kernels, counted, so that what a scene costs can be listed, asserted and timed."""
+"""Counted kernel launches: the cost of a scene can be listed, asserted and timed."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ PARTS = {
     "control": "start of a step, line search, decisions of the loops",
     "commit": "acceptance of a step, energy ledger, report",
 }
-"""What the launches of a step are for. A launch without a label is "control"."""
+"""Purposes of the launches of a step. A launch without a label is "control"."""
 
 
 class Recorder(Protocol):
-    """Does the launches in place of the Launcher, to time them."""
+    """Executes launches in place of the Launcher, for timing."""
 
     def __call__(
         self, part: str, kernel: wp.Kernel, size: Sequence[int], inputs: list[Any], make: Callable[[], wp.Launch]
     ) -> None:
-        """Launch `kernel` on items and blocks of `size` for `part`; `make` gives the command that does it."""
+        """Launch `kernel` on items and blocks of `size` for `part`; `make` returns the command."""
 
 
 class Launcher:
-    """Launches on one device; remembers which kernels and modules were used and how often.
+    """Launcher of one device that counts launches per kernel and module.
 
     Attributes:
-        recorder: does the launches, if set; they are not counted then.
-        label: the part that launches belong to. parts: those there are: `PARTS`, and what terms add.
-        rare_launches: those that only a hard step does; they are not among `launches`.
+        recorder: executes the launches if set; they are then not counted.
+        label: current part. parts: `PARTS` and those added by terms.
+        rare_launches: launches in rarely taken branches, not counted in `launches`.
     """
 
     def __init__(self, device: Any) -> None:
@@ -63,19 +63,19 @@ class Launcher:
         self.parts = dict(PARTS)
 
     def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
-        """Launch one thread per item of `dim`; an empty launch is left out."""
+        """Launch one thread per item of `dim`; empty launches are skipped."""
         if min([dim] if isinstance(dim, int) else dim) == 0:
             return
         self._do(wp.launch, kernel, [dim] if isinstance(dim, int) else dim, inputs, block_dim)
 
     def lanes(self, per_row: int) -> int:
-        """Lanes that share a row with so many entries: a power of two; one on the CPU."""
+        """Lanes that share a row of the given number of entries: a power of two; one on the CPU."""
         if not self.device.is_cuda:
             return 1
         return min(WARP, 1 << max(0, max(per_row, 1).bit_length() - 1))
 
     def padded(self, threads: int) -> int:
-        """Threads in whole warps, as sums over lanes want."""
+        """Threads rounded up to whole warps, for sums over lanes."""
         return -(-threads // WARP) * WARP if self.device.is_cuda else threads
 
     def tiled(self, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
@@ -84,7 +84,7 @@ class Launcher:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Launches within belong to part `name`; the innermost counts."""
+        """Context: launches within belong to part `name`; the innermost counts."""
         if name not in self.parts:
             raise ModelError(f"part {name!r} is unknown; there are {', '.join(self.parts)}, and `parts` of terms")
         outer, self.label = self.label, name
@@ -95,7 +95,7 @@ class Launcher:
 
     @contextmanager
     def rare(self) -> Iterator[None]:
-        """Launches within are for hard steps alone: a condition on the device leads to them."""
+        """Context for launches inside a rarely taken device branch (not counted)."""
         outer, self.rarely = self.rarely, True
         try:
             yield
@@ -110,7 +110,7 @@ class Launcher:
             self.recorder(self.label, kernel, (*dim, block_dim), inputs, functools.partial(do, record_cmd=True))
             return
         self._count(kernel)
-        with quiet_warp():  # a module that no Simulation has loaded is loaded now
+        with quiet_warp():  # load a module that no Simulation has loaded yet
             do()
 
     def _count(self, kernel: wp.Kernel) -> None:
@@ -123,12 +123,12 @@ class Launcher:
 
 
 def kernel_name(kernel: wp.Kernel) -> str:
-    """module.kernel for reading."""
+    """Readable name module.kernel."""
     return f"{kernel.module.name.removeprefix('warpfea.kernels.')}.{kernel.key.rsplit('__locals__', 1)[-1]}"
 
 
 def labelled(name: str) -> Callable[[Callable[Concatenate[S, P], R]], Callable[Concatenate[S, P], R]]:
-    """Marks a method of an object with a `launch`: its launches belong to part `name`, see `PARTS`."""
+    """Decorator: attribute a method's launches to profile part `name`, see `PARTS`."""
 
     def mark(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
         @functools.wraps(method)

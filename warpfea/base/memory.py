@@ -1,4 +1,4 @@
-"""Device memory that does not suffice, as one error that says how much was asked for and what to do."""
+"""Out-of-memory errors with the requested size and remedies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _REFUSED = re.compile(r"Failed to allocate (?:(\d+) bytes|memory)|out of memory"
 
 @contextmanager
 def enough_memory(what: str, device: Any) -> Iterator[None]:
-    """Turn a refused allocation within, on a Warp device or on the host, into a CapacityError about `what`."""
+    """Convert a failed allocation within, on a Warp device or the host, to a CapacityError about `what`."""
     try:
         yield
     except MemoryError as error:
@@ -27,8 +27,8 @@ def enough_memory(what: str, device: Any) -> Iterator[None]:
         if found is None:
             raise
         count = int(found[1]) if found[1] else 0
-        asked = f"another {count} bytes ({size(count)})" if count else "what it needs"
-        text = f"{what}: device {device} has no room for {asked}{_room(device)}{REMEDY}"
+        asked = f": {count} bytes ({size(count)}) requested" if count else ""
+        text = f"{what}: out of memory on {device}{asked}{_room(device)}{REMEDY}"
         raise CapacityError(text, bytes=count) from error
 
 
@@ -36,7 +36,7 @@ REMEDY = "; take fewer worlds, a coarser mesh, dtype='float32' or a device with 
 
 
 def _room(device: Any) -> str:
-    """How much of a GPU's memory is free."""
+    """Free and total memory of a GPU as text."""
     if not getattr(device, "is_cuda", False):
         return ""
-    return f": {size(device.free_memory)} of {size(device.total_memory)} are free"
+    return f", {size(device.free_memory)} of {size(device.total_memory)} are free"

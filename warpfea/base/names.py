@@ -1,4 +1,4 @@
-"""Names that a user misspells: what was likely meant."""
+"""Suggestions for misspelled names."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Iterable
 __all__ = ["did_you_mean", "listing"]
 
 CUTOFF = 0.6
-"""Similarity, 0 to 1, from which a known name is offered."""
+"""Similarity, 0 to 1, from which a known name is suggested."""
 SHORT, SHORT_CUTOFF = 5, 0.75
-"""Length up to which a name is short, and its cutoff: a letter in common says less of it."""
+"""Maximum length of a short name, and its cutoff: one common letter is weaker evidence."""
 
 
 SYNONYMS = {
@@ -24,14 +24,14 @@ SYNONYMS = {
     **dict.fromkeys(("newmark", "hht"), "generalized_alpha"),
     **dict.fromkeys(("euler", "implicit_euler"), "backward_euler"),
 }
-"""Other words for names that are used here."""
+"""Synonyms of names used here."""
 
 
 def did_you_mean(name: object, known: Iterable[object]) -> str:
-    """The text "; did you mean 'x'?" with the known name closest to `name`, or nothing where none is close.
+    """The text "; did you mean 'x'?" with the known name closest to `name`, or "" if none is close.
 
-    Upper and lower case, and hyphens for underscores, count as the same; hyphens in front don't count. A short name is
-    also close to one with its letters in another order; other words for a name of `SYNONYMS` mean it.
+    Case, hyphens for underscores and leading hyphens are ignored. A short name also matches a permutation of its
+    letters, and synonyms (`SYNONYMS`) match their name.
     """
     wanted = _plain(str(name))
     plain: dict[str, str] = {}
@@ -45,7 +45,7 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
 
 
 def listing(known: Iterable[object]) -> str:
-    """The names in quotes with commas, or "none"."""
+    """Quoted names separated by commas, or "none"."""
     return ", ".join(repr(str(name)) for name in known) or "none"
 
 

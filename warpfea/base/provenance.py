@@ -1,4 +1,4 @@
-"""Where numbers come from: versions, machine, commit."""
+"""Provenance of results: versions, machine, commit."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ __all__ = ["commit", "machine", "origin", "versions"]
 
 
 def origin(words: Sequence[str], device: Any) -> dict[str, Any]:
-    """What a result file says of where its numbers come from: command, commit, machine and versions.
+    """Provenance of a result file: command, commit, machine and versions.
 
     Args:
-        words: of the command line, without "warpfea".
-        device: that was used; None for the preferred one.
+        words: words of the command line, without "warpfea".
+        device: device used; None for the preferred one.
     """
     return {
         "command": shlex.join(["warpfea", *words]),
@@ -34,7 +34,7 @@ def origin(words: Sequence[str], device: Any) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what made the numbers."""
+    """Versions of the software."""
     import scipy
 
     from .version import __version__
@@ -49,7 +49,7 @@ def versions() -> dict[str, str]:
 
 
 def machine(device: Any) -> dict[str, Any]:
-    """The computer: processor, its cores, and the device that was used."""
+    """The computer: processor, cores and device used."""
     used = wp.get_device(device) if device else wp.get_preferred_device()
     out = {"cpu": cpu_name(), "cores": os.cpu_count(), "system": platform.system(), "device": str(used)}
     if used.is_cuda:
@@ -58,7 +58,7 @@ def machine(device: Any) -> dict[str, Any]:
 
 
 def cpu_name() -> str:
-    """Name of the processor."""
+    """Processor name."""
     if sys.platform == "linux":
         for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -68,18 +68,18 @@ def cpu_name() -> str:
 
 @functools.cache
 def commit() -> str | None:
-    """Commit of the checkout that this runs from, with + if files differ; None without git or outside a checkout.
+    """Commit of this checkout, with + if files differ; None without git or outside a checkout.
 
-    Asked once, before results are written into the checkout.
+    Evaluated once, before results are written into the checkout.
     """
     root = pathlib.Path(__file__).resolve().parents[2]
 
     def ask(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
 
-    if not (root / "pyproject.toml").is_file():  # installed: a repository around it is another's
+    if not (root / "pyproject.toml").is_file():  # installed: a surrounding repository is unrelated
         return os.environ.get("WARPFEA_COMMIT")
     try:
         return ask("rev-parse", "HEAD") + ("+" if ask("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):
-        return os.environ.get("WARPFEA_COMMIT")  # a copy without its history is told which commit it is
+        return os.environ.get("WARPFEA_COMMIT")  # the commit is passed to a copy without history

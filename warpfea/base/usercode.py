@@ -1,4 +1,4 @@
-"""Code that a user wrote: what goes wrong there is told with its file and line."""
+"""Errors in user code, reported with file and line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["user_code"]
 
 @contextmanager
 def user_code(what: str) -> Iterator[None]:
-    """Turn an error of the code within into a ModelError about `what`; those of warpfea pass."""
+    """Convert an error of the user code within to a ModelError about `what`; errors of warpfea pass."""
     try:
         yield
     except (Error, NotImplementedError):

@@ -1,4 +1,4 @@
-"""Numbers that may differ between worlds, as users give them."""
+"""Parsing of per-world values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["chosen_worlds", "on_host", "per_world", "refuse"]
 
 
 def on_host(values: Any) -> np.ndarray:
-    """Values of the host or of a device, of Warp or of what shares its memory. TypeError, ValueError: neither."""
+    """Array on the host or a device (Warp, or shared memory of another library). TypeError, ValueError for others."""
     if isinstance(values, wp.array):
         values = values.numpy()
     elif hasattr(values, "detach"):  # of PyTorch
@@ -24,10 +24,10 @@ def on_host(values: Any) -> np.ndarray:
 
 
 def chosen_worlds(what: str, mask: Any, worlds: int) -> np.ndarray:
-    """(worlds,) which worlds a mask, or some of their numbers, mean, by default all.
+    """(worlds,) flags from a mask or world indices; default all.
 
     Raises:
-        ModelError: neither, or whole numbers that may be either.
+        ModelError: neither, or ambiguous whole numbers.
     """
     if mask is None:
         return np.ones(worlds, dtype=bool)
@@ -42,21 +42,21 @@ def chosen_worlds(what: str, mask: Any, worlds: int) -> np.ndarray:
     numbers = known and out.dtype.kind != "b" and out.ndim < 2 and bool(np.isin(out, range(worlds)).all())
     numbers = numbers and len(set(out.ravel().tolist())) == out.size
     chosen = np.isin(np.arange(worlds), out) if numbers else np.zeros(worlds, dtype=bool)
-    if flags and not numbers:  # whole numbers, one of them twice
+    if flags and not numbers:  # whole numbers, one of them repeated
         return out.astype(bool)
-    if numbers and (out.size < worlds or worlds > 3):  # of up to three worlds all numbers may be flags or statuses
+    if numbers and (out.size < worlds or worlds > 3):  # for up to three worlds the numbers may be flags or statuses
         return chosen
     if flags:
         one, other = out.astype(bool).tolist(), chosen.tolist()
-        raise ModelError(f"{what}: mask = {mask!r} may be flags of the worlds or their numbers; write {one} or {other}")
+        raise ModelError(f"{what}: mask = {mask!r} is ambiguous (flags or world indices): write {one} or {other}")
     raise ModelError(
-        f"{what}: mask = {mask!r} must be ({worlds},) of True and False, one per world, or the numbers of some of the "
-        f"worlds 0 to {worlds - 1}"
+        f"{what}: mask = {mask!r} must be ({worlds},) of True and False, one per world, or world indices "
+        f"from 0 to {worlds - 1}"
     )
 
 
 def per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ...] = ()) -> np.ndarray:
-    """(worlds, *row) numbers of one value for all worlds, or of one per world. ModelError for another shape."""
+    """(worlds, *row) array of one value for all worlds, or one per world. ModelError for another shape."""
     one, each = f"{row}" if row else "a number", (worlds, *row)
     try:
         out = np.asarray(on_host(values), dtype=float)
@@ -68,6 +68,6 @@ def per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ..
 
 
 def refuse(what: str, name: str, values: np.ndarray, good: np.ndarray, wanted: str) -> None:
-    """Raise ModelError for the first world whose value is not good; `wanted`: what it must be."""
+    """Raise ModelError for the first world with an invalid value; `wanted`: the requirement."""
     for world in np.flatnonzero(~good)[:1]:
         raise ModelError(f"{what}: {name} = {values[world].tolist()!r} in world {world} must be {wanted}")

@@ -1,4 +1,4 @@
-"""Output protocol and safe writing of files: whole or not at all."""
+"""Output protocol and atomic file writing."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["Output", "check_folder", "check_target", "progress_bar", "temporary_
 
 
 class Output:
-    """A writer of results, called by `Simulation.run` as open, write ..., close.
+    """A writer of results, called by `Simulation.run`: open, write ..., close.
 
-    `write` comes once for the initial state and after each accepted step; the writer decides itself whether a
-    frame is due. `close` makes the file valid and is also called after an interrupted run. `abort` drops all
-    that the run wrote and leaves an older target file as it was. A writer may be opened again after either.
+    `write` is called once for the initial state and after each accepted step; the writer decides if a frame is due.
+    `close` completes the file, also after an interrupted run. `abort` discards the output of the run and keeps an
+    older target file. A writer may be reopened after either.
 
     Adaptive steps end where a frame is due: `rate` is frames per simulated second, None without a rate; `moments` are
     single times, s.
@@ -34,7 +34,7 @@ class Output:
         raise NotImplementedError
 
     def write(self, sim: Any) -> None:
-        """Take the present state if a frame is due."""
+        """Write the current state if a frame is due."""
         raise NotImplementedError
 
     def close(self, sim: Any) -> None:
@@ -42,7 +42,7 @@ class Output:
         raise NotImplementedError
 
     def abort(self) -> None:
-        """Remove temporary files; does nothing when not open."""
+        """Remove temporary files; no effect if not open."""
         raise NotImplementedError
 
 
@@ -61,17 +61,17 @@ def check_target(path: str | os.PathLike[str], suffixes: Sequence[str]) -> pathl
 
 
 def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:
-    """OutputError naming `target` unless `folder` exists and can be written."""
+    """OutputError naming `target` unless `folder` exists and is writable."""
     if not folder.is_dir():
         raise OutputError(f"{target}: the folder {folder} does not exist")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"{target}: the folder {folder} is not writable")
     probe = folder / temporary_beside(target).name
-    try:  # a full disk, or a file system that takes no files, shows only so
+    try:  # a full disk or a read-only file system is detected only by writing
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise OutputError(f"{target}: the folder {folder} takes no files ({error.strerror or error})") from error
+        raise OutputError(f"{target}: cannot write to folder {folder} ({error.strerror or error})") from error
 
 
 def temporary_beside(target: pathlib.Path) -> pathlib.Path:
@@ -80,7 +80,7 @@ def temporary_beside(target: pathlib.Path) -> pathlib.Path:
 
 
 def write_whole(target: pathlib.Path, write: Callable[[pathlib.Path], object]) -> None:
-    """Call `write(temporary)` and rename the result to `target`. OutputError for what the system refuses."""
+    """Call `write(temporary)` and rename the result to `target`. OutputError for errors of the system."""
     temporary = temporary_beside(target)
     try:
         write(temporary)
@@ -93,7 +93,7 @@ def write_whole(target: pathlib.Path, write: Callable[[pathlib.Path], object]) -
 
 @contextmanager
 def progress_bar(total: int, label: str, show: bool | None = None) -> Iterator[Callable[[], object]]:
-    """A bar on stderr; yields the function that advances it. `show=None`: only when stderr is a terminal."""
+    """Progress bar on stderr; yields its advance function. `show=None`: only if stderr is a terminal."""
     from tqdm import tqdm  # type: ignore[import-untyped,unused-ignore]
 
     disable = None if show is None else not show

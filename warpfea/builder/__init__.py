@@ -1,1 +1,1 @@
-"""What a user says of a scene, checked as it is said."""
+"""Scene description with immediate validation."""

@@ -1,4 +1,4 @@
-"""Places that joints hold: a handle of a body, or the ground, with the affine motion around it."""
+"""Joint attachment points: position and local deformation gradient of a body or the ground."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ from .checks import vector
 __all__ = ["COINCIDENT", "GROUND", "UNKNOWN", "Attachment", "Ground", "attach"]
 
 COINCIDENT = 1e-9
-"""Distance of places that are one, over the size of their bodies."""
+"""Distance of coincident points, relative to the size of their bodies."""
 FLAT_SURFACE, FLAT_NODES = 1e-2, 1e-3
-"""Variance of places across their plane, over that in it, below which a fit does not tell how its normal turns."""
+"""Variance of points across their plane, over that in it, below which the normal's rotation is undetermined by a
+fit.
+"""
 ACROSS = 0.5
 UNKNOWN = 10.0
 
 
 class Ground:
-    """The world that does not move; `warpfea.GROUND`."""
+    """The fixed ground; `warpfea.GROUND`."""
 
     def __repr__(self) -> str:
         return "GROUND"
@@ -37,15 +39,15 @@ GROUND = Ground()
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """A place on a body, or on the ground, with the affine motion around it: x + F (Y - X).
+    """Attachment point on a body or the ground, with the local affine motion x + F (Y - X).
 
     Attributes:
         body: None for the ground.
         X: (3,) reference position, m.
         slots, weights, gradients: (n,), (n,), (n, 3): x = sum weights e, F = sum e gradients^T.
-        known: (3, 3) projector on the directions n for which F n is known.
-        weak: (3, 3) projector on those that a point holds with almost no stiffness: a beam's axis, a shell's tangents;
-            in part (`ACROSS`) of a solid's face.
+        known: (3, 3) projector on the directions n with known F n.
+        weak: (3, 3) projector on those that a point constrains with almost no stiffness: a beam's axis, a shell's
+            tangents; in part (`ACROSS`) of a solid's face.
         label: for messages.
         child: the joint's child side.
     """
@@ -61,7 +63,7 @@ class Attachment:
     child: bool
 
     def position(self, at: np.ndarray, what: str) -> Vector:
-        """The place of the point that is at `at` (3,) in the reference; off X it is carried along by F."""
+        """Current position x + F (at - X) of the reference point `at` (3,), m."""
         arm = at - self.X
         if self.body is None:
             return constant(at)
@@ -82,26 +84,26 @@ class Attachment:
         lost = np.linalg.norm(n - self.known @ n)
         if lost > 1e-6:
             raise ModelError(
-                f"{what}: {self.label} does not tell how the direction {np.round(n, 6).tolist()} turns; give a "
-                "surface, a material point, or more nodes that span it"
+                f"{what}: {self.label} does not determine the rotation of direction {np.round(n, 6).tolist()}: give "
+                "a surface, a material point, or more nodes"
             )
 
     def weakness(self, n: np.ndarray) -> float:
-        """0 for a direction that the section, director or solid carries, 1 for one that it does not; 10: not known."""
+        """0 for a direction carried by the section, director or solid, 1 for others; 10: not known."""
         if self.body is None:
             return 0.0
         return float(np.linalg.norm(self.weak @ n) + UNKNOWN * (np.linalg.norm(n - self.known @ n) > 1e-6))
 
     @property
     def size(self) -> float:
-        """Diagonal of the body's box, m; 0 of the ground."""
+        """Diagonal of the body's bounding box, m; 0 for the ground."""
         if self.body is None:
             return 0.0
         low, high = self.body.mesh.bounding_box()
         return float(np.linalg.norm(np.asarray(high) - np.asarray(low)))
 
     def same_as(self, other: Attachment) -> bool:
-        """Whether both are the same place of the same body."""
+        """True if both are the same point of the same body."""
         return (
             self.body is not None
             and self.body is other.body
@@ -111,7 +113,7 @@ class Attachment:
 
 
 def attach(thing: Any, what: str, *, child: bool) -> Attachment:
-    """The attachment of a handle, or of a fixed place (3,). ModelError for anything else."""
+    """Attachment of a handle, or of a fixed point (3,). ModelError for anything else."""
     all_known, none_weak = np.eye(3), np.zeros((3, 3))
     if isinstance(thing, Ground):
         return Attachment(None, np.full(3, np.nan), *_none(), all_known, none_weak, "the ground", child)
@@ -138,7 +140,7 @@ def _none() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _weak(body: Discretisation, axes: np.ndarray) -> np.ndarray:
-    """Projector on the axes (columns) that do not belong to a beam's section or a shell's director."""
+    """Projector on the axes (columns) outside a beam's section or a shell's director."""
     if body.family.solid:
         return np.zeros((3, 3))
     columns = axes[:, : 3 - body.family.spin_vectors]
@@ -146,7 +148,7 @@ def _weak(body: Discretisation, axes: np.ndarray) -> np.ndarray:
 
 
 def _fit(weights: np.ndarray, X: np.ndarray, flat: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Affine least-squares fit of points X (n, 3): mean (3,), gradients (n, 3), projector on what they span."""
+    """Affine least-squares fit of points X (n, 3): mean (3,), gradients (n, 3), projector on their span."""
     mean = weights @ X
     arm = X - mean
     C = arm.T @ (weights[:, None] * arm)
@@ -158,7 +160,7 @@ def _fit(weights: np.ndarray, X: np.ndarray, flat: float) -> tuple[np.ndarray, n
 
 
 def _of_nodes(nodes: NodeSet, child: bool) -> Attachment:
-    """Mean of the nodes and the best affine motion of them; directions off their span by their gradient slots."""
+    """Mean of the nodes and their best-fit affine motion; directions off their span by their gradient slots."""
     body = nodes.body
     label = f"nodes {nodes.name!r} of body {body.name!r}" if nodes.name else f"{len(nodes)} nodes of body {body.name!r}"
     position = support_slots(nodes, "position")
@@ -180,7 +182,7 @@ def _of_nodes(nodes: NodeSet, child: bool) -> Attachment:
 
 
 def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
-    """Area mean of a surface; in its plane the best affine motion, across it the mean of F."""
+    """Area mean of a surface; in its plane the best-fit affine motion, across it the mean of F."""
     body = surface.body
     label = f"surface {surface.name!r} of body {body.name!r}" if surface.name else f"a surface of body {body.name!r}"
     t = assembly.facet_tables(surface)
@@ -204,7 +206,7 @@ def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
             h = np.einsum("fq,fqsk->fsk", dA[rows] / dA.sum(), assembly.gradients(ds, J)) @ rest
             np.add.at(gradients, body.connectivity[members], h)
             weak = rest @ _weak(body, assembly.orthonormal(J[0, 0])) @ rest
-        if body.family.solid:  # the mean of F across a face feels the strain at it, the fit in its plane does not
+        if body.family.solid:  # the mean of F normal to a face includes the local strain; the in-plane fit does not
             weak = ACROSS * rest
     slots = np.flatnonzero((weights != 0.0) | gradients.any(axis=1))
     return Attachment(body, mean, slots, weights[slots], gradients[slots], np.eye(3), weak, label, child)

@@ -18,19 +18,19 @@ from ..mesh import Mesh
 __all__ = ["beam_geometry", "spline"]
 
 CORNER = math.radians(1.0)
-"""A polyline that bends by more than this has a corner."""
+"""Bend of a polyline, degrees, above which it has a corner."""
 KINK = 5.0
-"""Degrees that a curve given as a function may turn by at a point."""
+"""Maximum direction jump, degrees, of a curve given as a function."""
 STEPS = 32
-"""Steps of the differences per element."""
+"""Difference steps per element."""
 FORWARD = np.array([-147.0, 360.0, -450.0, 400.0, -225.0, 72.0, -10.0]) / 60.0
 """Weights of f(0), f(h), ..., f(6 h) in h f'(0), of sixth order."""
 SMOOTH = 1e-4
-"""Relative difference of the derivatives on both sides of a node that counts as rounding."""
+"""Relative difference of the one-sided derivatives at a node that counts as rounding."""
 CHORDS = 8
-"""Chords per element, whose angles show how far it turns."""
+"""Chords per element, for its total turning angle."""
 HALVINGS = 16
-"""Halvings of a part of the curve in the search for a corner."""
+"""Interval halvings in the search for a corner."""
 
 
 def spline(points: Any, *, closed: bool = False) -> Callable[[float], np.ndarray]:
@@ -59,13 +59,13 @@ def spline(points: Any, *, closed: bool = False) -> Callable[[float], np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class _Path:
-    """A curve by its parameter s in [0, 1]: place and derivative on one side, and where elements may end.
+    """Curve of a parameter s in [0, 1]: position, one-sided derivative, and admissible element ends.
 
     Attributes:
         at: s -> (3,) m.
         slope: (s, side) -> dX/ds (3,), side -1 or 1.
-        marks: parameters of corners, which must be nodes.
-        turns: angles (degrees) that the elements turn by, summed along each, where ends alone don't tell.
+        marks: parameters of corners (nodes there).
+        turns: total turning angle of each element, degrees, if not determined by its ends.
     """
 
     at: Callable[[float], np.ndarray]
@@ -140,17 +140,17 @@ def _refuse_corner(name: str, angle: float, s: float) -> None:
 
 
 def _angles(lines: np.ndarray) -> np.ndarray:
-    """Angles (degrees) between successive vectors (n, 3), (n - 1,); 0 beside a vector of length 0."""
+    """Angles (degrees) between successive vectors (n, 3), (n - 1,); 0 next to a zero vector."""
     a, b = lines[:-1], lines[1:]
     across = np.linalg.norm(np.cross(a, b), axis=1)
     return np.degrees(np.arctan2(across, np.sum(a * b, axis=1)))
 
 
 def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal: Any) -> np.ndarray:
-    """(3, 3) columns: tangent (as it is), width and height vectors."""
+    """(3, 3) columns: tangent (unscaled), width and height vectors."""
     length = float(np.linalg.norm(tangent))
     if not (math.isfinite(length) and length > 0.0):
-        raise ModelError(f"body {name!r}: the curve stands still or is not finite at s = {s:.4g}")
+        raise ModelError(f"body {name!r}: the curve has a zero or non-finite tangent at s = {s:.4g}")
     t = tangent / length
     try:
         up = np.asarray(normal(s) if callable(normal) else normal, dtype=float)
@@ -169,7 +169,7 @@ def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal:
 
 
 def _parameters(name: str, elements: int, marks: tuple[float, ...]) -> np.ndarray:
-    """Node parameters, evenly spread between marks, which are nodes."""
+    """Node parameters, evenly spaced between marks, which are nodes."""
     if not marks:
         return np.linspace(0.0, 1.0, elements + 1)
     edges = np.array([0.0, *marks, 1.0])
@@ -218,11 +218,11 @@ def _path(name: str, curve: Any, elements: int, corners: str) -> _Path:
 
 
 def _function_path(name: str, curve: Callable[[float], Any], elements: int) -> _Path:
-    """A smooth curve. The derivative at the end of an element is taken from points within the element.
+    """Smooth curve. The derivative at an element's end is taken from points within the element.
 
-    So it holds for any number of turns and up to the joints of arcs and lines, and the function is asked in [0, 1]
-    only. Neighbours share the mean of theirs, so that their sections coincide, but where the curve bends or its speed
-    jumps.
+    It is therefore valid for any number of turns and at junctions of arcs and lines; the function is evaluated in
+    [0, 1] only. Neighbours share the mean derivative, so that their sections coincide, except at bends and jumps of
+    the speed.
     """
 
     def at(s: float) -> np.ndarray:
@@ -256,10 +256,10 @@ def _function_path(name: str, curve: Callable[[float], Any], elements: int) -> _
 
 
 def _turns(name: str, at: Callable[[float], np.ndarray], elements: int) -> np.ndarray:
-    """Angles (degrees) between the chords within each element, summed. ModelError for a corner of the curve."""
+    """Turning angles (degrees) of the chords within each element, summed. ModelError for a corner of the curve."""
     grid = np.linspace(0.0, 1.0, CHORDS * elements + 1)
     turns = _angles(np.diff([at(s) for s in grid], axis=0))
-    pairs = turns + np.append(turns[1:], 0.0)  # a corner between two points of the grid is shared by both
+    pairs = turns + np.append(turns[1:], 0.0)  # a corner between two points of the grid is split between both
     for k in np.flatnonzero(pairs > 2.0 * KINK):
         low, high = grid[k], grid[min(int(k) + 3, CHORDS * elements)]
         angle, where = _closest_turn(at, low, high)
@@ -270,9 +270,9 @@ def _turns(name: str, at: Callable[[float], np.ndarray], elements: int) -> np.nd
 
 
 def _closest_turn(at: Callable[[float], np.ndarray], low: float, high: float) -> tuple[float, float]:
-    """Angle (degrees) by which a curve turns where it does so fastest, in an ever shorter part, and where that is.
+    """Largest direction change (degrees) of a curve under interval refinement, and its parameter.
 
-    That of a smooth curve goes to 0 with the length, that of a corner does not.
+    It tends to 0 with the interval for a smooth curve, not for a corner.
     """
     for _ in range(HALVINGS):
         s = np.linspace(low, high, 5)

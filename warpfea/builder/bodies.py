@@ -1,4 +1,4 @@
-"""Bodies from meshes, materials and options, and the names they get."""
+"""Bodies from meshes, materials and options; unique names."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from .solids import solid_geometry
 __all__ = ["MeshLike", "as_mesh", "make_solid", "make_structure", "unused_name"]
 
 MeshLike = str | pathlib.Path | Mesh | Any
-"""A file, a Mesh, or a meshio.Mesh, which this package does not import."""
+"""File, Mesh or meshio.Mesh (not imported here)."""
 
 
 def as_mesh(mesh: MeshLike, what: str, scale: float, transform: Any) -> Mesh:
-    """A checked mesh, m, of a file, a Mesh or a meshio.Mesh. ModelError for anything else, MeshError for a bad mesh."""
+    """Checked mesh, m, from a file, a Mesh or a meshio.Mesh. ModelError for anything else, MeshError for a bad mesh."""
     if isinstance(mesh, (str, pathlib.Path)):
         return meshes.read(mesh, scale=scale, transform=transform)
     if meshes.is_meshio(mesh):
@@ -84,10 +84,10 @@ def make_structure(
 
 
 def unused_name(name: Any, default: str, taken: set[str], what: str) -> str:
-    """The name a user gave, or a new one from `default`; `what`: "body" or "joint".
+    """The given name, or a new one from `default`; `what`: "body" or "joint".
 
     Raises:
-        ModelError: the name is no text, or used already.
+        ModelError: the name is not text, or already used.
     """
     if name is None:
         k = 1

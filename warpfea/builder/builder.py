@@ -1,4 +1,4 @@
-"""ModelBuilder: what a user says of a scene, checked as it is said."""
+"""ModelBuilder: scene description with immediate validation."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ __all__ = ["ModelBuilder"]
 
 
 class ModelBuilder:
-    """Collects bodies, supports and loads; `finalize` makes a Model of them.
+    """Collects bodies, supports and loads; `finalize` makes a Model.
 
     Args:
-        gravity: (3,) m/s^2, or a time law of it; in statics a law is taken at the part of the load, 0 to 1.
+        gravity: (3,) m/s^2, or a time law of it; in statics a law is evaluated at the load factor, 0 to 1.
         up_axis: "Z" or "Y", for outputs.
 
     Raises:
@@ -73,20 +73,20 @@ class ModelBuilder:
         Args:
             mesh: file (Gmsh .msh, .vtu, Abaqus .inp), Mesh or meshio.Mesh, m after `scale`.
             material: one law, or laws by element group of the mesh.
-            element: "T4" or "T10", by default as the cells are; "ENMC", "FN" or "FN18", the ANCF tetrahedra, on
-                tetrahedra (of T10 cells the corner nodes stay, numbered anew; ENMC keeps the curved shape); "H3843",
+            element: "T4" or "T10", by default that of the cells; "ENMC", "FN" or "FN18", the ANCF tetrahedra, on
+                tetrahedra (of T10 cells the corner nodes, renumbered; ENMC keeps the curved shape); "H3843",
                 the ANCF brick, on hexahedra.
             quadrature: name of the force rule of all elements; T10: "tet4", "tet5_paper", "tet8", "tet14"; T4: "tet1",
                 "tet4"; ENMC, FN, FN18: "tet14", "conical4"; H3843: "3x3x3", "4x4x4". By default T10 takes "tet4" where
                 straight and "tet8" where curved, T4 "tet1", the others their first.
             scale: factor on the coordinates of the file.
             transform: (4, 4) matrix, or (rotation (3, 3), translation (3,)), applied after `scale`.
-            initial: initial positions, a function X (nodes, 3) -> (nodes, 3) or, for T4 and T10, (nodes, 3) in m, where
-                they differ from the stress-free reference.
+            initial: initial positions, a function X (nodes, 3) -> (nodes, 3) or, for T4 and T10, (nodes, 3) in m, if
+                different from the stress-free reference.
             name: unique name; by default the mesh's.
 
         Raises:
-            MeshError: the file or mesh can't be used.
+            MeshError: unusable file or mesh.
             ModelError: unknown group or rule, elements without material, a name used twice.
         """
         mesh = as_mesh(mesh, "add_solid", scale, transform)
@@ -112,7 +112,7 @@ class ModelBuilder:
                 warpfea.elements.ancf_beam.
             corners: "error", or "weld": a rigid corner, where both sides share the deformation gradient (Shabana and
                 Mikkola 2003).
-            initial: initial positions, a function X (n, 3) -> (n, 3), where they differ from the stress-free reference.
+            initial: initial positions, a function X (n, 3) -> (n, 3), if different from the stress-free reference.
             name: unique name.
 
         Raises:
@@ -130,22 +130,22 @@ class ModelBuilder:
         """Add a shell of ANCF 3443 elements on the mid-surface of quads.
 
         Args:
-            mesh: file, Mesh or meshio.Mesh of quads, such as wf.mesh.grid; the director points where the quads turn
-                left-handed about it, (X_1 - X_0) x (X_3 - X_0).
+            mesh: file, Mesh or meshio.Mesh of quads, such as wf.mesh.grid; the director points to the side from
+                which the quads are clockwise, (X_1 - X_0) x (X_3 - X_0).
             thickness: m.
             material: one law, or laws by element group of the mesh.
             integration: "tied" (default with SVK; remedies against thickness and shear locking, and the shear factor
                 5/6), or "full" (4x4x2 points of the full law, as Paper I; default with the other laws); see
                 warpfea.elements.ancf_shell.
-            normals: directors at the nodes, (nodes, 3) or a function X (n, 3) -> (n, 3), of a curved surface known
-                better than by its quads; by default the mean of the quads' normals.
-            corners: "error" where normals differ by more than 30 degrees, or "weld": a rigid corner.
+            normals: directors at the nodes, (nodes, 3) or a function X (n, 3) -> (n, 3), more accurate than the
+                quads of a curved surface; by default the mean of the quads' normals.
+            corners: "error" if normals differ by more than 30 degrees, or "weld": a rigid corner.
             scale, transform: as for add_solid.
-            initial: initial positions, a function X (n, 3) -> (n, 3), where they differ from the stress-free reference.
+            initial: initial positions, a function X (n, 3) -> (n, 3), if different from the stress-free reference.
             name: unique name; by default the mesh's.
 
         Raises:
-            MeshError: the file or mesh can't be used.
+            MeshError: unusable file or mesh.
             ModelError: a mesh that is not of quads, a corner, or an option out of range.
         """
         mesh = as_mesh(mesh, "add_shell", scale, transform)
@@ -165,16 +165,16 @@ class ModelBuilder:
     # supports
 
     def clamp(self, nodes: NodeSet, *, slots: str = "all", components: str = "xyz") -> None:
-        """Hold nodes at their initial place.
+        """Clamp nodes at their initial positions.
 
         Args:
-            nodes: what to hold.
+            nodes: nodes to clamp.
             slots: "all" (built in), or "position" (pinned), "position+axis", or other names joined by "+": "axis" and
                 "section" of beams, "surface" and "director" of shells, "gradients" of ANCF solids, or one of them,
                 "gradient-x", "gradient-y", "gradient-z". Holding the gradient along the axis at a built-in end adds a
                 little stiffness; "position+section" does not. On a plane wall of an ANCF solid hold the positions and
                 the gradients along the wall.
-            components: which of "xyz" to hold, global axes.
+            components: letters of "xyz" to clamp, global axes.
 
         Raises:
             ModelError: an unknown name of slots or components, or nodes of another builder.
@@ -186,16 +186,16 @@ class ModelBuilder:
         self, nodes: NodeSet, *, displacement: Any = None, rotation: Rotation | None = None, components: str = "xyz",
         slots: str | None = None,
     ) -> None:  # fmt: skip
-        """Move nodes on a prescribed path.
+        """Prescribe the motion of nodes.
 
         Args:
-            nodes: what to move.
+            nodes: nodes to move.
             displacement: time law of the displacement from the reference (3,), m, or (times (n,), values
                 (n, nodes, 3)).
             rotation: Rotation about an axis, from the reference.
-            components: which of "xyz" are prescribed.
-            slots: as for clamp; by default "all" with a rotation, which turns gradients too, and "position" with a
-                displacement, which holds gradients that are named.
+            components: prescribed letters of "xyz".
+            slots: as for clamp; by default "all" with a rotation, which rotates gradients too, and "position" with a
+                displacement, which clamps the named gradients.
 
         Raises:
             ModelError: neither or both of displacement and rotation, or a wrong shape.
@@ -213,11 +213,11 @@ class ModelBuilder:
     def add_moment(self, point: MaterialPoint | NodeSet, moment: Any) -> None:
         """A moment about fixed directions (time law (3,), N m), at a material point or shared equally by nodes.
 
-        It does the work m . omega on the spin of the section (beams), of the director (shells; the part of the moment
+        It is work-conjugate to the spin of the section (beams), of the director (shells; the part of the moment
         along the director does nothing), or of the deformation gradient (ANCF solids, and any solid at a point).
 
         Raises:
-            ModelError: nodes without gradients to turn (T4, T10).
+            ModelError: nodes without gradient slots (T4, T10).
         """
         body = self._own(point, "add_moment", MaterialPoint, NodeSet)
         self.description.moments.append(loads.spin_moment(body, point, moment))
@@ -237,7 +237,7 @@ class ModelBuilder:
 
         Args:
             field: wp.func (x: vec3, t: scalar) -> vec3, in the model's precision or in float32 or float64 as annotated.
-            bodies: bodies it acts on; by default all that were added so far.
+            bodies: bodies it acts on; by default all added so far.
         """
         loads.check_field(field)
         chosen = list(self.bodies if bodies is None else bodies)
@@ -259,7 +259,7 @@ class ModelBuilder:
         loads.set_initial_state(body, velocity, angular_velocity, displacement)
 
     def add_probe(self, name: str, where: MaterialPoint | SurfaceSet | NodeSet) -> None:
-        """Record a point at every step; of a surface its area mean, of nodes their mean."""
+        """Record a point at every step: area mean of a surface, mean of nodes."""
         body = self._own(where, "add_probe", MaterialPoint, SurfaceSet, NodeSet)
         if any(p.name == name for p in self.description.probes):
             raise ModelError(f"probe {name!r} is there already")
@@ -271,20 +271,21 @@ class ModelBuilder:
         self, kind: str, *, parent: Any, child: Any, anchor: Any = None, axis: Any = None, axis2: Any = None,
         drive: Any = None, name: str | None = None,
     ) -> Joint:  # fmt: skip
-        """Tie two bodies, or a body and the ground, by a joint.
+        """Connect two bodies, or a body and the ground, by a joint.
 
         Args:
             kind: "spherical", "universal", "revolute", "cylindrical", "translational", "fixed", or "distance" (a rod of
                 constant length between two points).
-            parent, child: wf.GROUND, a material point (body.at), nodes (body.nodes, beam.end), or a surface, whose mean
-                place and turn count. A joint turns a solid best by a surface or several nodes: at a point of a solid
-                the stress is singular, and the joint the softer the finer the mesh.
-            anchor: (3,) m, where the joint is in the reference; by default where the child's handle is. Of a distance
+            parent, child: wf.GROUND, a material point (body.at), nodes (body.nodes, beam.end), or a surface,
+                represented by its mean position and rotation. Attach rotational joints of solids to a surface or
+                several nodes: at a single point the stress is singular, and the joint softens as the mesh is
+                refined.
+            anchor: (3,) m, joint position in the reference; by default that of the child's handle. For a distance
                 joint with the ground: the rod's end there.
             axis: (3,) of the hinge or the slide, or the parent's axis of a universal joint.
             axis2: the child's axis of a universal joint, perpendicular to `axis`; by default any such.
-            drive: time law: angle (rad) of a revolute joint, the child against the parent, right-handed about the axis
-                and of any number of turns; travel (m) of a translational joint, the child along the axis; length (m) of
+            drive: time law: angle (rad) of a revolute joint, child relative to parent, right-handed about the axis,
+                any number of turns; travel (m) of a translational joint, the child along the axis; length (m) of
                 a distance joint. Angle and travel are 0 in the reference.
             name: unique name.
 
@@ -292,8 +293,8 @@ class ModelBuilder:
             Joint: the handle for sim.joint_force, sim.violation, sim.joint_record.
 
         Raises:
-            ModelError: an unknown kind, handles that are apart without an anchor, points of a rod that coincide, a
-                handle that does not tell how a direction turns, or an argument that does not belong to the kind.
+            ModelError: an unknown kind, distant handles without an anchor, coincident points of a rod, a handle that
+                does not determine a direction's rotation, or an argument of another kind.
         """
         name = self._joint_name(name, str(kind))
         for side, thing in (("parent", parent), ("child", child)):
@@ -312,8 +313,8 @@ class ModelBuilder:
             name: unique name.
 
         Raises:
-            ModelError: an unknown kind, a wrong number of points, points that coincide where a direction is needed, or
-                pinned points that are apart.
+            ModelError: an unknown kind, a wrong number of points, coincident points that define a direction, or
+                pinned points apart.
         """
         name = self._joint_name(name, str(kind))
         for k, point in enumerate(points if isinstance(points, (tuple, list)) else ()):
@@ -322,19 +323,19 @@ class ModelBuilder:
         return self._join(make_constraint(kind, points, value, name))
 
     def weld(self, first: NodeSet | SurfaceSet, second: SurfaceSet | Body, *, name: str | None = None) -> Joint:
-        """Tie a face to another body that it lies in, whatever the families: beam to solid, shell to solid, ...
+        """Tie a face to another body that contains it, of any element families: beam to solid, shell to solid, ...
 
-        The gap between both vanishes in the mean with each shape function of the first face (a mortar tie): nothing is
-        asked of the first body's section but what it can do. The first should be the coarser side.
+        Mortar tie: int phi_i (x - x_second) dA = 0 for each shape function phi_i of the first face, so that only its
+        own section deformations are constrained. The first should be the coarser side.
 
         Args:
             first: a surface; beam.start, beam.end or a named edge of a shell (plate.edge) stand for their faces. Other
                 nodes are pinned one by one.
-            second: the body, or a surface of it, that holds the first.
+            second: the body, or a surface of it, that contains the first.
             name: unique name.
 
         Raises:
-            ModelError: a point of the first face that lies outside of the second body, or both are one body.
+            ModelError: a point of the first face outside the second body, or one body twice.
         """
         name = self._joint_name(name, "weld")
         self._own(first, f"weld {name!r}", NodeSet, SurfaceSet)
@@ -351,15 +352,15 @@ class ModelBuilder:
     # contact
 
     def add_collider(self, shape: Shape, path: Any = None, name: str | None = None) -> Collider:
-        """Add a rigid obstacle, which bodies feel where `add_contact` says so.
+        """Add a rigid obstacle; it acts on bodies through `add_contact`.
 
         Args:
-            shape: HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh, where it is at displacement 0.
+            shape: HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh, placed at displacement 0.
             path: time law of its displacement (3,), m, or a Rotation; None: it is fixed.
             name: unique name; by default the shape's.
 
         Raises:
-            ModelError: no shape, a path that is not finite, or a name used twice.
+            ModelError: not a shape, a non-finite path, or a name used twice.
         """
         collider = make_collider(self.description, shape, path, name)
         self.description.colliders.append(collider)
@@ -372,10 +373,10 @@ class ModelBuilder:
         points: int | None = None, smoothing: Any = None, overlap: str = "refuse", overlap_time: float = 0.1,
         name: str | None = None,
     ) -> Contact | PairContact:  # fmt: skip
-        """Let a body, or a surface of it, touch a collider or another body.
+        """Define contact of a body, or a surface of it, with a collider or another body.
 
         Args:
-            surface: the outer faces that may touch; of a body all.
+            surface: outer faces; of a body all.
             collider: as `add_collider` returned it; or another body, or a surface of it.
             mu, mu_static: coefficients of friction in slip, and in stick if it is larger.
             restitution: speed after an impact over that before, 0 < restitution <= 1.
@@ -383,15 +384,15 @@ class ModelBuilder:
             treatment: "implicit", or "explicit" with the paper's law.
             stiffness: factor on the normal and the tangential stiffness; None: 1.
             model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
-            radius: m; "patch": of the disc whose area counts instead of the surface's; "sphere": of the body there.
+            radius: m; "patch": disc whose area replaces the surface's; "sphere": local radius of the body.
             offset: gap at which contact begins, m.
             points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4, between bodies 16.
             smoothing: "paper": depth over which its damping is ramped in, m; "smooth": (eps in N, v_eps in m/s).
-            overlap: of bodies that overlap at the start: "refuse", or "offset": stored, it decays in `overlap_time`, s
-                (statics: part of the load).
+            overlap: initial overlap: "refuse", or "offset": stored and decaying in `overlap_time`, s (statics: load
+                factor).
             name: unique name; by default "BODY on COLLIDER".
 
-        Bodies that no contact names pass through each other. Between two, forces of reports are those on the first.
+        Bodies without a contact pass through each other. Between two, reported forces act on the first.
 
         Returns:
             Contact, PairContact: the handle for reports.
@@ -409,12 +410,12 @@ class ModelBuilder:
         return add_contact(self.description, surface, collider, name, **options)
 
     def finalize(self, *, device: Any = None, dtype: str = "float64", worlds: int = 1) -> Model:
-        """Make the constant Model of what was described so far; what is added later is for the next `finalize`.
+        """Make the constant Model of the description; later additions apply to the next `finalize`.
 
         Args:
-            device: Warp device, e.g. "cpu" or "cuda:0"; by default CUDA where there is one, else the CPU.
+            device: Warp device, e.g. "cpu" or "cuda:0"; by default CUDA if available, else the CPU.
             dtype: "float64" or "float32".
-            worlds: copies of the scene that are simulated side by side.
+            worlds: number of independent copies of the scene.
 
         Raises:
             ModelError: no bodies, unknown device or precision, or gravity or a body force on a body whose material has
@@ -422,8 +423,8 @@ class ModelBuilder:
             CapacityError: the device has too little memory.
 
         Warns:
-            ModelWarning: a size, mass, density or E that a wrong unit is likely to have made (MeshWarning the first
-                three), or a nu at which solids lock.
+            ModelWarning: a size, mass, density or E that suggests a wrong unit (MeshWarning: first three), or a nu
+                with volumetric locking.
         """
         check_densities(self.gravity, self.description)
         with quiet_warp():
@@ -432,10 +433,10 @@ class ModelBuilder:
         return model
 
     def add_term(self, make: Callable[[Model], Term | None]) -> None:
-        """Add a term of one's own to the residual: a function of the Model that returns a Term, or None for nothing.
+        """Add a user-defined term to the residual: a function of the Model returning a Term, or None.
 
         Raises:
-            ModelError: `make` can't be called.
+            ModelError: `make` is not callable.
         """
         if not callable(make):
             raise ModelError(f"add_term: expected a function or class that takes the Model, got {make!r}")
@@ -446,5 +447,5 @@ class ModelBuilder:
         return TermSet(model, self._terms), Evaluation(model)
 
     def _own(self, thing: Any, what: str, *kinds: type) -> Body:
-        """The body behind a handle, which must be of one of the kinds and of this builder."""
+        """Body of a handle, which must be of one of the kinds and of this builder."""
         return owner_of(thing, what, kinds, self.bodies)

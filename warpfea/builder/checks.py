@@ -1,4 +1,4 @@
-"""Checks of what users pass to a builder."""
+"""Validation of a builder's arguments."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ __all__ = [
 
 COMPONENTS = {"x": 0, "y": 1, "z": 2}
 SIZES = (1e-6, 1e3)
-"""Least and largest plausible size of a body, m: the longest side of its box."""
+"""Least and largest plausible size of a body, m: the longest side of its bounding box."""
 MASSES = (1e-12, 1e7)
 """Least and largest plausible mass of a body, kg: a grain of dust, and more than a steel tower of 300 m."""
 LEAST_E, METAL = 1e6, 2500.0
 """Pa and kg/m^3: metals in MPa have at most 4.1e5; soft matter is lighter, dense rubber stiffer."""
 LARGEST_NU = 0.499
-"""Of solids; beyond it the volumetric locking of a coarse mesh decides."""
+"""Limit of nu for solids; above it volumetric locking of a coarse mesh dominates."""
 LEAST_DENSITY = 1.0
-"""Least plausible density, kg/m^3: an aerogel; t/mm^3 are far below. Heavy bodies stand for others in models."""
+"""Least plausible density, kg/m^3: an aerogel; t/mm^3 are far below. Heavy bodies may stand for others."""
 FOAM, STIFFEST_FOAM = 25.0, 1e9
-"""kg/m^3 and Pa: nothing lighter is stiffer, but solids in g/cm^3 are."""
+"""kg/m^3 and Pa: no lighter solid is stiffer, except densities given in g/cm^3."""
 HANDLES: dict[type, str] = {
     Body: "the body",
     NodeSet: "nodes (body.nodes)",
@@ -56,10 +56,10 @@ HANDLES: dict[type, str] = {
 
 
 def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body]) -> Body:
-    """The body behind a handle, which must be of one of the kinds and of one of the bodies, and not empty.
+    """Body of a handle, which must be non-empty, of one of the kinds and of one of the bodies.
 
     Raises:
-        ModelError: it is not; the text begins with `what`.
+        ModelError: otherwise; the text begins with `what`.
     """
     body = thing if isinstance(thing, Body) else getattr(thing, "body", None)
     wanted = " or ".join(HANDLES[kind] for kind in kinds)
@@ -81,7 +81,7 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
 
 
 def gravity_of(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
-    """A constant gravity (3,), m/s^2, and its law over time, of which the constant is zero; None: constant."""
+    """Gravity as (constant (3,), m/s^2, time law or None); the constant is zero with a law."""
     samples = isinstance(value, (tuple, list)) and len(value) == 2 and np.ndim(value[0]) == 1
     if samples or isinstance(value, (wp.Function, Control)) or callable(value):
         return np.zeros(3), time_law(value, "gravity")
@@ -89,16 +89,16 @@ def gravity_of(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
 
 
 def check_densities(gravity: np.ndarray, d: Description) -> None:
-    """Raise ModelError where gravity or a body force acts on a material without density."""
+    """Raise ModelError for gravity or a body force on a material without density."""
     bodies, forces = d.bodies, d.body_forces
     if np.any(gravity) or d.gravity is not None:
-        require_density(bodies, "gravity needs, and any motion")  # no "or gravity=(0, 0, 0)": motion is next
+        require_density(bodies, "gravity, and by any motion")  # no hint "or gravity=(0, 0, 0)"
     for force in forces:
         require_density(force.bodies, "add_body_force")
 
 
 def warn_implausible(model: Any) -> None:
-    """Warn (MeshWarning) of a size, mass or density that a wrong unit is likely to have made."""
+    """Warn (MeshWarning) of a size, mass or density that suggests a wrong unit."""
     for body in model.bodies:
         _warn_of_densities(body)
         _warn_of_constants(body)
@@ -114,14 +114,14 @@ def warn_implausible(model: Any) -> None:
         what = f"is {size:.3g} m long" + ("" if mass is None else f" and weighs {mass:.3g} kg")
         hint = "lengths are in metres, density in kg/m^3"
         if body.mesh.path is not None:
-            hint = f"was {body.mesh.label} scaled twice? Its lengths are read in metres"
+            hint = f"check scale= of {body.mesh.label}: lengths are in metres"
             if large:
-                hint = f"is {body.mesh.label} in mm? Then give scale=1e-3 (--scale 1e-3); it is read in metres"
+                hint = f"lengths are in metres; if {body.mesh.label} is in mm, give scale=1e-3 (--scale 1e-3)"
         warnings.warn(f"body {body.name!r} {what}: {hint}", MeshWarning, stacklevel=3)
 
 
 def _warn_of_constants(body: Body) -> None:
-    """Warn of a metal whose E is likely in MPa, and of a solid that locks."""
+    """Warn of a metal with E probably in MPa, and of volumetric locking of solids."""
     for group, material in body.materials:
         law = type(material).__name__ + (f" of group {group!r}" if group else "")
         lam, mu = material.lame
@@ -130,15 +130,15 @@ def _warn_of_constants(body: Body) -> None:
         if dense and E < LEAST_E and (low := float(np.min(material.density))) > METAL:
             speed = math.sqrt(E / low)
             warnings.warn(
-                f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3 is a metal as soft as rubber "
-                f"(waves run at {speed:.2g} m/s). Is E in MPa? Steel is E=2.1e11, density=7850",
+                f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3: implausible wave speed "
+                f"{speed:.2g} m/s for a metal: is E given in MPa? Steel is E=2.1e11, density=7850",
                 ModelWarning,
                 stacklevel=4,
             )
         if body.family.solid and nu > LARGEST_NU:
             warnings.warn(
-                f"body {body.name!r}: {law} with nu = {nu:.6g} locks: elements are far too stiff beyond {LARGEST_NU}; "
-                "take nu=0.49, or a finer mesh and see whether the result stays",
+                f"body {body.name!r}: {law} with nu = {nu:.6g}: volumetric locking above {LARGEST_NU}: use nu=0.49, "
+                "or refine the mesh until the result is stable",
                 ModelWarning,
                 stacklevel=4,
             )
@@ -191,7 +191,7 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
     """A vector field on a body's slots, (slots, 3): values at the nodes, and its gradient on gradient slots.
 
     Args:
-        values: (3,) the same everywhere; a function X (n, 3) -> (n, 3), whose gradient is taken by central
+        values: (3,) uniform; a function X (n, 3) -> (n, 3), whose gradient is taken by central
             differences with steps that follow the size of the cells; or (nodes, 3), for bodies without gradient slots.
 
     Raises:
@@ -220,7 +220,7 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
 
 
 def _node_sizes(mesh: Mesh) -> np.ndarray:
-    """Extent (m) of the smallest cell at each node (nodes,), 1 where there is none."""
+    """Extent (m) of the smallest cell at each node (nodes,), 1 for nodes without cells."""
     x = mesh.points[mesh.cells]
     extent = np.max(x.max(axis=1) - x.min(axis=1), axis=1)
     out = np.full(len(mesh.points), np.inf)
@@ -229,7 +229,7 @@ def _node_sizes(mesh: Mesh) -> np.ndarray:
 
 
 def component_mask(text: str, what: str) -> np.ndarray:
-    """(3,) ones where a letter of "xyz" is named."""
+    """(3,) ones for the letters of "xyz" in the argument."""
     out = np.zeros(3)
     if not isinstance(text, str) or not text or any(c not in COMPONENTS for c in text):
         raise ModelError(f"{what}: components = {text!r} must be letters of 'xyz'")
@@ -271,7 +271,7 @@ def assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[s
 
 
 def _bare_volume(mesh: Mesh) -> str:
-    """What to do about a mesh whose groups are surfaces, edges or points only."""
+    """Hint for a mesh without element groups."""
     if mesh.element_sets:
         return ""
     names = listing(dict.fromkeys([*mesh.surface_sets, *mesh.node_sets]))

@@ -1,4 +1,4 @@
-"""Colliders and contacts as a builder records them; the methods of ModelBuilder say what they mean."""
+"""Colliders and contacts as recorded by a builder; documented at the methods of ModelBuilder."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def contact_surface(thing: Body | SurfaceSet) -> SurfaceSet:
     """A surface, or all outer faces of a body.
 
     Raises:
-        ModelError: no faces, faces inside of the body, or the same face twice.
+        ModelError: no faces, interior faces, or a repeated face.
     """
     body = thing if isinstance(thing, Body) else thing.body
     surface = SurfaceSet(body, body.boundary) if isinstance(thing, Body) else thing
@@ -144,7 +144,7 @@ def make_pair(
 
 
 def _checked(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any]:
-    """The options of a contact with None replaced where it stands for a value. ModelError names what is wrong."""
+    """Contact options with None replaced by defaults. ModelError names the invalid one."""
     for option, known in (("law", CONTACT_LAWS), ("treatment", TREATMENTS), ("model", CONTACT_MODELS),
                           ("overlap", OVERLAPS)):  # fmt: skip
         if o[option] not in known:
@@ -164,8 +164,8 @@ def _checked(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any
         o["radius"] = _number(what, "radius", o["radius"], "positive, m")
     elif o["model"] == "sphere":
         raise ModelError(
-            f"{what}: model = 'sphere' needs radius=, the radius of the body's surface where it touches, m: its force "
-            "4/3 E sqrt(R) d^1.5 depends on it, and a mesh does not tell it"
+            f"{what}: model = 'sphere' needs radius= (m), the local radius of curvature R of the Hertz force "
+            "4/3 E* sqrt(R) d^1.5"
         )
     o["offset"] = _number(what, "offset", o["offset"], "a finite number, m", low=-np.inf)
     o["overlap_time"] = _number(what, "overlap_time", o["overlap_time"], "positive, s")
@@ -192,9 +192,7 @@ def _smoothing(what: str, law: str, value: Any) -> float | tuple[float, float] |
     if value is None:
         return None
     if law == "default":
-        raise ModelError(
-            f"{what}: smoothing = {value!r}: law = 'default' is smooth as it is; 'paper' and 'smooth' take it"
-        )
+        raise ModelError(f"{what}: smoothing = {value!r} applies to law = 'paper' or 'smooth' only")
     if law == "paper":
         return _number(what, "smoothing", value, "a positive depth, m, over which the paper's damping is ramped in")
     pair = tuple(value) if isinstance(value, (tuple, list, np.ndarray)) else ()

@@ -1,4 +1,4 @@
-"""Joints as compositions of DP1, DP2, DIST and PIN (Paper I, section 5.4) that place their own points and axes.
+"""Joints as compositions of DP1, DP2, DIST and PIN (Paper I, section 5.4) with their own points and axes.
 
     spherical      PIN                     translational  3 DP1 + 2 DP2
     universal      PIN + DP1               fixed          PIN + 3 DP1
@@ -38,7 +38,7 @@ Angle = tuple[Vector, Vector, Vector]
 def make_joint(
     kind: str, parent: Any, child: Any, anchor: Any, axis: Any, axis2: Any, drive: Any, name: str
 ) -> Joint:  # fmt: skip
-    """Compose a joint. Raises ModelError naming the joint and what is wrong."""
+    """Compose a joint. ModelError naming the joint and the error."""
     what = f"joint {name!r}"
     P, Q = _sides(what, kind, parent, child)
     if axis2 is not None and kind != "universal":
@@ -74,7 +74,7 @@ def make_joint(
 
 
 def _sides(what: str, kind: str, parent: Any, child: Any) -> tuple[Attachment, Attachment]:
-    """Parent and child of a joint. ModelError for an unknown kind, without a body, and for one place twice."""
+    """Parent and child of a joint. ModelError for an unknown kind, two grounds, or identical attachment points."""
     if kind not in JOINTS:
         raise ModelError(f"{what}: kind {kind!r} is unknown; there are {', '.join(JOINTS)}{did_you_mean(kind, JOINTS)}")
     P, Q = attach(parent, f"{what}: parent", child=False), attach(child, f"{what}: child", child=True)
@@ -97,7 +97,7 @@ def _cross(n: np.ndarray, axis2: Any, P: Attachment, Q: Attachment, what: str) -
 def _guide(
     kind: str, n: np.ndarray, gap: Vector, P: Attachment, Q: Attachment, what: str
 ) -> tuple[list[Row], Angle | None, tuple[Vector, Vector] | None]:
-    """Rows of a revolute, cylindrical or translational joint besides its pin, its angle and its travel."""
+    """Rows of a revolute, cylindrical or translational joint besides its pin; vectors of its angle and travel."""
     u, w = _pair(n, P, Q)
     if P.weakness(n) + Q.weakness(u) + Q.weakness(w) <= Q.weakness(n) + P.weakness(u) + P.weakness(w):
         rows = [_dp(P.direction(n, what), Q.direction(d, what)) for d in (u, w)]
@@ -122,7 +122,9 @@ def _driven(
         assert travel is not None
         return Row(DOT, *travel, law=law)
     if angle is None:
-        raise ModelError(f"{what}: {P.label} and {Q.label} do not tell the angle about the axis; give more nodes")
+        raise ModelError(
+            f"{what}: rotation angle about the axis undetermined by {P.label} and {Q.label}: give more nodes"
+        )
     first, second, turned = angle
     return Row(TURN, first, turned, 1.0, second, law, angular=True)
 
@@ -132,13 +134,13 @@ def _between(P: Attachment, Q: Attachment) -> str:
 
 
 def pin_rows(gap: Vector, law: TimeLaw | None = None) -> list[Row]:
-    """Three rows that hold a vector at zero or at the law's value."""
+    """Three rows that constrain a vector to zero or the law's value."""
     options = [_right_side(law, k) for k in range(3)]
     return [Row(DOT, gap, constant(e), component=k, **options[k]) for k, e in enumerate(np.eye(3))]
 
 
 def _right_side(law: TimeLaw | None, component: int = 0) -> dict[str, Any]:
-    """A constant is fixed: statics must not ramp it, nor a control."""
+    """Constant right sides are fixed: statics must not ramp them or a control."""
     if law is not None and len(law.values) == 1:
         return {"fixed": float(law.values[0, component])}
     return {"law": replace(law, ramped=False) if law is not None and law.control is not None else law}
@@ -154,7 +156,7 @@ def _scale(a: Vector, b: Vector) -> float:
 
 
 def _locked(P: Attachment, Q: Attachment, what: str) -> list[Row]:
-    """Three DP1 between two triads that agree, the pairs chosen among directions that both sides carry."""
+    """Three DP1 between two aligned triads, the pairs chosen among directions that both sides carry."""
     triads = [np.eye(3)]
     for side in (Q, P):
         if side.body is not None and side.weak.any():
@@ -175,7 +177,7 @@ def _locked(P: Attachment, Q: Attachment, what: str) -> list[Row]:
 
 
 def _pair(n: np.ndarray, P: Attachment, Q: Attachment) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions that make a right-handed triad (u, w, n) with the axis, along a body's weak one where there is."""
+    """Two directions completing a right-handed triad (u, w, n), along the weakly held direction if any."""
     u = _perpendicular(n)
     for side in (Q, P):
         if side.body is not None and side.weak.any():
@@ -189,10 +191,10 @@ def _pair(n: np.ndarray, P: Attachment, Q: Attachment) -> tuple[np.ndarray, np.n
 
 
 def _angle(n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attachment, what: str) -> Angle | None:
-    """Vectors (a, a2, b): the child has turned about n by the angle of b from a towards a2; None: not known."""
+    """Vectors (a, a2, b) of the joint angle atan2(a2.b, a.b) about n, or None."""
     options: list[Any] = []
     for first, second in ((u, w), (w, -u)):
-        for pair, other, sign in ((P, Q, 1.0), (Q, P, -1.0)):  # seen from the child, the parent turns the other way
+        for pair, other, sign in ((P, Q, 1.0), (Q, P, -1.0)):  # seen from the child, the parent rotates the other way
             cost = pair.weakness(u) + pair.weakness(w) + other.weakness(first)
             options.append((round(cost, 9), len(options), pair, other, first, sign * second))
     cost, _, pair, other, first, second = min(options, key=lambda option: option[:2])
@@ -209,8 +211,8 @@ def _anchor(what: str, P: Attachment, Q: Attachment, anchor: Any) -> np.ndarray:
         apart = float(np.linalg.norm(P.X - Q.X))
         if apart > COINCIDENT * max(P.size, Q.size):
             raise ModelError(
-                f"{what}: {P.label} and {Q.label} are {apart:.6g} m apart; say where: anchor=, which keeps the gap (to "
-                "close it, pin both with value=(0, 0, 0) and call solve_static)"
+                f"{what}: {P.label} and {Q.label} are {apart:.6g} m apart: give anchor= to keep the offset, or pin "
+                "both with value=(0, 0, 0) and call solve_static to close it"
             )
     return at
 
@@ -220,7 +222,7 @@ def _distance(what: str, name: str, P: Attachment, Q: Attachment, anchor: Any, l
     for side in (P, Q):
         if side.body is None and np.isnan(side.X).any():
             if anchor is None:
-                raise ModelError(f"{what}: say where on the ground the rod ends: anchor=")
+                raise ModelError(f"{what}: missing anchor=: the end point of the rod on the ground")
             ends.append(constant(vector(anchor, f"{what}: anchor")))
         else:
             ends.append(side.position(side.X, what))
@@ -258,7 +260,7 @@ def _orthogonal(m: np.ndarray, n: np.ndarray) -> np.ndarray:
 
 
 def _perpendicular(n: np.ndarray) -> np.ndarray:
-    """A unit vector perpendicular to n, along a global axis where n is."""
+    """A unit vector perpendicular to n, along a global axis if n is."""
     e = np.eye(3)[int(np.argmin(np.abs(n)))]
     return _orthogonal(e, n)
 
@@ -267,7 +269,7 @@ def _perpendicular(n: np.ndarray) -> np.ndarray:
 
 
 def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
-    """A single DP1, DP2, DIST or PIN between points: material points, nodes, surfaces (means), places in space (3,).
+    """A single DP1, DP2, DIST or PIN between points: material points, nodes, surfaces (means), fixed points (3,).
 
     Raises:
         ModelError: an unknown kind, a wrong number of points, or points that coincide where a direction is needed.
@@ -292,7 +294,7 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
 
 
 def _places(what: str, kind: str, points: Any) -> list[Attachment]:
-    """The points of a single constraint. ModelError for an unknown kind, another number, and where none is a body's."""
+    """Points of a single constraint. ModelError for an unknown kind, a wrong number, or no point on a body."""
     if kind not in CONSTRAINTS:
         raise ModelError(
             f"{what}: the kind is unknown; there are {', '.join(CONSTRAINTS)}{did_you_mean(kind, CONSTRAINTS)}"
@@ -314,7 +316,7 @@ def _places(what: str, kind: str, points: Any) -> list[Attachment]:
 
 
 def _pin(what: str, gap: Vector, value: Any, size: float) -> list[Row]:
-    """Rows of P - Q = value, or of points that coincide. ModelError for such that are apart without a value."""
+    """Rows of P - Q = value, or of coincident points. ModelError for distinct points without a value."""
     if value is not None:
         return pin_rows(gap, time_law(value, f"{what}: value"))
     apart = float(np.linalg.norm(gap.value))

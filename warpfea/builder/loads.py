@@ -1,4 +1,4 @@
-"""Loads, initial states and probes as a builder records them; the methods of ModelBuilder say what they mean."""
+"""Loads, initial states and probes as recorded by a builder; documented at the methods of ModelBuilder."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def follower_pressure(body: Body, surface: SurfaceSet, pressure: Any) -> Pressur
 
 
 def check_field(field: Any) -> None:
-    """Raise ModelError unless a body force is a wp.func of place and time."""
+    """Raise ModelError unless a body force is a wp.func of position and time."""
     if not isinstance(field, wp.Function):
         raise ModelError(
             f"add_body_force: the field must be a wp.func, got {field!r}; write def f(x: wp.vec3d, t: wp.float64) -> "
@@ -88,7 +88,7 @@ def check_field(field: Any) -> None:
 
 
 def start_from(body: Body, initial: Any) -> None:
-    """Initial positions of a body, as the methods of ModelBuilder that add one take them; None: the reference."""
+    """Initial positions of a body as an argument of the methods of ModelBuilder that add one; None: the reference."""
     if initial is not None:
         start, reference = slot_field(body, initial, f"body {body.name!r}: initial"), slot_field(body, lambda X: X, "")
         body.initial_displacement = start - reference

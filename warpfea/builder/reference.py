@@ -1,4 +1,4 @@
-"""What a scene knows of its own motion: the reference that `warpfea study` measures errors against."""
+"""Reference solution of a scene for error measurement by `warpfea study`."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Positions = Callable[[np.ndarray], np.ndarray] | tuple[Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A motion that is known without the scene's own steps.
+    """Reference motion, known independently of the scene's own steps.
 
     Attributes:
-        probes: by name a function of times (n,), s, that gives positions (n, 3), m; or samples (times, positions).
-        about: where it comes from, for the table.
+        probes: by name: a function of times (n,), s, returning positions (n, 3), m, or samples (times, positions).
+        about: source, for the table.
         error: its own error, m; 0 for a closed form.
-        field: what the scene's `field` is to give at the end; None: unknown.
+        field: expected value of the scene's `field` at the end; None: unknown.
     """
 
     probes: Mapping[str, Positions] = field(repr=False)
@@ -56,15 +56,15 @@ def _check_samples(what: str, times: Any, positions: Any) -> None:
 
 
 def reference_of(given: Any, parameters: Mapping[str, Any]) -> Reference | None:
-    """The reference that a scene's `reference` means for values of its parameters; None where it has none.
+    """Reference of a scene for the given parameter values; None if it has none.
 
     Args:
-        given: a Reference, a dict of its probes, or a function that gives one of them; it is called with the parameters
-            of the scene that it names.
-        parameters: all of the scene.
+        given: a Reference, a dict of its probes, or a function returning one of them, called with those scene
+            parameters that it names.
+        parameters: all parameters of the scene.
 
     Raises:
-        ModelError: it is none of these, or names what is no parameter.
+        ModelError: another type, or an unknown parameter name.
     """
     if callable(given):
         wanted = inspect.signature(given).parameters
@@ -81,15 +81,15 @@ def reference_of(given: Any, parameters: Mapping[str, Any]) -> Reference | None:
 
 
 def read_reference(path: str | pathlib.Path, probe: str) -> Reference:
-    """A file of positions over time.
+    """Reference from a file of positions over time.
 
     Args:
         path: .csv with the columns t, x, y, z and, for several probes, probe; or .json with t (n,) and probes, a dict
             of positions (n, 3), and optionally about and error (m). SI units.
-        probe: that a .csv without the column `probe` is of.
+        probe: name of the probe of a .csv without the column `probe`.
 
     Raises:
-        ModelError: no such file, or not of this form.
+        ModelError: missing file or another format.
     """
     file = pathlib.Path(path)
     if not file.is_file():

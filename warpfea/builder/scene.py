@@ -46,7 +46,7 @@ _BOOL = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no":
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a scene: its name, type, default (REQUIRED if there is none) and description."""
+    """Parameter of a scene: name, type, default (REQUIRED if there is none) and description."""
 
     name: str
     kind: Any
@@ -55,21 +55,21 @@ class Parameter:
 
     @property
     def required(self) -> bool:
-        """There is no default."""
+        """True without a default."""
         return self.default is REQUIRED
 
     @property
     def kind_name(self) -> str:
-        """The type as a user reads it."""
+        """Readable type."""
         return _kind_name(self.kind)
 
     def parse(self, text: str) -> Any:
-        """The value that `text` stands for. ValueError says what was expected."""
+        """Value parsed from `text`. ValueError states the expected type."""
         return _parse(text, self.kind)
 
 
 class Scene(Generic[P]):
-    """A scene; calling it makes its ModelBuilder.
+    """A scene; a call returns its ModelBuilder.
 
     Attributes:
         name: of the function.
@@ -77,7 +77,7 @@ class Scene(Generic[P]):
         fps: frames of a USD file per simulated second.
         speed: simulated seconds per second of an animation.
         picture: time of a picture, s, or None for the end.
-        reference, field: what `warpfea study` compares with, see `scene`.
+        reference, field: reference of `warpfea study`, see `scene`.
         description: first line of the docstring.
         parameters: by name.
     """
@@ -117,10 +117,10 @@ class Scene(Generic[P]):
         return f"Scene({self.name!r}, dt={self.dt:g}, t_end={self.t_end:g})"
 
     def parse(self, settings: Iterable[str]) -> dict[str, Any]:
-        """Values of `name=value` texts.
+        """Parameter values from `name=value` texts.
 
         Raises:
-            ModelError: no `=`, a name given twice, an unknown parameter (lists what there is), or a bad value.
+            ModelError: no `=`, a name given twice, an unknown parameter (lists the known ones), or a bad value.
         """
         out: dict[str, Any] = {}
         for setting in settings:
@@ -143,7 +143,7 @@ class Scene(Generic[P]):
         return out
 
     def resolve(self, given: dict[str, Any]) -> dict[str, Any]:
-        """All parameters: what is given, and defaults. ModelError for one without either."""
+        """All parameters: given values and defaults. ModelError for one without either."""
         out = {}
         for name, parameter in self.parameters.items():
             if name not in given and parameter.required:
@@ -156,7 +156,7 @@ class Scene(Generic[P]):
         """Call the scene with the given parameters.
 
         Raises:
-            ModelError: it returns no ModelBuilder, or its own code fails, with file and line.
+            ModelError: no ModelBuilder is returned, or the scene's code fails (with file and line).
         """
         from .builder import ModelBuilder
 
@@ -185,7 +185,7 @@ def scene(
     reference: Any = None,
     field: Callable[[Any], Any] | None = None,
 ) -> Callable[[Callable[P, ModelBuilder]], Scene[P]]:
-    """Make a function that returns a ModelBuilder a scene.
+    """Decorator: make a function that returns a ModelBuilder a scene.
 
     Args:
         dt: default step, s.
@@ -194,11 +194,11 @@ def scene(
         tol: default tolerance of the solver; None: the solver's own.
         fps: frames per simulated second in a USD file.
         speed: simulated seconds per second of a GIF; less than 1 is slow motion.
-        picture: time that a PNG shows, s; None: the end.
-        reference: the motion, where it is known, for `warpfea study`: a dict from names of probes to functions of times
-            (n,) that give positions (n, 3); a wf.Reference; or a function of parameters of the scene that gives one.
-        field: a function of the simulation at its end that gives an array whose shape is the same for every mesh, such
-            as displacements at fixed places; `warpfea study` takes the norm of its error.
+        picture: time of a PNG, s; None: the end.
+        reference: known motion for `warpfea study`: a dict of probe names to functions of times (n,) returning
+            positions (n, 3); a wf.Reference; or a function of scene parameters returning one.
+        field: a function of the final simulation returning an array of mesh-independent shape, e.g. displacements at
+            fixed points; `warpfea study` reports the norm of its error.
 
     Raises:
         ModelError: a number that is not positive.
@@ -217,13 +217,13 @@ def scene(
 
 
 def names() -> list[str]:
-    """Names of the scenes that come with warpfea. Imports none of them."""
+    """Names of the scenes of warpfea, without importing them."""
     package = importlib.import_module("warpfea.scenes")
     return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if not m.name.startswith("_"))
 
 
 def find(name: str) -> Scene[Any]:
-    """The scene `name` that comes with warpfea. ModelError lists what there is."""
+    """The scene `name` of warpfea. ModelError lists the known ones."""
     if name not in names():
         hint = did_you_mean(name, names())
         raise ModelError(
@@ -236,7 +236,7 @@ def find(name: str) -> Scene[Any]:
 
 
 def split_name(what: str) -> tuple[str | None, str]:
-    """File and scene of NAME, file.py or file.py:NAME; None where there is no file, "" where there is no name."""
+    """File and scene of NAME, file.py or file.py:NAME; None without a file, "" without a name."""
     file, colon, name = what.rpartition(":")
     if colon and file.endswith(".py"):
         return file, name
@@ -244,11 +244,11 @@ def split_name(what: str) -> tuple[str | None, str]:
 
 
 def locate(what: str) -> Scene[Any]:
-    """The scene NAME, file.py or file.py:NAME. ModelError lists what there is."""
+    """The scene NAME, file.py or file.py:NAME. ModelError lists the known ones."""
     file, name = split_name(what)
     if file is None:
         return find(name)
-    # absolute: Python knows the file's code by that path, and so its lines are found
+    # absolute: Python stores the file's code under that path, so tracebacks show its lines
     found = load_file(pathlib.Path(file).absolute())
     if not name:
         if len(found) > 1:
@@ -263,9 +263,10 @@ _loaded = itertools.count()
 
 
 def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
-    """Run a Python file and return its scenes by name; of those, imported ones only if it defines none itself.
+    """Run a Python file and return its scenes by name; imported ones only if it defines none.
 
-    A file of a package (a folder with __init__.py) may use relative imports, another one import what lies beside it.
+    A file of a package (a folder with __init__.py) may use relative imports, any other file imports from its own
+    folder.
 
     Raises:
         ModelError: no such file, an error in it (with its line), or no scene in it.
@@ -320,7 +321,7 @@ def _parameters(function: Callable[..., Any], text: str) -> dict[str, Parameter]
     docs = _argument_docs(text)
     try:
         hints = typing.get_type_hints(function)
-    except Exception:  # an annotation that can't be evaluated: the default's type decides
+    except Exception:  # unresolvable annotation: use the type of the default
         hints = {}
     out = {}
     for name, item in inspect.signature(function).parameters.items():
@@ -406,7 +407,7 @@ def _parse_float(text: str) -> float:
 _SCALARS: dict[Any, Callable[[str], Any]] = {
     bool: _parse_bool, int: _parse_int, float: _parse_float, str: str, pathlib.Path: pathlib.Path,
 }  # fmt: skip
-"""Readers of values that are no union, literal or tuple."""
+"""Parsers of values other than unions, literals and tuples."""
 
 
 def _parse_union(text: str, kind: Any, arguments: tuple[Any, ...]) -> Any:

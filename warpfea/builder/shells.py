@@ -1,4 +1,4 @@
-"""Geometry of shells: axes and frames dX/dxi of each quad at its nodes, with directors shared by the elements there."""
+"""Geometry of shells: axes and frames dX/dxi of each quad at its nodes, with directors shared by adjacent elements."""
 
 from __future__ import annotations
 
@@ -71,19 +71,19 @@ def _directors(label: str, mesh: Mesh, normal: np.ndarray, given: Any) -> np.nda
     length = np.linalg.norm(out, axis=1, keepdims=True)
     flat = np.flatnonzero(length[mesh.used_nodes, 0] < 1e-9)
     if len(flat):
-        raise ModelError(f"{label}: node {int(mesh.used_nodes[flat[0]])} of {mesh.label} has no normal")
+        raise ModelError(f"{label}: the normal at node {int(mesh.used_nodes[flat[0]])} of {mesh.label} is zero")
     return out / np.where(length > 0.0, length, 1.0)
 
 
 def _at_corners(mesh: Mesh, sharp: np.ndarray) -> np.ndarray:
-    """(E, 4) whether the node of an element lies on a corner of the surface."""
+    """(E, 4) True if the element's node lies on a corner of the surface."""
     nodes = np.zeros(len(mesh.points), dtype=bool)
     nodes[mesh.cells[sharp]] = True
     return nodes[mesh.cells]
 
 
 def _tangent(line: np.ndarray, director: np.ndarray, smooth: np.ndarray) -> np.ndarray:
-    """Lines (E, 4, 3) turned into the tangent plane; a smooth surface keeps their length along the arc."""
+    """Lines (E, 4, 3) rotated into the tangent plane; a smooth surface keeps their arc length."""
     flat = line - np.sum(line * director, axis=2, keepdims=True) * director
     length = np.linalg.norm(flat, axis=2, keepdims=True)
     chord = np.linalg.norm(line, axis=2, keepdims=True)
@@ -94,7 +94,9 @@ def _tangent(line: np.ndarray, director: np.ndarray, smooth: np.ndarray) -> np.n
 
 
 def _axes(mesh: Mesh, director: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """(nodes, 3, 3): the first element's line at each node made perpendicular to the director, across, director."""
+    """Node axes (nodes, 3, 3): an element's line projected perpendicular to the director, its cross product, the
+    director.
+    """
     first = np.zeros_like(mesh.points)
     cells, lines = mesh.cells[::-1], along[::-1]
     first[cells.ravel()] = lines.reshape(-1, 3)  # the lowest element writes last

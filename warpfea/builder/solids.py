@@ -15,10 +15,10 @@ __all__ = ["solid_geometry"]
 
 
 def solid_geometry(name: str, mesh: Mesh, family: Family) -> tuple[Mesh, np.ndarray | None]:
-    """The mesh a family lives on, and its frames (elements, n, 3, 3) = dX/dxi at the element nodes, m.
+    """Mesh of the family, and its frames (elements, n, 3, 3) = dX/dxi at the element nodes, m.
 
-    Of a T10 mesh ANCF tetrahedra take the corner nodes; ENMC, a complete cubic, keeps its curved sides through the
-    frames and face nodes.
+    ANCF tetrahedra use the corner nodes of a T10 mesh; ENMC, a complete cubic, keeps curved sides by its frames and
+    face nodes.
 
     Raises:
         ModelError: the family does not fit the cells.

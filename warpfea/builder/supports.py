@@ -1,4 +1,4 @@
-"""Supports as a builder records them: nodes held, moved or turned."""
+"""Supports as recorded by a builder: nodes clamped, moved or rotated."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def clamp_support(body: Body, nodes: NodeSet, slots: str, components: str) -> Su
 def drive_supports(
     body: Body, nodes: NodeSet, displacement: Any, rotation: Any, components: str, slots: str | None
 ) -> list[Support]:
-    """One support that moves, and one that holds the gradients named with a displacement; see ModelBuilder.drive."""
+    """Support of the driven components, and one that clamps named gradients with a displacement; see
+    ModelBuilder.drive.
+    """
     what = f"drive of {nodes.name or 'nodes'!r} on body {body.name!r}"
     if (displacement is None) == (rotation is None):
         raise ModelError(f"{what}: give either displacement or rotation")
@@ -46,7 +48,7 @@ def drive_supports(
     moved = np.isin(support.slots, support_slots(nodes, "position"))
     if not moved.any():
         raise ModelError(f"{what}: slots = {slots!r} has no position to displace; clamp holds gradients")
-    if not moved.all():  # gradients stay as they are
+    if not moved.all():  # gradients stay constant
         out.append(Support(body, support.slots[~moved], support.components))
     support.slots = support.slots[moved]
     if isinstance(displacement, tuple) and len(displacement) == 2 and np.ndim(displacement[1]) == 3:

@@ -1,4 +1,4 @@
-"""Welds of faces to other bodies: mortar ties, the gap zero in the mean with each function of the first face."""
+"""Welds of faces to other bodies: mortar ties, zero mean gap weighted with each function of the first face."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ __all__ = ["make_weld"]
 PER_ELEMENT = 2.0
 MOST_PARTS = 8
 NEAR = 0.5
-"""Distance from a surface's points, over its size, at which a face is not meant to be on it."""
+"""Distance from a surface's points, over its size, beyond which a face is off it."""
 SLACK = 1e-4
-"""Gap that is bridged, over an element's size: files hold rounded coordinates."""
+"""Bridged gap over the element size: files hold rounded coordinates."""
 
 
 def make_weld(first: NodeSet | SurfaceSet, second: SurfaceSet | Body, name: str) -> Joint:
@@ -48,7 +48,7 @@ def make_weld(first: NodeSet | SurfaceSet, second: SurfaceSet | Body, name: str)
 
 
 def _face(nodes: NodeSet) -> SurfaceSet | None:
-    """The face of a beam or shell that a named set of nodes stands for."""
+    """Face of a beam or shell denoted by a named set of nodes."""
     body = nodes.body
     if body.family.solid or not nodes.name:
         return None
@@ -83,7 +83,7 @@ def _mortar(
 
 
 def _parts(face: SurfaceSet, holder: Discretisation) -> int:
-    """Parts to split a face in, so that the kinks of the holder's functions between its elements are seen."""
+    """Quadrature subdivisions of a face that resolve the other body's element boundaries."""
     _, dA = assembly.facet_places(face.body, assembly.facet_tables(face))
     area = float(dA.sum(axis=1).max())
     size = np.cbrt(float(np.median(assembly.element_volumes(holder))))
@@ -91,7 +91,7 @@ def _parts(face: SurfaceSet, holder: Discretisation) -> int:
 
 
 def _pins(nodes: NodeSet, holder: Discretisation, within: SurfaceSet | None, what: str) -> tuple[list[Vector], Vector]:
-    """Nodes at their places in the holder."""
+    """Pins of nodes at their positions in the second body."""
     body = nodes.body
     slots = support_slots(nodes, "position")
     places = body.reference[slots] + body.origin
@@ -109,7 +109,7 @@ def _pins(nodes: NodeSet, holder: Discretisation, within: SurfaceSet | None, wha
 
 
 def _check_near(X: np.ndarray, within: SurfaceSet | None, what: str) -> None:
-    """Raise ModelError for points (n, 3) off the box of the surface that was named."""
+    """Raise ModelError for points (n, 3) outside the bounding box of the named surface."""
     if within is None:
         return
     body = within.body

@@ -1,7 +1,7 @@
 """The command line: `warpfea run | scenes | info | render | bench | study | stress | profile`.
 
-Exit codes: 0 done, 2 bad input or usage, 3 a step refused or a case not met, 4 output failed, 130 interrupted (files
-valid), 1 a defect.
+Exit codes: 0 success, 2 bad input or usage, 3 rejected step or failed case, 4 output error, 130 interrupted (files
+valid), 1 internal error.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     try:
-        from . import parser  # here, so that Ctrl-C ends it as it ends the rest
+        from . import parser  # inside the try block, so that Ctrl-C is handled
 
         try:
             arguments = parser.parse(words)
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"warpfea: interrupted{f': {stop}' if str(stop) else ''}", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # the reader of our output has left
+    except BrokenPipeError:  # closed pipe: the reader of our output has ended
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return DONE
     except Exception as error:
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _check_device(name: str | None) -> None:
-    """ModelError for a device that is not there, before any work."""
+    """ModelError for an unknown device, before any work."""
     if name is not None:
         from ..base.devices import find_device
 

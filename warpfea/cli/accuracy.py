@@ -9,7 +9,7 @@ from .arguments import Once, add_general, call, count, positive
 __all__ = ["SCENE", "add_accuracy"]
 
 SCENE = "SCENE"
-"""The word of the command line in place of a study's name; put in before the name of a scene."""
+"""Placeholder for a study's name, inserted before the name of a scene."""
 
 EXAMPLES = """\
 examples:

@@ -1,4 +1,4 @@
-"""What the parsers of all commands share: the parser, types of values, general options."""
+"""Common parts of the parsers: parser class, types of values, general options."""
 
 from __future__ import annotations
 
@@ -32,32 +32,32 @@ __all__ = [
 
 
 class Parser(argparse.ArgumentParser):
-    """Help that keeps its line breaks; errors as UsageError."""
+    """Help with its line breaks; errors as UsageError."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         defaults: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
         super().__init__(*args, **(defaults | options))
 
     def error(self, message: str) -> NoReturn:
-        """Raise UsageError, with the name that was likely meant."""
+        """Raise UsageError with the closest known name."""
         choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if choice:
             message += did_you_mean(choice[1], re.findall(r"[\w-]+", choice[2]))
-        raise UsageError(f"{message} ({self.prog} --help tells more)")
+        raise UsageError(f"{message} (see {self.prog} --help)")
 
 
 class Once(argparse.Action):
-    """Stores the value of an option that makes a file: given twice, one of the two files would be missing."""
+    """Store the value of an output option: a second value would discard a file."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
-        """Store the value. UsageError if there is one."""
+        """Store the value. UsageError for a second one."""
         if getattr(namespace, self.dest) is not None:
             parser.error(f"{option} is given twice")
         setattr(namespace, self.dest, values)
 
 
 def existing(text: str) -> pathlib.Path:
-    """The path of a file that is there. UsageError."""
+    """Path of an existing file. UsageError."""
     path = pathlib.Path(text)
     if not path.is_file():
         raise UsageError(f"{path}: is a folder, not a file" if path.is_dir() else f"{path}: no such file")
@@ -93,7 +93,7 @@ def count(text: str) -> int:
 
 
 def load_steps(text: str) -> int:
-    """A number of load steps; "auto": one, which the solver halves where it is refused."""
+    """Number of load steps; "auto": one, halved by the solver if rejected."""
     if text == "auto":
         return 1
     try:
@@ -103,7 +103,7 @@ def load_steps(text: str) -> int:
 
 
 def counts(text: str) -> list[int]:
-    """Positive whole numbers with commas; 1e5 counts as one."""
+    """Positive whole numbers separated by commas; 1e5 counts as one."""
     try:
         values = [float(part) for part in text.split(",")]
         assert all(math.isfinite(v) and v >= 1 and v == int(v) for v in values)
@@ -113,7 +113,7 @@ def counts(text: str) -> list[int]:
 
 
 def numbers(text: str, size: int) -> tuple[float, ...]:
-    """Finite numbers with commas."""
+    """Finite numbers separated by commas."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -130,12 +130,12 @@ def vector(text: str) -> tuple[float, ...]:
 
 
 def pair(text: str) -> tuple[float, ...]:
-    """Two numbers with a comma."""
+    """Two numbers separated by a comma."""
     return numbers(text, 2)
 
 
 def color_range(text: str) -> tuple[float, ...]:
-    """Two finite rising numbers with a comma."""
+    """Two finite increasing numbers separated by a comma."""
     low, high = numbers(text, 2)
     if not low < high:
         raise argparse.ArgumentTypeError(f"{text!r} does not rise: give LOW,HIGH")
@@ -151,7 +151,7 @@ def size(text: str) -> tuple[int, int]:
 
 
 def call(module: str, function: str) -> Any:
-    """The command, imported when it is called."""
+    """The command, imported on call."""
 
     def command(arguments: argparse.Namespace) -> int:
         import importlib
@@ -162,7 +162,7 @@ def call(module: str, function: str) -> Any:
 
 
 def add_general(to: argparse.ArgumentParser, quiet: str = "no bars and no summary table") -> None:
-    """The options that every command has; `quiet` is the help of --quiet."""
+    """Options common to all commands; `quiet` is the help of --quiet."""
     group = to.add_argument_group("general")
     group.add_argument("--quiet", action="store_true", help=quiet)
     group.add_argument("--no-progress", action="store_true", help="no bars; there are none without a terminal")

@@ -1,4 +1,4 @@
-"""The options of the commands that measure: bench, study, stress, profile."""
+"""Options of the measuring commands: bench, study, stress, profile."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ STUDIES: dict[str, tuple[str, tuple[str, ...], str]] = {
         "Writes bar_*.npz into the folder of --out, by default tests/data of the checkout; needs gmsh.",
     ),
 }
-"""Studies besides those of scenes: name -> help, options, description; `run` of cli/study.py does them."""
+"""Studies other than those of scenes: name -> help, options, description; executed by `run` of cli/study.py."""
 _OPTIONS: dict[str, dict[str, Any]] = {
     "--device": {"help": "cpu, cuda:0, ..."},
     "--quick": {"action": "store_true", "help": "a trial: few and small rows, no result"},
@@ -155,7 +155,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def add_study(commands: Any) -> None:
-    """`warpfea study`: that of scenes, and `STUDIES`."""
+    """`warpfea study`: scenes and `STUDIES`."""
     to = commands.add_parser(
         "study",
         help="error against run time of a scene",
@@ -198,10 +198,10 @@ def add_stress(commands: Any) -> None:
 
 
 def with_scene(words: Sequence[str]) -> list[str]:
-    """The words of `warpfea study NAME` with what says that NAME is a scene, where it is no study.
+    """Words of `warpfea study NAME`, with the placeholder of scenes inserted unless NAME is a study.
 
     Raises:
-        UsageError: NAME is neither a study, a scene nor a file; in words of our own.
+        UsageError: NAME is neither a study, a scene nor a file.
     """
     from ..builder.scene import names
 
@@ -217,7 +217,7 @@ def with_scene(words: Sequence[str]) -> list[str]:
 
 
 def add_profile(commands: Any, add_model: Callable[[argparse.ArgumentParser], None]) -> None:
-    """`warpfea profile`; `add_model` adds the options of what is simulated."""
+    """`warpfea profile`; `add_model` adds the options of the model."""
     from ..terms.term_set import all_parts
 
     parts = "\n".join(f"  {name:14}  {text}" for name, text in all_parts().items())

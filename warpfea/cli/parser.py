@@ -1,4 +1,4 @@
-"""The options of all commands, and help that teaches by examples."""
+"""Options of all commands, and help with examples."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ A scene file is Python:
 LATER = {
     "sweep": "a sweep over parameters on many devices",
 }
-"""Commands of a later version: not offered, but who tries one is told."""
+"""Commands of a later version: not offered, but refused with an explanation."""
 MATERIAL_HINT = "e.g. svk:E=7e8,nu=0.33,density=2700"
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
-    """The arguments, with `command` the function that does them. UsageError; SystemExit after --help."""
+    """Parsed arguments, with `command` the function to call. UsageError; SystemExit after --help."""
     from .. import __version__
 
     top = Parser(
@@ -105,17 +105,17 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     if rest:
         known = commands.choices[words[0]]._option_string_actions if words[0] in commands.choices else ()
         hint = did_you_mean(rest[0].partition("=")[0], known) if rest[0].startswith("-") else ""
-        raise UsageError(f"unrecognized arguments: {' '.join(rest)}{hint} (warpfea {words[0]} --help tells more)")
+        raise UsageError(f"unknown option: {' '.join(rest)}{hint} (see warpfea {words[0]} --help)")
     arguments.words = list(words)
     if not hasattr(arguments, "command"):
         top.print_help()
         names = "run, scenes, info, render, bench, study, stress, profile"
-        raise UsageError(f"give a command: {names} ({top.prog} --help tells more)")
+        raise UsageError(f"give a command: {names} (see {top.prog} --help)")
     return arguments
 
 
 def _join_negative(words: Sequence[str]) -> list[str]:
-    """`--gravity -1,0,0` as `--gravity=-1,0,0`: argparse takes a word that begins with - for an option."""
+    """`--gravity -1,0,0` as `--gravity=-1,0,0`: argparse treats words that begin with - as options."""
     out: list[str] = []
     for word in words:
         if out and out[-1] in ("--gravity", "--view", "--range") and re.match(r"-[\d.]", word):
@@ -126,7 +126,7 @@ def _join_negative(words: Sequence[str]) -> list[str]:
 
 
 def _add_model(to: argparse.ArgumentParser) -> None:
-    """What is simulated and how: shared by run and info."""
+    """Model and solver options common to run and info."""
     to.add_argument("what", metavar="SCENE", help="a scene, file.py or file.py:scene, or a mesh (.msh, .vtu, .inp)")
     to.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter of the scene")
     mesh = to.add_argument_group("for a mesh file (vectors are x,y,z; repeat an option for several groups)")
@@ -231,7 +231,7 @@ def _add_run(commands: Any) -> None:
 
 
 def _add_look(to: Any) -> None:
-    """What pictures show."""
+    """Options of pictures."""
     to.add_argument(
         "--field",
         metavar="NAME",

@@ -1,4 +1,4 @@
-"""A mesh file with materials, supports and loads given on the command line, made into a scene."""
+"""Scene of a mesh file with materials, supports and loads from the command line."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DAMPING = ("eta", "lambda_v", "form")
 
 
 def part_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]:
-    """The scene of a mesh file, and the parameters that its summary names. UsageError, ModelError, MeshError."""
+    """Scene of a mesh file, and the parameters of its summary. UsageError, ModelError, MeshError."""
     path = existing(options.what)
     if options.set:
         raise UsageError(f"--set {options.set[0]}: a mesh file has no parameters; --set is for scenes")
@@ -70,7 +70,7 @@ def part_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
 
 
 def mesh_facts(mesh: meshes.Mesh) -> dict[str, Any]:
-    """What a mesh holds: counts, box (m), volume (m^3; area of quads, m^2), and the size of each group."""
+    """Contents of a mesh: counts, box (m), volume (m^3; area of quads, m^2), and the size of each group."""
     low, high = mesh.bounding_box()
     return {
         "cells": mesh.cell_type,
@@ -122,7 +122,7 @@ def _materials(path: pathlib.Path, mesh: Any, laws: list[tuple[str, materials.Ma
 
 
 def parse_material(text: str) -> tuple[str, materials.Material]:
-    """Group ("" for the whole mesh) and law of `[GROUP=]LAW:NAME=VALUE,...`. UsageError says what is wrong."""
+    """Group ("" for the whole mesh) and law of `[GROUP=]LAW:NAME=VALUE,...`. UsageError names the error."""
     where = f"--material {text}"
     head, colon, tail = text.partition(":")
     group, _, name = head.rpartition("=")
@@ -150,7 +150,7 @@ def parse_material(text: str) -> tuple[str, materials.Material]:
 
 
 def _hint(text: str) -> str:
-    """What to write for a text that is no number."""
+    """Hint for a text that is not a number."""
     return "; commas stand between the values" if ";" in text else number_hint(text)
 
 
@@ -171,13 +171,13 @@ def _damping(where: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _maker(where: str, law: Any, values: dict[str, Any]) -> Callable[..., materials.Material]:
-    """The constructor that takes these names: the law's own, or from_E_nu."""
+    """Constructor for these names: the law's own, or from_E_nu."""
     makers = [law, law.from_E_nu]
     wanted: list[str] = []
     known = [*DAMPING]
     for make in makers:
         names = [n for n in inspect.signature(make).parameters if n != "damping"]
-        needed = [n for n in names if n not in ("ratio", "density")]  # the model says where a density is missing
+        needed = [n for n in names if n not in ("ratio", "density")]  # a missing density is reported by the model
         if set(values) <= set(names) and set(needed) <= set(values):
             return make  # type: ignore[no-any-return]
         wanted.append(", ".join([*needed, "density"]))

@@ -1,4 +1,4 @@
-"""`warpfea profile`: where the time of a step goes, as a table, JSON and a picture."""
+"""`warpfea profile`: run time of a step by part and kernel, as a table, JSON and a picture."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ KEYS = (
     "versions",
 )
 SHOWN = 15
-"""Kernels that are listed one by one."""
+"""Maximum number of kernels listed one by one."""
 
 
 def profile(options: argparse.Namespace) -> int:
-    """Do `warpfea profile SCENE`."""
+    """Run `warpfea profile SCENE`."""
     check_targets(options)
     if options.png:  # before any work
         from ..studies.plots import require_matplotlib
@@ -83,7 +83,7 @@ def profile(options: argparse.Namespace) -> int:
 
 
 def _content(source: Source, sim: Simulation, found: Profile) -> dict[str, Any]:
-    """What the JSON holds."""
+    """Contents of the JSON."""
     info = sim.model.info()
     content = {
         "schema": SCHEMA,

@@ -1,4 +1,4 @@
-"""`warpfea run`: simulate, write files, sum up."""
+"""`warpfea run`: simulate, write files, summarise."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ TARGETS: dict[str, Sequence[str]] = {
 EVERY = 100
 """Steps between checkpoints."""
 STATIC_SPEED = 0.5
-"""Of the load per second of an animation of --static."""
+"""Load factor per second of an animation of --static."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """Do `warpfea run`."""
+    """Run `warpfea run`."""
     check_targets(options)
     _check_kind(options)
     _check_look(options)
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
             status = "interrupted"
             raise
         finally:
-            with interruptible():  # all is done but the report: Ctrl-C does not take it away
+            with interruptible():  # only the report remains: Ctrl-C must not discard it
                 wall_s = clock.perf_counter() - began
                 _report(options, sim, summarize(source, sim, status=status, wall_s=wall_s, setup_s=setup_s), before)
     return DONE
@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
 def _report(
     options: argparse.Namespace, sim: Simulation, summary: dict[str, Any], before: dict[pathlib.Path, Any]
 ) -> None:
-    """Write the summary, and print it. An output that fails here does not hide what ended the run.
+    """Write and print the summary. A failing output here does not hide the error that ended the run.
 
     `before` are the marks of the outputs before the run.
     """
@@ -106,7 +106,7 @@ def _report(
 
 
 def check_targets(options: argparse.Namespace) -> None:
-    """Before any work: UsageError for a wrong suffix, OutputError for a folder that is not there or not writable."""
+    """Before any work: UsageError for a wrong suffix, OutputError for a missing or read-only folder."""
     for name, suffixes in TARGETS.items():
         value = getattr(options, name, None)
         if value is None or (name == "json" and value == "-"):
@@ -125,7 +125,7 @@ FOR_MOTION = ("t_end", "dt", "error", "integrator", "png_time", "checkpoint", "r
 
 
 def _check_kind(options: argparse.Namespace) -> None:
-    """UsageError for options that belong to a motion given with --static, or the other way round."""
+    """UsageError for options of dynamics with --static, or the reverse."""
     if not options.static:
         if options.load_steps:
             raise UsageError("--load-steps is for --static")
@@ -150,30 +150,27 @@ USES = {
     "speed": ("an animation", ("gif",)),
     "every": ("checkpoints", ("checkpoint",)),
 }
-"""What an option is for, and the outputs of which one must be given."""
+"""Purpose of an option, and the outputs of which one must be given."""
 
 
 def _check_look(options: argparse.Namespace) -> None:
-    """UsageError for options of outputs that are not written, and for one that can't go on after --resume."""
+    """UsageError for options of missing outputs, and for outputs that can't be extended after --resume."""
     for name, (what, uses) in USES.items():
         if getattr(options, name) is not None and not any(getattr(options, use) for use in uses):
             option, outputs = name.replace("_", "-"), " or ".join(f"--{use}" for use in uses)
             raise UsageError(f"--{option} is for {what}: give {outputs} too")
     if options.resume and options.gif and pathlib.Path(options.gif).exists():
         raise UsageError(
-            f"--gif {options.gif}: is there, and a GIF can't be gone on with after --resume; give another name, or "
-            "draw the whole motion of --usd with warpfea render"
+            f"--gif {options.gif}: already exists, and a GIF can't be extended after --resume: choose another name, or "
+            "render the --usd file with warpfea render"
         )
 
 
 def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> None:
-    """UsageError for an end at the start, and for a picture of what is not reached."""
+    """UsageError for an end at the start, and for a picture after the end."""
     fixed = not (options.static or options.resume or isinstance(source.dt, str))
     if fixed and t_end <= SAME_TIME * float(source.dt):
-        raise UsageError(
-            f"--t-end {t_end:g}: no step would be done, for it is within {SAME_TIME:g} of a step from the start; give "
-            "a later --t-end"
-        )
+        raise UsageError(f"--t-end {t_end:g}: less than {SAME_TIME:g} of a step after the start: give a later end time")
     if options.png_time is not None and not 0.0 <= options.png_time <= t_end * (1.0 + 1e-9):
         raise UsageError(f"--png-time {options.png_time:g}: the run lasts from 0 to t = {t_end:g} s")
 
@@ -186,7 +183,7 @@ def _check_field(name: str | None, model: Model) -> None:
 
 
 def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> list[Output]:
-    """The writers that were asked for; their libraries are imported here."""
+    """The requested writers; their libraries are imported here."""
     out: list[Output] = []
     fps = options.fps or source.scene.fps
     extend = options.resume is not None
@@ -222,7 +219,7 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
 
 
 def _files(options: argparse.Namespace) -> dict[str, pathlib.Path]:
-    """The file that tells whether an output was written, by option; of a series its list."""
+    """File that proves an output was written, by option; of a series its index."""
     names = ("usd", "vtu", "png", "gif", "checkpoint", "json")
     files = {name: pathlib.Path(getattr(options, name)) for name in names if getattr(options, name) not in (None, "-")}
     if "vtu" in files:
@@ -231,7 +228,7 @@ def _files(options: argparse.Namespace) -> dict[str, pathlib.Path]:
 
 
 def _mark(file: pathlib.Path) -> tuple[int, int] | None:
-    """What changes when a file is written; writers put a new file in the place of an old one. None: there is none."""
+    """File identity (inode, time, size), or None: detects whether a writer replaced the file."""
     try:
         stat = file.stat()
     except OSError:
@@ -240,7 +237,7 @@ def _mark(file: pathlib.Path) -> tuple[int, int] | None:
 
 
 def _written(options: argparse.Namespace, before: dict[pathlib.Path, Any]) -> list[str]:
-    """The outputs that this run has written, with what is known of them; `before` are the marks from before it."""
+    """Outputs written by this run, with their properties; `before`: file identities before it."""
     notes: dict[str, Any] = {"usd": "validated, for usdview, Blender, Omniverse", "vtu": "for ParaView"}
     texts = []
     for name, file in _files(options).items():

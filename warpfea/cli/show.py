@@ -23,7 +23,7 @@ __all__ = ["info", "render", "scenes"]
 
 
 def scenes(options: argparse.Namespace) -> int:
-    """Do `warpfea scenes [SCENE]`."""
+    """Run `warpfea scenes [SCENE]`."""
     what = options.what
     if what is None:
         found = [find(name) for name in names()]
@@ -57,7 +57,7 @@ def _one_scene(found: Scene[Any]) -> str:
 
 
 def info(options: argparse.Namespace) -> int:
-    """Do `warpfea info SCENE`."""
+    """Run `warpfea info SCENE`."""
     check_targets(options)
     if is_mesh(options.what) and not options.material:
         return _mesh_info(options)
@@ -83,7 +83,7 @@ def info(options: argparse.Namespace) -> int:
 
 
 def _mesh_info(options: argparse.Namespace) -> int:
-    """What a mesh file holds, without a material."""
+    """Contents of a mesh file, without a material."""
     facts = mesh_facts(meshes.read(existing(options.what), scale=options.scale or 1.0))
     if options.json:
         write_json(options.json, plain({"scene": options.what, "mesh": facts}))
@@ -143,7 +143,7 @@ def _info_table(content: dict[str, Any]) -> str:
 
 
 def _body_rows(bodies: list[dict[str, Any]]) -> list[list[str]]:
-    """A row for each body; of many a row for all alike."""
+    """A row for each body; one common row for many."""
     texts = {}
     for body in bodies:
         rules, materials = ", ".join(body["quadrature"]), ", ".join(body["materials"])
@@ -171,12 +171,12 @@ def _joint_rows(joints: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def _bodies(c: dict[str, Any]) -> str:
-    """What touches what."""
+    """Bodies and colliders in contact."""
     return f"body {c['body']} on {c['collider'] if 'collider' in c else 'body ' + c['with']}"
 
 
 def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
-    """A row for each contact; of many a count."""
+    """A row for each contact; a count for many."""
     if len(contacts) > MANY:
         left = sum(c["left_out"] for c in contacts)
         return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_clamped(left)}"]]
@@ -188,17 +188,17 @@ def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def _triangles(contact: dict[str, Any]) -> str:
-    """What to say of a collider that is a mesh."""
+    """Text of a mesh collider."""
     return f" ({contact['triangles']} triangles)" if "triangles" in contact else ""
 
 
 def _clamped(count: int) -> str:
-    """What to say of points that are left out."""
+    """Text of unused points."""
     return f", {count} clamped ones left out" if count else ""
 
 
 def render(options: argparse.Namespace) -> int:
-    """Do `warpfea render`."""
+    """Run `warpfea render`."""
     from ..outputs.render import render_usd
 
     suffix = pathlib.Path(options.output).suffix.lower()

@@ -1,4 +1,4 @@
-"""What SCENE on the command line stands for: a scene, one of a user's file, or a mesh; and its simulation."""
+"""Resolution of the SCENE argument: scene, user file or mesh; its simulation."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from .part import OPTIONS, part_scene
 __all__ = ["Source", "find_scene", "is_mesh", "load", "progress", "resolve"]
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".step", ".stp", ".iges", ".igs", ".brep", ".geo", ".3mf")
-"""Formats of surfaces and shapes, which hold no elements."""
+"""Formats of surfaces and shapes, without elements."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A scene with its parameters and the options of a run.
+    """Scene with its parameters and the options of a run.
 
     Attributes:
-        label: what the user wrote.
-        scene: the scene. values: what it is called with.
-        parameters: what a summary says.
+        label: text of the argument.
+        scene: the scene. values: its arguments.
+        parameters: those of the summary.
         dt, integrator, dtype, device, tol, solver, inversion, error, energy_growth: of the run.
         load_steps, static_tol: of statics; None: a motion, the solver's default. stabilise: of statics.
     """
@@ -58,7 +58,7 @@ class Source:
         return self.scene.build(self.values).finalize(device=self.device, dtype=self.dtype)
 
     def simulation(self, model: Model, show: bool | None) -> Simulation:
-        """The simulation, or with load steps that of statics; shows a bar while kernels compile."""
+        """The simulation (dynamic, or static with load steps); shows a bar while kernels compile."""
         if self.load_steps is not None:
             with compile_bar(show) as bar:
                 return begin_static(
@@ -84,23 +84,23 @@ class Source:
 
 
 def progress(options: argparse.Namespace) -> bool | None:
-    """Whether to show bars; None: when stderr is a terminal."""
+    """True to show bars; None: if stderr is a terminal."""
     return False if options.quiet or options.no_progress else None
 
 
 def is_mesh(what: str) -> bool:
-    """Whether SCENE is a mesh file."""
+    """True if SCENE is a mesh file."""
     return pathlib.Path(what).suffix.lower() in FORMATS
 
 
 def load(file: str) -> dict[str, Scene[Any]]:
     """The scenes of a file by name; an error in it is a ModelError with file and line."""
-    # absolute: Python knows the file's code by that path, and so its lines are found
+    # absolute: Python stores the file's code under that path, so tracebacks show its lines
     return load_file(existing(file).absolute())
 
 
 def find_scene(what: str) -> Scene[Any]:
-    """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists what there is."""
+    """The scene NAME, file.py or file.py:NAME. ModelError or UsageError lists the known ones."""
     file, _ = split_name(what)
     if file is None:
         _check_suffix(what)
@@ -110,20 +110,19 @@ def find_scene(what: str) -> Scene[Any]:
 
 
 def _check_suffix(what: str) -> None:
-    """UsageError for a file that is neither a scene nor a mesh that can be read."""
+    """UsageError for a file that is neither a scene nor a readable mesh."""
     suffix = pathlib.Path(what).suffix
     if not suffix:
         return
     formats = ", ".join(f"{end} ({name})" for end, name in FORMATS.items())
-    text = f"{what}: {suffix} is not a format of meshes that is read, nor a scene; meshes are read from {formats}, "
-    text += "scenes from .py"
+    text = f"{what}: unsupported file type {suffix}: neither a scene (.py) nor a mesh ({formats})"
     if suffix.lower() in SURFACES:
         text += f"; {suffix} describes a surface or a shape, not elements: fill it with tetrahedra, in Gmsh for example"
     raise UsageError(text)
 
 
 def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = None) -> Source:
-    """The scene and options of `run` and `info`; dt, integrator and precision of a checkpoint go before the scene's."""
+    """Scene and options of `run` and `info`; dt, integrator and precision of a checkpoint override the scene's."""
     saved = checkpoint or {}
     if is_mesh(options.what):
         found, parameters = part_scene(options)

@@ -10,7 +10,7 @@ __all__ = ["stress"]
 
 
 def stress(options: argparse.Namespace) -> int:
-    """Do `warpfea stress`: 3 where a row did not meet its criterion."""
+    """Run `warpfea stress`; 3 if a row fails its criterion."""
     from ..studies.stress import suite
 
     return DONE if suite.stress(options) else NOT_CONVERGED

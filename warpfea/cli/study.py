@@ -1,4 +1,4 @@
-"""`warpfea study`: those of scenes, and those of `measuring.STUDIES`."""
+"""`warpfea study`: studies of scenes, and `measuring.STUDIES`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SAME = ("reference", "mesh", "measure", "target", "split", "repeat", "limit", "o
 
 
 def study(options: argparse.Namespace) -> int:
-    """Do `warpfea study STUDY`."""
+    """Run `warpfea study STUDY`."""
     with contextlib.redirect_stdout(None) if options.quiet else contextlib.nullcontext():
         module = {"ancf-tets": "ancf_tets.command", "peer-meshes": "bench.peer_meshes"}.get(
             options.study, options.study
@@ -29,7 +29,7 @@ def study(options: argparse.Namespace) -> int:
 
 
 def accuracy(options: argparse.Namespace) -> int:
-    """Do `warpfea study SCENE`: 3 where nothing reaches the target."""
+    """Run `warpfea study SCENE`; 3 if no setting reaches the target."""
     scene = find_scene(options.what)
     texts = list(options.over)
     texts += [f"method={options.methods}"] if options.methods else []

@@ -1,4 +1,4 @@
-"""The summary of a run: JSON with fixed keys, and a table for people."""
+"""Summary of a run: JSON with fixed keys, and a readable table."""
 
 from __future__ import annotations
 
@@ -56,40 +56,41 @@ KEYS = (
     "stable",
 )
 MANY = 12
-"""Joints and contacts that are listed one by one."""
+"""Maximum number of joints and contacts listed one by one."""
 WORST = 4
-"""Joints and contacts listed of more."""
+"""Number of joints and contacts listed of more."""
 SHARE = 0.05
-"""Of the energy turned over that the integrator may take without a word."""
+"""Numerical dissipation over the energy exchanged above which the summary suggests another scheme."""
 LESS = {
     "backward_euler": "--integrator bdf2 takes far less of slow motion, energy_momentum nothing; a smaller --dt less",
     "bdf2": "--integrator energy_momentum takes nothing, a smaller --dt less",
     "generalized_alpha": "--integrator energy_momentum takes nothing, a larger rho_inf or a smaller --dt less",
     "energy_momentum": "contact takes it at the end of steps; a smaller --dt takes less",
 }
-"""What to write where it takes more."""
+"""Suggestion for large numerical dissipation."""
 ADDED = "--integrator bdf2 or 'energy_momentum(rho_inf=0.8)', or a smaller --dt"
-"""What to write where generalized-alpha was warned of adding energy."""
+"""Suggestion after a warning that generalized-alpha adds energy."""
 NO_J = 1e30
-"""What a step reports for the smallest J where no element has one."""
+"""Reported min J without elements that have one."""
 
 
 def summarize(
     source: Source, sim: Simulation, *, status: str, wall_s: float, setup_s: float | None = None
 ) -> dict[str, Any]:
-    """The summary of a run of one world, SI units.
+    """Summary of a run of one world, SI units.
 
-    `analysis` is "dynamic" or "static"; `t_end` the time that was reached, of statics `load` the part of the load, 0 to
-    1, with `steps` load steps; `substeps` are the accepted ones of dt="auto", whose `steps` are intervals, else null;
-    `mass` is null where a density is missing, `bounding_box` that of the reference; `wall_s` are the seconds from
+    `analysis` is "dynamic" or "static"; `t_end` the time reached, in statics `load` the load factor, 0 to 1, with
+    `steps` load steps; `substeps` are the accepted ones of dt="auto", whose `steps` are intervals, else null;
+    `mass` is null if a density is missing, `bounding_box` that of the reference; `wall_s` are the seconds from
     building to the closing of files: `setup_s` until the first step, of which `compile_s` to make the simulation with
-    its kernels, `output_s` to write files, `solve_s` the rest; `min_J` is the smallest det F of any step, null where
+    its kernels, `output_s` to write files, `solve_s` the rest; `min_J` is the smallest det F of any step, null if
     there is none; `rough_steps` are those accepted short of the tolerance (Jacobi), `floored_steps` those whose
-    residual rounding stopped above it, and `max_floor` the largest error that was estimated there (`StepReport.floor`),
+    residual rounding stopped above it, and `max_floor` the largest error that was estimated there
+    (`StepReport.floor`),
     0 without such steps; energies and probes are the last values, of statics the strain energy alone; `violation` is
     the largest of the constraints in any step, m; `contacts` has by name the largest normal_force, N, and penetration,
-    m, of any step, and the last force, N, area, m^2, and stick; `stable` is whether the equilibrium of statics is, null
-    where that is not known.
+    m, of any step, and the last force, N, area, m^2, and stick; `stable` is the stability of the static equilibrium,
+    null if unknown.
     """
     setup_s = min(sim.compile_s if setup_s is None else setup_s, wall_s)
     output_s = min(sim.output_s, wall_s - setup_s)
@@ -170,18 +171,18 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
         reached = s["steps"] - s["rough_steps"]
         tol = number(sim.solver.tolerance(s["dtype"]))
         rows.append(
-            ["NOT CONVERGED", f"{reached} of {s['steps']} steps ({reached / steps:.0%}) reached the tolerance {tol}"]
+            ["NOT CONVERGED", f"tolerance {tol} reached in {reached} of {s['steps']} steps ({reached / steps:.0%})"]
         )
     e = s["energies"]
     parts = [f"{name} {_text(e[name])}" for name in ("kinetic", "strain", "potential", "work", "viscous") if name in e]
     rows.append(["energy", f"{', '.join(parts)} J"])
     if s["load"] is None:
         lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
-        rows.append(["", f"lost by the integrator {lost} J, unbalanced {left} J"])
+        rows.append(["", f"numerical dissipation {lost} J, energy imbalance {left} J"])
         rows += _suggestion(sim)
         if s["contacts"]:
             stored = _text((e["contact"] or 0.0) + (e["contact_pairs"] or 0.0))
-            lost = f"lost to restitution {_text(e['contact_loss'])}, to friction {_text(e['friction'])} J"
+            lost = f"dissipated: impact {_text(e['contact_loss'])}, friction {_text(e['friction'])} J"
             moved = f", done by colliders {_text(e['collider_work'])} J" if sim.model.description.colliders else ""
             rows.append(["", f"in contact {stored} J, {lost}{moved}"])
     for name, values in s["probes"].items():
@@ -200,7 +201,7 @@ def _times(s: dict[str, Any]) -> str:
 
 
 def _suggestion(sim: Simulation) -> list[list[str]]:
-    """A row that names other schemes where the integrator takes or gives much of the energy that is turned over."""
+    """A row suggesting other schemes if the integrator dissipates or adds much of the energy exchanged."""
     share, name = integrator_share(sim), sim.integrator.name
     if not share > SHARE:
         return []
@@ -209,7 +210,7 @@ def _suggestion(sim: Simulation) -> list[list[str]]:
 
 
 def _steps(s: dict[str, Any], sim: Simulation) -> str:
-    """How many steps of which size."""
+    """Numbers of steps by size."""
     if sim.error is None:
         end = s["steps"] * s["dt"] - s["t_end"]
         shorter = s["status"] == "done" and SAME_TIME * s["dt"] < end < s["dt"]
@@ -225,17 +226,17 @@ def model_box(model: Model) -> list[list[float]]:
 
 
 def box_text(box: Sequence[Sequence[float]]) -> str:
-    """The sides of a box for reading."""
+    """Readable sides of a box."""
     return " x ".join(number(high - low) for low, high in zip(*box)) + " m"
 
 
 def mass_text(mass: float | None) -> str:
-    """A mass for reading."""
+    """Readable mass."""
     return "no density" if mass is None else f"{number(mass)} kg"
 
 
 def _inverted(J: float, model: Model) -> str:
-    """What to say of J <= 0: laws that need J > 0 forbid it at the quadrature points, not at the vertices."""
+    """Text of J <= 0: laws that need J > 0 forbid it at the quadrature points, not at the vertices."""
     if any(block.key.law in ANY_J for block in model.blocks):
         advice = "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"
         return f"an element turned inside out: J = {number(J, 3)}; {advice}"
@@ -243,7 +244,7 @@ def _inverted(J: float, model: Model) -> str:
 
 
 def _iterations(s: dict[str, Any], sim: Simulation) -> str:
-    """Iterations, and what is left of the equations."""
+    """Iterations and residuals."""
     if s["steps"] == 0:
         return "no step was accepted"
     text = f"{_counts(s, sim)} per step, residual up to {_text(s['max_residual'], 2)}"
@@ -251,7 +252,7 @@ def _iterations(s: dict[str, Any], sim: Simulation) -> str:
 
 
 def _counts(s: dict[str, Any], sim: Simulation) -> str:
-    """Iterations per step; of steps that adapt those that were accepted count."""
+    """Iterations per step; accepted ones of adaptive steps."""
     steps = max(s["steps"] if s["substeps"] is None else s["substeps"], 1)
     first = s["newton_iterations"] / steps
     if isinstance(sim.solver, Jacobi):
@@ -273,12 +274,12 @@ def _joints(sim: Simulation) -> list[list[str]]:
             text += f", force {_text(force)} N, moment {_text(moment)} N m"
         rows.append([f"joint {joints[k].name}", text])
     if len(rows) < len(joints):
-        rows.append(["joints", f"{len(joints)} in all, of which these are violated most"])
+        rows.append(["joints", f"{len(joints)} joints; largest violations shown"])
     return rows
 
 
 def _contacts(sim: Simulation) -> dict[str, Any]:
-    """Of each contact that has been recorded the largest and the last values."""
+    """Maximum and last values of each recorded contact."""
     out = {}
     for contact in sim.model.description.all_contacts:
         record = sim.contact_record(contact)
@@ -307,7 +308,7 @@ def _text(value: float | None, digits: int = 4) -> str:
 
 
 def _short(parameters: dict[str, Any]) -> list[tuple[str, str]]:
-    """Parameters for one line: numbers short, empty ones left out."""
+    """Parameters in one line: numbers short, empty ones omitted."""
     out = []
     for name, value in parameters.items():
         if value not in (None, [], ""):

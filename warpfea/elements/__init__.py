@@ -1,4 +1,4 @@
-"""Element families as tables. A new one is a file here that calls `register` and is imported below."""
+"""Element families as tables. A new family is a file here that calls `register` and is imported below."""
 
 from . import ancf_beam, ancf_shell, ancf_solid, lagrange
 from .family import (

@@ -1,9 +1,9 @@
-"""What the ANCF families share: monomial bases, the nodal basis B^-1 b of Paper I, and Cartesian gradient slots.
+"""Common parts of ANCF elements: monomial bases, nodal basis B^-1 b of Paper I, Cartesian gradient slots.
 
-The functions of a family live on a parent square, cube or simplex, with slots r, r_xi, r_eta, r_zeta at each node. What
-neighbours share are gradients along axes of the node instead. A frame T = dX/dxi per element and node, in those axes,
-turns the functions of one into those of the other (Paper T's S* = S T; `fold`). Curved, stretched or turned elements
-then need nothing else, and elements that meet at a node share its slots however their own parent lines run.
+The functions of a family live on a parent square, cube or simplex, with slots r, r_xi, r_eta, r_zeta at each node.
+Neighbours share gradients along axes of the node instead. A frame T = dX/dxi per element and node, in those axes,
+transforms the functions of one into those of the other (Paper T's S* = S T; `fold`). This covers curved, stretched
+or rotated elements, and elements that meet at a node share its slots for any direction of their parent lines.
 """
 
 from __future__ import annotations

@@ -4,25 +4,25 @@ On the parent xi in [0, 1], eta, zeta in [-1/2, 1/2] the basis [1, u, v, w, uv, 
 cubics along the axis, linear in the section. Slot 1 is the gradient along the beam's axis, slots 2 and 3 are those
 along width and height of the section; each node has its own axes.
 
-Locking, and what the integrations do about it:
-- Poisson: a section that stays a parallelogram can't widen on one side and narrow on the other, so bending meets the
-  stiffness of uniaxial *strain*: with nu = 0.3, 1.35 E. The part D0 of the SVK law without coupling of the normal
+Locking, and the remedies of the integrations:
+- Poisson: a section that stays a parallelogram can't widen on one side and narrow on the other, so bending has the
+  stiffness of uniaxial *strain*: 1.35 E for nu = 0.3. The part D0 of the SVK law without coupling of the normal
   strains is integrated over the volume, the Poisson part D - D0 on the axis alone (Gerstmayr, Matikainen, Mikkola
   2008, Multibody Syst. Dyn. 20:359); bending then has E, tension the full law.
 - shear: section vectors turn linearly along an element, the slope of a cubic axis does not. Shear at the Gauss points
-  makes both agree there, and the axis loses its cubic part. "tied" takes the transverse shear at the nodes, where
-  neighbours share it. The deviation b of the axis from the sections in the middle of the element gets the energy that
-  its curvature would have, which is what bending lacks where a moment varies linearly along the element (the residual
+  makes both agree there, and the axis loses its cubic part. "tied" takes the transverse shear at the nodes, shared
+  by neighbours. The deviation b of the axis from the sections in the middle of the element gets the energy of its
+  curvature, missing in bending under a moment that varies linearly along the element (the residual
   bending flexibility of MacNeal 1978, Comput. Struct. 8:175).
 - thickness: a section vector interpolated between two directions is too short in between; "tied" takes the strain in
   the section at the nodes (Betsch and Stein 1995, Commun. Numer. Methods Eng. 11:899).
 - torsion and shear of a plane section (not locking, but too stiff as well): "tied" takes the section's own constants.
-"tied" has all of it, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I). What "tied"
-gives up: it passes the patch test under tension, not under shear tractions or pressure on its sides, which disturb the
-gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft by
-about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Tried and dropped:
-the curvature extrapolated from the middle and the ends, exact to fourth order in that angle, but it lets the axis's
-gradient trade stretch for curvature, an error of 0.4 (h/R)^2 that does not vanish with the mesh.
+"tied" has all remedies, "split" the first at 3x2x2 points (as Project Chrono's 3243), "full" none (Paper I). Limits
+of "tied": it passes the patch test under tension, not under shear tractions or pressure on its sides, which disturb
+the gradients of the axis (to second order in h/t, or by a tenth of the strain in the section); and bending is too soft
+by about 0.1 of the square of the angle that an element spans, as section vectors turn along a chord. Rejected:
+curvature extrapolated from the middle and the ends, exact to fourth order in that angle, but with an error of 0.4
+(h/R)^2 by exchange of stretch and curvature of the axis's gradient, not reduced by the mesh.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.nd
 
 
 def svk_only(material: Material) -> SVK:
-    """The material as SVK, which is the law that these integrations split. Raises ModelError for any other."""
+    """The material as SVK, required by these integrations. Raises ModelError for any other."""
     if not isinstance(material, SVK):
         raise ModelError(f"this integration splits the St. Venant-Kirchhoff law, not {type(material).__name__}")
     return material
@@ -138,7 +138,7 @@ def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
 
 
 def _shear_stress(material: Material) -> tuple[str, tuple[float, ...]]:
-    """The transverse shears at quadrature points, which "tied" needs for its stress output."""
+    """Transverse shears at quadrature points, for the stress output of "tied"."""
     _, mu = svk_only(material).lame
     return "orthotropic", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, mu, mu)
 

@@ -5,29 +5,29 @@ u = xi, w = eta and v = zeta: twelve functions of the mid-surface, and functions
 thickness. Slots 1 and 2 are gradients along the surface, slot 3 along the director; with bases on the parent square,
 shared nodes make the surface continuous also on distorted quads.
 
-Locking and its remedies, all in the choice of what is integrated where ("tied"):
+Locking and its remedies, by the choice of strains and integration points ("tied"):
 - Poisson (thickness): a director that is one vector per point can't strain linearly through the thickness, so bending
   is (1-nu)^2/(1-2nu) times too stiff (1.225 for nu = 0.3). The law is split into plane stress, integrated through the
   thickness, which needs no such strain, and the part that couples the thickness to the surface, integrated on the
   mid-surface alone (the split of Gerstmayr, Matikainen, Mikkola 2008 for beams, taken to shells).
 - shear: the bilinear director can't follow the slopes of the cubic surface, so a thin plate would have to bend with
-  constant curvature in each direction: it locks (a clamped 8x8 plate of t/L = 1e-3 deflects 3 % of what it should, with
-  3x3 points as with 4x4). The covariant transverse shears are taken at the corners and the middles of the edges they
-  run along, where neighbours share them, and interpolated (assumed natural strain, Dvorkin and Bathe 1984, Eng. Comput.
-  1:77; here quadratically along the edges, as the slopes of their Hermite cubics): two conditions per node and one per
-  edge are left, fewer than unknowns. Reissner's factor 5/6 counts for the shear stress that vanishes at the faces of a
-  real plate.
-- curvature thickness: a director interpolated between two directions is too short in between; on a curved or strongly
-  bent shell that costs more than bending (a thin quarter arc of 16 elements bends 0.13 of what it should). The strain
+  constant curvature in each direction: it locks (a clamped 8x8 plate of t/L = 1e-3 deflects 3 % of the exact value,
+  with 3x3 points as with 4x4). The covariant transverse shears are taken at the corners and the middles of the edges
+  they run along, shared by neighbours, and interpolated (assumed natural strain, Dvorkin and Bathe 1984, Eng. Comput.
+  1:77; here quadratically along the edges, as the slopes of their Hermite cubics): two conditions per node and one
+  per edge remain, fewer than unknowns. Reissner's factor 5/6 accounts for the shear stress vanishing at the faces.
+- curvature thickness: a director interpolated between two directions is too short in between; on a curved or
+  strongly bent shell the spurious strain energy exceeds that of bending (a thin quarter arc of 16 elements bends
+  0.13 of the exact value). The strain
   across the thickness is taken at the nodes and interpolated (Betsch and Stein 1995, Commun. Numer. Methods Eng.
   11:899). The strains in the surface that it is coupled to are taken at 2x2 points, which integrate their variations on
-  any flat quad; at the nodes alone they do not balance those of plane stress, and a pressed plate is not uniform (its
-  pressure on a flat collider varied by 1e-3). Means of the surface gradients at the nodes, in place of strains at
+  any flat quad; at the nodes alone they do not balance those of plane stress, and the pressure of a pressed plate on
+  a flat collider varies by 1e-3. Means of the surface gradients at the nodes, in place of strains at
   points, lock a thin arc (0.83 of the deflection with 16 elements, 0.37 with 8). Strains averaged to the nodes do not,
   but make the surface stiffer (Cook's membrane, nu = 0.49, 4x4 elements: by 6 %).
 - membrane: needs no remedy. The cubic surface follows an arc without stretching to fourth order in its angle; with the
   thickness strain out of the way a thin arc (R/t = 1000) bends as a thick one does: plane stress stays at 4x4 points.
-"full" is Paper I's law at 4x4x2 points, without remedies. What "tied" gives up: it passes the patch test under plane
+"full" is Paper I's law at 4x4x2 points, without remedies. Limits of "tied": it passes the patch test under plane
 stress and a pressure on both faces on any mesh, and under uniform transverse shear on parallelograms; on general quads
 that is off by a few percent of the shear. "full" passes all of these.
 """
@@ -66,7 +66,7 @@ def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.nd
 
 
 def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
-    """The part integrated through the thickness: plane stress, without strain across it and transverse shear."""
+    """Part integrated through the thickness: plane stress, without thickness strain and transverse shear."""
     m = svk_only(material)
     _, mu = m.lame
     c = m.E / (1.0 - m.nu * m.nu)
@@ -74,13 +74,13 @@ def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
 
 
 def _thickness_part(material: Material) -> tuple[str, tuple[float, ...]]:
-    """The rest, (d/2) (E_33 + k (E_11 + E_22))^2 with d = lambda + 2 mu and k = nu/(1 - nu): 0 in plane stress."""
+    """Remainder, (d/2) (E_33 + k (E_11 + E_22))^2 with d = lambda + 2 mu and k = nu/(1 - nu): 0 in plane stress."""
     lam, mu = svk_only(material).lame
     return "assumed_strain", (lam + 2.0 * mu,)
 
 
 def _thickness_stress(material: Material) -> tuple[str, tuple[float, ...]]:
-    """The law of `_thickness_part` at points, for stress output."""
+    """Law of `_thickness_part` at points, for stress output."""
     m = svk_only(material)
     lam, mu = m.lame
     c = m.E / (1.0 - m.nu * m.nu)
@@ -89,7 +89,7 @@ def _thickness_stress(material: Material) -> tuple[str, tuple[float, ...]]:
 
 
 def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
-    """The transverse shear, taken at tying points."""
+    """Transverse shear at tying points."""
     _, mu = svk_only(material).lame
     return "assumed_strain", (mu,)
 

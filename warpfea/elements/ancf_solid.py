@@ -52,7 +52,7 @@ def tet_functions(xi: np.ndarray, elimination: float | None = None) -> tuple[np.
 
     Args:
         xi: (Q, 3) points of the unit tetrahedron.
-        elimination: the coefficient c of FN's face centroids; None for ENMC, which keeps them.
+        elimination: coefficient c of FN's face centroids; None for ENMC.
 
     Returns:
         s (Q, S) and ds/dxi (Q, S, 3), with S = 20 or 16.

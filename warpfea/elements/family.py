@@ -1,4 +1,4 @@
-"""What an element family is: slots per node, shape functions, quadrature rules, faces. All else reads these tables."""
+"""Element family tables: slots, shape functions, quadrature, faces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Family", "Lattice", "Parent", "Part", "Tying", "families", "for_cell
 
 @dataclass(frozen=True, eq=False)
 class Tying:
-    """Strains e = 2 E_ab taken at tying points, and their energy (mu/2) e.A e in an element, J.
+    """Assumed strains e = 2 E_ab at tying points, and their energy (mu/2) e.A e in an element, J.
 
     Attributes:
         points: (n, 3) parent coordinates.
@@ -26,7 +26,7 @@ class Tying:
         coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q), the
             rule, the material, the body's section) -> A (E, n, width).
         width: A couples the points of each run of `width` points.
-        uses: constants of the material that A depends on.
+        uses: material constants in A.
     """
 
     points: np.ndarray
@@ -38,7 +38,7 @@ class Tying:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One integral of an element's strain energy; most elements have one, remedies against locking split it in several.
+    """One integral of an element's strain energy; most elements have one, locking remedies split it.
 
     Attributes:
         name: name in reports.
@@ -73,7 +73,7 @@ class Parent:
         return np.full(3, 0.25) if self.low is None else 0.5 * (np.array(self.low) + np.array(self.high))
 
     def outside(self, xi: np.ndarray) -> np.ndarray:
-        """How far points (..., 3) lie outside, (...,) in parent units; 0 inside."""
+        """Outside distance of points (..., 3), (...,) in parent units; 0 inside."""
         if self.low is None:
             least = np.minimum(xi.min(axis=-1), 1.0 - xi.sum(axis=-1))
             return np.maximum(-least, 0.0)
@@ -82,7 +82,7 @@ class Parent:
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """How one element is drawn as cells of VTK: parent points (P, 3), a meshio cell type, cells (C, n)."""
+    """VTK drawing of an element: parent points (P, 3), meshio cell type, cells (C, n)."""
 
     points: np.ndarray
     cell_type: str
@@ -94,29 +94,28 @@ class Family:
     """An element family as tables: r = sum e_i s_i, F = sum e_i h_i^T (Eq. (1)) over its slots i.
 
     Attributes:
-        name: how users select it, e.g. "T10".
-        cell_type: mesh cell it is built on, e.g. "tetra10".
+        name: selector, e.g. "T10".
+        cell_type: mesh cell, e.g. "tetra10".
         node_slots: slot kinds of each element node; kind 0 is a position, 1..3 a gradient along the node's axes.
         shape: function (xi (Q, 3), nodes (E, n, 3)[, frames (E, n, 3, 3)]) -> (s (E or 1, Q, S),
-            ds (E or 1, Q, S, 3)), ds = ds/dxi. A family whose functions do not depend on the element's shape returns
-            one row.
+            ds (E or 1, Q, S, 3)), ds = ds/dxi. One row if the functions are independent of the element's shape.
         rules: force quadrature rules by name; the first is the default.
         curved_rule: default force rule of curved elements (the patch test on a curved T10 needs degree 3).
         mass_rule: rule that integrates s_i s_j rho det J0 exactly on straight elements.
-        curved_mass_rule: the same on curved ones.
-        vertices: (4, 3) parent coordinates of the vertices where J is tested beside the points.
-        affine: whether an element with straight sides has one J0.
+        curved_mass_rule: mass rule of curved elements.
+        vertices: (4, 3) parent coordinates of the vertices, further test points of J.
+        affine: True if J0 is constant in elements with straight sides.
         parent: the parent domain.
         faces: parent corners of each face, (3, 3) triangles or (4, 3) quadrilaterals, outward; mesh cells of solids
             count their faces in the same order.
         face_rule: rule on the unit triangle or square, exact for a pressure on a flat face.
         divisions: parts (a, b) into which each face is cut along its two sides for drawing; triangles take the first.
         node_samples: (n, k, 3) parent points at each element node where fields are evaluated for drawing.
-        lattice: how an element is drawn in VTK.
-        schemes: integrations of several parts by name; every force rule is one of a single part besides.
+        lattice: drawing of an element in VTK.
+        schemes: integrations of several parts by name; each force rule is also one of a single part.
         output_schemes: integrations that are for stress output only: "shear stress" in place of a tied part "shear".
         slot_sets: slot kinds by the name under which supports may hold them.
-        spin_vectors: what a moment turns: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
+        spin_vectors: rotated by a moment: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
             or a shell's surface offers almost no rotational stiffness at a point, and must not carry it.
         solid: the mesh cell is the body itself; False for beams and shells, which add a section or a thickness.
     """
@@ -165,7 +164,7 @@ class Family:
 
     @property
     def has_gradients(self) -> bool:
-        """Whether nodes carry gradient slots."""
+        """True if nodes carry gradient slots."""
         return any(k > 0 for kinds in self.node_slots for k in kinds)
 
     def kinds(self, names: str) -> set[int]:
@@ -175,7 +174,7 @@ class Family:
         for name in str(names).split("+"):
             if name not in known:
                 raise ModelError(
-                    f"slots = {names!r}: element {self.name} knows {', '.join(map(repr, known))}, and several of them "
+                    f"slots = {names!r}: valid slots of element {self.name}: {', '.join(map(repr, known))}, or several "
                     f"joined by '+'{did_you_mean(name, known)}"
                 )
             out |= set(known[name])

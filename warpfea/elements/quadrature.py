@@ -29,7 +29,7 @@ class Rule:
     """A quadrature rule.
 
     Attributes:
-        name: how users select it.
+        name: selector.
         points: (Q, 3) or (Q, 2) parent coordinates.
         weights: (Q,), with sum equal to the parent's volume or area.
         degree: total degree of the polynomials integrated exactly.
@@ -44,9 +44,9 @@ class Rule:
 
     @property
     def radial(self) -> bool:
-        """Whether a tetrahedron's rule has a point on each line from the centroid to vertices 0-3, in this order.
+        """True if a tetrahedron's rule has a point on each line from the centroid to vertices 0-3, in this order.
 
-        The centroid may come before them.
+        The centroid may precede them.
         """
         if self.points.shape not in ((4, 3), (5, 3)):
             return False
@@ -100,7 +100,7 @@ def _tet14() -> Rule:
 TET_RULES: dict[str, Rule] = {
     "tet1": Rule("tet1", np.full((1, 3), 0.25), np.array([1.0 / 6.0]), 1),
     "tet4": _barycentric("tet4", 2, [(0.25, _orbit4((5.0 - np.sqrt(5.0)) / 20.0))]),
-    # Paper I's rule, Eq. (11); its negative weight makes a T10 mass matrix indefinite
+    # Paper I's rule, Eq. (11); its negative weight makes the T10 mass matrix indefinite
     "tet5_paper": _barycentric("tet5_paper", 3, [(-0.8, np.full((1, 4), 0.25)), (0.45, _orbit4(1.0 / 6.0))]),
     "tet8": _tet8(),
     "tet14": _tet14(),
@@ -161,8 +161,8 @@ def triangle_7() -> Rule:
 def triangle_16() -> Rule:
     """Vertices, two points on each side, six inside and the centre: degree 7 with positive weights.
 
-    The solution of the eight moment equations of an orbit of vertices, one of six points on the sides, two of three
-    points inside and the centre; contact between bodies needs corners, and many points where meshes do not match.
+    Solution of the eight moment equations of an orbit of vertices, one of six points on the sides, two of three
+    interior points and the centre; contact between non-matching meshes needs corners and many points.
     """
     side, near, far = 0.160700827727076, 0.1549360602237603, 0.46915074614381225
     points = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]
@@ -216,11 +216,11 @@ def lobatto_square(n: int) -> Rule:
 
 
 def composite(rule: Rule, parts: int) -> Rule:
-    """A rule on the unit square or triangle repeated on parts x parts equal parts, for integrands with kinks."""
+    """Composite rule: a rule on the unit square or triangle on parts x parts equal parts, for integrands with kinks."""
     if parts == 1:
         return rule
     cells = [(np.array([i, j]), 1.0) for i in range(parts) for j in range(parts)]
-    if rule.weights.sum() < 0.75:  # the triangle: upright parts, and turned ones between them
+    if rule.weights.sum() < 0.75:  # triangle: upright parts, and inverted ones between them
         cells = [(np.array([i, j]), 1.0) for i in range(parts) for j in range(parts - i)]
         cells += [(np.array([i + 1, j + 1]), -1.0) for i in range(parts - 1) for j in range(parts - 1 - i)]
     points = np.concatenate([(corner + sign * rule.points) / parts for corner, sign in cells])

@@ -14,9 +14,9 @@ __all__ = ["Rectangle"]
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A rectangular section: width and height, m; the height lies along the beam's normal.
+    """Rectangular section: width and height, m; the height lies along the beam's normal.
 
-    The section of an element stays plane, which makes it too stiff in shear and in torsion, where a real one warps;
+    The section of an element stays plane, hence too stiff in shear and torsion, where a real one warps;
     integration "tied" corrects both with the constants of beam theory.
 
     Args:

@@ -1,4 +1,4 @@
-"""Meshes: :class:`Mesh`, :func:`read` for files, :func:`from_meshio` for what meshio has read, generators with named
+"""Meshes: :class:`Mesh`, :func:`read` for files, :func:`from_meshio` for meshio's meshes, generators with named
 sides, :func:`check` and :func:`linear`.
 
 Lengths are in metres once read (``scale``). Set names come from the file's groups, or from the generator's sides.

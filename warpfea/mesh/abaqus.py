@@ -35,15 +35,15 @@ Members = dict[str, list[Ints]]
 def read_inp(file: Path) -> RawMesh:
     """Read *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE of type ELEMENT.
 
-    Messages name ids as the file has them. Any number of *NODE and *ELEMENT blocks is fine; reference nodes
-    of the assembly are left out. Face labels S1, S2, .. of solids and edge labels E1 .. E4 of shells are the
+    Messages use the file's ids. Any number of *NODE and *ELEMENT blocks is accepted; reference nodes of the assembly
+    are ignored. Face labels S1, S2, .. of solids and edge labels E1 .. E4 of shells are the
     local faces 0, 1, ...
 
     Raises
     ------
     MeshError
-        Several parts, instances with a translation, generated nodes or elements, unknown element types, ids
-        that are defined twice or not at all, unknown face labels, bad numbers.
+        Several parts, instances with a translation, generated nodes or elements, unknown element types, repeated or
+        undefined ids, unknown face labels, bad numbers.
     """
     blocks = list(_blocks(file.read_text(encoding="utf-8", errors="replace")))
     for keyword, _, _ in blocks:
@@ -85,7 +85,7 @@ def read_inp(file: Path) -> RawMesh:
 
 
 def _read_elements(raw: RawMesh, blocks: list[Block], node_ids: _Ids) -> tuple[list[Ints], Members]:
-    """Add the *ELEMENT blocks to the mesh; ids of the elements of each, and the sets that they name."""
+    """Add the *ELEMENT blocks to the mesh; returns the element ids of each block, and the named sets."""
     element_ids: list[Ints] = []
     members: Members = {}
     for keyword, options, lines in blocks:
@@ -161,7 +161,7 @@ def _block(keyword: str, lines: list[str]) -> Block:
 
 
 def _single_part(blocks: list[Block]) -> list[Block]:
-    """Drop what belongs to the assembly only; refuse what would need placing parts."""
+    """Drop assembly-only data; refuse transformations of parts."""
     kept: list[Block] = []
     inside, part, instances = "", 0, 0
     with_nodes: set[int] = set()
@@ -207,7 +207,7 @@ def _cell_type(name: str, lines: int) -> tuple[str, int]:
 
 
 def _face_labels(kinds: list[str]) -> list[str]:
-    """The labels that a *SURFACE may use: E1 .. E4 if there are no solids, else S1, S2, ... of their faces."""
+    """Labels valid in a *SURFACE: E1 .. E4 without solids, else S1, S2, ... of their faces."""
     solids = [kind for kind in kinds if cell_dimension(kind) == 3]
     if not solids:
         return ["E1", "E2", "E3", "E4"]

@@ -1,6 +1,6 @@
-"""Reading mesh files: the one place that touches meshio.
+"""Reading of mesh files, the only module that uses meshio.
 
-What meshio 5.3.5 gets wrong is handled here. Gmsh: sets are built from the tags, keyed by (dimension, tag),
+Workarounds for defects of meshio 5.3.5. Gmsh: sets are built from the tags, keyed by (dimension, tag),
 because its `cell_sets` are empty for MSH 2.2, lack unnamed groups, keep one of two groups that share a name,
 and 4.1 files with ungrouped entities fail; `$PhysicalNames` and `$Entities` are parsed here and meshio reads
 nodes and elements. Missing end markers (a truncated file) are only a warning there. VTU: cell types it skips
@@ -34,7 +34,7 @@ from .mesh import Mesh, transformation
 __all__ = ["FORMATS", "from_meshio", "is_meshio", "read", "read_triangles"]
 
 FORMATS = {".msh": "Gmsh 2.2 and 4.1", ".vtu": "VTK", ".inp": "Abaqus"}
-"""The mesh files that are read."""
+"""Supported mesh files."""
 
 
 def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None, cell_type: str | None = None) -> Mesh:
@@ -48,7 +48,7 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
     path : Gmsh .msh (2.2, 4.1; ASCII, binary), VTK .vtu or Abaqus .inp
     scale : metres per unit of the file
     transform : 4x4 matrix or (3x3, 3): X' = A (scale X) + t, in metres; no reflection
-    cell_type : "tetra", "tetra10", "hexahedron" or "quad" to insist on one
+    cell_type : "tetra", "tetra10", "hexahedron" or "quad" required cell type
 
     Sets
     ----
@@ -64,13 +64,13 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
     Raises
     ------
     MeshError
-        The file is missing or can't be read, holds solids of other types or of two types, or no solids and
-        surface cells other than quads, or fails a check of :func:`warpfea.mesh.check`.
+        A missing or unreadable file, solids of other types or of two types, or no solids and
+        surface cells other than quads, or a failed check of :func:`warpfea.mesh.check`.
 
     Warns
     -----
     MeshWarning
-        Nodes without elements; they keep their place in the numbering.
+        Unused nodes; they keep their numbers.
     """
     file = Path(path)
     label = str(file)
@@ -93,12 +93,12 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
 
 
 def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) and triangles (m, 3) of any file that meshio reads; quads are cut in two, all else left out.
+    """Points (n, 3) and triangles (m, 3) of any file that meshio reads; quads are split in two, other cells ignored.
 
     Raises
     ------
     MeshError
-        The file is missing or can't be read, or has no triangles.
+        A missing or unreadable file, or no triangles.
     """
     import meshio
 
@@ -122,7 +122,7 @@ def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
 
 
 def is_meshio(mesh: Any) -> bool:
-    """Whether an object is a meshio.Mesh; meshio itself is not imported."""
+    """True for a meshio.Mesh; meshio itself is not imported."""
     kind = type(mesh)
     return kind.__name__ == "Mesh" and kind.__module__.partition(".")[0] == "meshio"
 
@@ -133,7 +133,7 @@ def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type:
     Sets
     ----
     Its `cell_sets` and `point_sets`; Gmsh's physical groups by their names in `field_data`; other integer cell and
-    point arrays as of a VTU file. What meshio loses of a file's groups is lost: :func:`read` takes the file itself.
+    point arrays as of a VTU file. Groups dropped by meshio are missing: :func:`read` reads the file itself.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type:
     if cell_type is not None and cell_type not in FILE_CELLS:
         raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(FILE_CELLS)}")
     raw = _raw(mesh)
-    raw.duplicates = "gmsh:physical" in mesh.cell_data  # MSH 2.2 repeats a cell that is in two groups
+    raw.duplicates = "gmsh:physical" in mesh.cell_data  # MSH 2.2 repeats cells of two groups
     for name, arrays in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
             for k, numbers in enumerate(arrays):
@@ -161,7 +161,7 @@ def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type:
 
 @contextlib.contextmanager
 def _quiet(label: str) -> Iterator[io.StringIO]:
-    """Keep meshio from printing, warning and exiting; what it raises becomes a MeshError naming the file."""
+    """Suppress printing, warnings and exits of meshio; its errors become a MeshError naming the file."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
@@ -243,7 +243,7 @@ def _gmsh_body(file: Path, start: int, new: bool, is_ascii: bool, size: int) -> 
 
 
 def _section(data: bytes, name: bytes) -> bytes:
-    """The body of a section, or nothing."""
+    """Body of a section, or b""."""
     at = data.find(b"$" + name)
     if at < 0:
         return b""
@@ -298,7 +298,7 @@ def _read_vtu(file: Path) -> RawMesh:
 
 
 def _raw(mesh: Any) -> RawMesh:
-    """Points, cells, and the groups that integer arrays of a meshio.Mesh make."""
+    """Points, cells, and groups from integer arrays of a meshio.Mesh."""
     named = {}
     for name, value in (mesh.field_data or {}).items():
         if np.size(value) == 2:  # of Gmsh: tag and dimension

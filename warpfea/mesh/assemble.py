@@ -1,4 +1,4 @@
-"""From the cell blocks and groups of a file to a :class:`Mesh` with its sets."""
+"""Assembly of a :class:`Mesh` with its sets from the cell blocks and groups of a file."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _WORDS = {
     "quad": ("quad", "quads"),
 }
 _BOUNDARY = {"tetra": "triangle", "tetra10": "triangle", "hexahedron": "quad"}
-"""What the type of a boundary cell begins with."""
+"""Type prefixes of boundary cells."""
 
 
 @dataclass
 class RawMesh:
-    """What a file holds, before it is checked.
+    """Contents of a file before validation.
 
     ``points`` (N, 3); ``blocks``: (meshio cell type, (K, n) node numbers); ``groups``: (name, block, numbers
-    of the block's cells); ``node_groups``, ``faces``: sets that the file names itself, ``faces`` as (block,
+    of the block's cells); ``node_groups``, ``faces``: sets named by the file, ``faces`` as (block,
     cell, local face). ``duplicates``: equal cells stand for membership in several groups.
     """
 
@@ -43,13 +43,13 @@ class RawMesh:
 
 
 def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
-    """The mesh, its topology checked, with the sets that the file's groups make.
+    """Mesh with validated topology, and sets from the file's groups.
 
     Raises
     ------
     MeshError
-        Solid cells of unknown or of two types, no solids and surface cells other than quads, boundary cells
-        that are no face, and :func:`check_topology`'s.
+        Solid cells of unknown or of two types, no solids and surface cells other than quads, boundary cells that are
+        not faces, and :func:`check_topology`'s.
     """
     label = str(file)
     body = _body_type(raw, label, cell_type)
@@ -101,7 +101,7 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
 
 
 def _body_type(raw: RawMesh, label: str, cell_type: str | None) -> str:
-    """The cell type of the body: that of the solids, of one known type, or else quads."""
+    """Cell type of the body: that of the solids, of one known type, or else quads."""
     counts: dict[str, int] = {}
     for kind, cells in raw.blocks:
         if len(cells):
@@ -168,7 +168,7 @@ class _FaceFinder:
                 f"not the face of a {solid} ({lost.size} such)"
             )
         face = order[low]
-        inside = np.flatnonzero(high - low == 2)  # between two elements: the one its normal leaves
+        inside = np.flatnonzero(high - low == 2)  # between two elements: the one on the back of its normal
         for other in (order[low[inside]], order[high[inside] - 1]):
             element, side = np.divmod(other, len(local))
             own = mesh.cells[element[:, None], local[side]]

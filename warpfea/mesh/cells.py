@@ -31,13 +31,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class CellType:
-    """What the mesh code has to know of one cell type.
+    """Properties of one cell type.
 
-    ``nodes``: nodes per cell; ``corners``: the first so many are corners; ``edges``: corner pairs, the
+    ``nodes``: nodes per cell; ``corners``: number of corner nodes, which come first; ``edges``: corner pairs, the
     mid-edge node of edge k is ``corners + k`` if the type has any; ``faces``: local node numbers, outward;
-    ``face_corners``: how many of each face are corners; ``gradients(xi)``: (P, nodes, d) shape derivatives
+    ``face_corners``: corners per face; ``gradients(xi)``: (P, nodes, d) shape derivatives
     at xi (P, d), d the dimension; ``rule``: points (P, d) and weights (P,) exact for the volume of a curved
-    cell; ``checked``: points (P, d) where det J0 has to be positive.
+    cell; ``checked``: points (P, d) where det J0 must be positive.
     """
 
     name: str
@@ -184,7 +184,7 @@ _ROWS = (
 )
 CELL_TYPES: dict[str, CellType] = {row.name: row for row in _ROWS}
 FILE_CELLS = ("tetra", "tetra10", "hexahedron", "quad")
-"""The cell types a file can hold; "line" (beams) and "tetra_faces" (ENMC) are made by the code."""
+"""Cell types in files; "line" (beams) and "tetra_faces" (ENMC) are generated."""
 ELEMENT_CELLS = {
     "T4": "tetra",
     "T10": "tetra10",
@@ -193,7 +193,7 @@ ELEMENT_CELLS = {
     "FN18": "tetra",
     "H3843": "hexahedron",
 }
-"""Name of a solid element in the API -> cell type that its mesh comes with."""
+"""Solid element name in the API -> cell type of its mesh."""
 
 _DIMENSION_PREFIXES = {
     0: ("vertex", "empty"),
@@ -235,8 +235,7 @@ def det_j0(points: Floats, cells: Ints, kind: CellType, xi: Floats) -> Floats:
 def element_volumes(points: Floats, cells: Ints, kind: CellType) -> Floats:
     """Volume (m^3), area (m^2) or length (m) of every cell, (M,); negative for an inverted solid.
 
-    Exact for curved sides of solids too; of a quad whose corners don't lie in a plane, that of the bilinear
-    surface by 2 x 2 points.
+    Exact for curved sides of solids too; for a non-planar quad that of the bilinear surface by 2 x 2 points.
     """
     xi, weights = kind.rule
     return det_j0(points, cells, kind, xi) @ weights
@@ -247,7 +246,7 @@ def row_keys(rows: Ints, bound: int) -> Ints:
     key = rows[:, 0].astype(np.int64)
     top = int(bound)
     for column in rows.T[1:]:
-        if top * int(bound) >= 2**62:  # too large to pack: number the different keys so far
+        if top * int(bound) >= 2**62:  # too large to pack: number the distinct keys so far
             unique, key = np.unique(key, return_inverse=True)
             top = len(unique)
         key = key * np.int64(bound) + column

@@ -20,9 +20,9 @@ from .mesh import Mesh
 __all__ = ["COINCIDENT", "check", "check_topology", "check_volumes"]
 
 COINCIDENT = 1e-10
-"""Two used nodes closer than this part of the mesh's size are taken for one node that was not merged."""
+"""Distance of used nodes, over the mesh size, below which they count as one unmerged node."""
 FLAT = 1e-12
-"""An element with a volume, or det J0, below this part of its longest edge cubed (area: squared) has none."""
+"""Volume or det J0 over the cube (area: square) of the longest edge below which an element is degenerate."""
 _LEFT_HANDED = {
     "tetra": "swap two corners",
     "tetra10": "swap two corners and their mid-edge nodes",
@@ -40,12 +40,12 @@ def check(mesh: Mesh) -> Mesh:
     MeshError
         No elements, NaN or infinite coordinates, a repeated node in an element, duplicate elements,
         coincident nodes, mid-edge nodes out of order, zero-volume or inverted elements. Of quads: zero area,
-        corners that don't turn one way, an edge of more than two quads, neighbours whose normals disagree.
+        non-convex corners, an edge of more than two quads, neighbours of opposite orientation.
 
     Warns
     -----
     MeshWarning
-        Nodes that no element uses.
+        Unused nodes.
     """
     check_topology(mesh.points, mesh.cells, mesh.cell_type, mesh.label)
     orphans = mesh.orphan_nodes
@@ -70,7 +70,7 @@ def check(mesh: Mesh) -> Mesh:
 
 
 def check_topology(points: Floats, cells: Ints, cell_type: str, label: str) -> None:
-    """Check what has to hold before any geometry is computed; arrays as in :class:`Mesh`.
+    """Checks before any computation of geometry; arrays as in :class:`Mesh`.
 
     Raises
     ------
@@ -167,7 +167,7 @@ def _check_mid_nodes(mesh: Mesh, curved: Ints) -> None:
 
 
 def _swap_back(mesh: Mesh, element: int) -> str:
-    """What to do about a quadratic tetrahedron that is inverted: the two corners that were swapped, if that is all."""
+    """Hint for an inverted quadratic tetrahedron: the two swapped corners, if that is the only error."""
     edges = mesh.kind.edges
     x = mesh.points[mesh.cells[element]]
     for a, b in edges:
@@ -199,7 +199,7 @@ def check_volumes(mesh: Mesh) -> None:
             f"{mesh.label}: element {e} has zero {what} ({volumes[e]:.3g} {unit}, longest edge "
             f"{longest[e]:.3g} m; {flat.size} such element{_s(flat)})"
         )
-    lowest = volumes / kind.rule[1].sum()  # mean det J0, which is its value everywhere in a straight simplex
+    lowest = volumes / kind.rule[1].sum()  # mean det J0; constant in a straight simplex
     simplex = kind.corners == kind.dimension + 1
     bent = np.flatnonzero(~mesh.straight_sided(1e-12)) if simplex else np.arange(len(mesh.cells))
     if bent.size:
@@ -228,7 +228,7 @@ def _longest_edges(mesh: Mesh) -> Floats:
 
 
 def _check_quads(mesh: Mesh) -> None:
-    """Each quad has an area, and its corners all turn the way of its mean normal."""
+    """Each quad has an area, and is convex with respect to its mean normal."""
     longest = _longest_edges(mesh)
     areas = mesh.volumes()
     flat = np.flatnonzero(areas <= FLAT * longest**2)
@@ -255,7 +255,7 @@ def _check_quads(mesh: Mesh) -> None:
 
 
 def _check_sheet(mesh: Mesh) -> None:
-    """An edge belongs to at most two quads, which run through it in opposite directions."""
+    """An edge belongs to at most two quads, with opposite directions."""
     sides = len(mesh.kind.edges)
     edges = mesh.cells[:, mesh.kind.edges].reshape(-1, 2)
     keys = row_keys(np.sort(edges, axis=1), len(mesh.points))

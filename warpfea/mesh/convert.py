@@ -1,4 +1,4 @@
-"""From one cell type to another, with the sets: T10 to T4, and T4 to T4 with face nodes."""
+"""Conversion of cell types with their sets: T10 to T4, and T4 to T4 with face nodes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["linear", "with_face_nodes"]
 
 
 def linear(mesh: Mesh) -> Mesh:
-    """A T10 mesh as T4 on its corner nodes; a T4 mesh as it is.
+    """T10 mesh as T4 on its corner nodes; a T4 mesh unchanged.
 
-    Mid-edge nodes are dropped, the others keep their order (nodes that no element uses too). Node sets lose the
-    mid-edge nodes and may become empty; element and surface sets stay as they are. Curved sides become flat.
+    Mid-edge nodes are dropped, the others keep their order (unused nodes, too). Node sets lose the mid-edge nodes
+    and may become empty; element and surface sets are unchanged. Curved sides become flat.
 
     Raises
     ------
@@ -50,18 +50,18 @@ def linear(mesh: Mesh) -> Mesh:
 
 
 def with_face_nodes(mesh: Mesh, face_points: Floats | None = None) -> Mesh:
-    """A T4 mesh with one node per face, which the two elements of a face share: cell type "tetra_faces".
+    """T4 mesh with one node per face, shared by its two elements: cell type "tetra_faces".
 
-    Face nodes are numbered after the file's nodes, in the order in which the elements come upon their faces. A set
+    Face nodes are numbered after the file's nodes, in the order of first occurrence by element. A set
     of nodes gains a face node if it holds the face's three corners and the face is one of the cells that gave the
     set its name: a face of the surface set of that name, any face of an element of the element set of that name,
-    or, where neither set exists, an outer face. Element and surface sets stay as they are.
+    or, where neither set exists, an outer face. Element and surface sets are unchanged.
 
     Parameters
     ----------
     face_points : (M, 4, 3) or None
-        Where the face nodes lie (m), per element and local face, if the faces are curved; by default at the mean
-        of the three corners. A shared face must get the same point from both elements, to 1e-9 of the mesh's size.
+        Positions of the face nodes (m), per element and local face, for curved faces; by default the mean of the
+        three corners. A shared face must get the same point from both elements, to 1e-9 of the mesh's size.
 
     Raises
     ------

@@ -50,14 +50,14 @@ def box(
     element : {"T4", "T10", "ENMC", "FN", "FN18", "H3843"}
         T10: six tetrahedra of 10 nodes per cell; H3843: one hexahedron; the others: six tetrahedra of 4 nodes.
     map : function X (n, 3) -> (n, 3), or None
-        Moves the nodes (m), mid-edge nodes too; the mesh is then checked. Sides keep their names, and must stay
-        apart.
+        Moves the nodes (m), mid-edge nodes too; the mesh is then checked. Sides keep their names, and must not
+        coincide.
 
     Raises
     ------
     MeshError
-        Non-positive size, fewer than one cell, unknown element; a map that returns no (n, 3) finite numbers, or
-        whose mesh fails :func:`warpfea.mesh.check`, for instance because it mirrors.
+        Non-positive size, fewer than one cell, unknown element; a map without (n, 3) finite values, or with a mesh
+        that fails :func:`warpfea.mesh.check`, e.g. a reflection.
     """
     lengths = positive("box: size", size, 3)
     numbers = counts("box: cells", cells, 3)
@@ -144,7 +144,7 @@ def sphere(
 
 
 def _round_type(what: str, element: str) -> str:
-    """The cell type of an element that a round body can be made of."""
+    """Cell type of an element available for round bodies."""
     kind = cell_type_of(what, element)
     if kind == "hexahedron":
         raise MeshError(
@@ -161,7 +161,7 @@ def _lattice(shape: Sequence[int]) -> Ints:
 
 
 def _bricks(numbers: Sequence[int]) -> tuple[Ints, Ints]:
-    """Lattice points (N, 3) and hexahedra (M, 8), x fastest, of a grid of so many cells."""
+    """Lattice points (N, 3) and hexahedra (M, 8), x fastest, of a grid of ``cells``."""
     nx, ny, nz = numbers
     base = _lattice((nx, ny, nz)) @ (1, nx + 1, (nx + 1) * (ny + 1))
     up = (nx + 1) * (ny + 1)
@@ -170,7 +170,7 @@ def _bricks(numbers: Sequence[int]) -> tuple[Ints, Ints]:
 
 
 def _kuhn(numbers: Sequence[int], kind: str, mirrored: Sequence[bool]) -> tuple[Ints, Ints]:
-    """Lattice points (N, 3), x fastest, and tetrahedra of a grid of so many cells.
+    """Lattice points (N, 3), x fastest, and tetrahedra of a grid of ``cells``.
 
     The lattice has step 2 per cell with T10 (all its points are nodes), 1 with T4. In a mirrored axis the
     cells below the middle are reflected.
@@ -221,7 +221,7 @@ def _join(sides: dict[str, Ints], names: Sequence[str]) -> Ints:
 def _round_points(
     lattice: Ints, cells: Ints, kind: str, place: Callable[[Floats], Floats], round_axes: tuple[int, ...]
 ) -> Floats:
-    """Points of the mapped lattice, with the edges that don't lie on the round side made straight."""
+    """Points of the mapped lattice, with straight edges except on the round side."""
     parent = 2.0 * lattice / lattice[-1] - 1.0  # -1 .. 1, exact at both ends and in the middle
     points = place(parent)
     row = CELL_TYPES[kind]

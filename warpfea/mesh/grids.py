@@ -31,14 +31,14 @@ def grid(
     size : (lx, ly) in m
     origin : (3,) in m
     map : function X (n, 3) -> (n, 3), or None
-        Moves the nodes (m), to roll or twist the sheet; the mesh is then checked. Opposite edges that it lays onto
-        each other node by node are joined: they share the nodes of the seam, which both sets name.
+        Moves the nodes (m), to roll or twist the sheet; the mesh is then checked. Opposite edges that coincide node
+        by node are joined: they share the nodes of the seam, which are in both sets.
 
     Raises
     ------
     MeshError
-        Non-positive size, fewer than one cell; a map that returns no (n, 3) finite numbers, or whose mesh fails
-        :func:`warpfea.mesh.check`, for instance because it draws an edge together to a point.
+        Non-positive size, fewer than one cell; a map without (n, 3) finite values, or with a mesh that fails
+        :func:`warpfea.mesh.check`, e.g. with an edge collapsed to a point.
     """
     lx, ly = positive("grid: size", size, 2)
     nx, ny = counts("grid: cells", cells, 2)
@@ -56,7 +56,7 @@ def grid(
 
 
 def _joined(points: Floats, at: Ints) -> tuple[Floats, Ints]:
-    """Points, and node numbers of the lattice ``at`` (ny + 1, nx + 1), with opposite edges that coincide joined."""
+    """Points, and node numbers of the lattice ``at`` (ny + 1, nx + 1), with coincident opposite edges joined."""
     tolerance = COINCIDENT * np.linalg.norm(np.ptp(points, axis=0))
     at = at.copy()
     for edge, other in ((at[:, -1], at[:, 0]), (at[-1], at[0])):

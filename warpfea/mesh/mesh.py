@@ -23,7 +23,7 @@ from .cells import (
 __all__ = ["Mesh", "Selection", "check_range", "transformation"]
 
 Selection = str | Callable[[Floats], Any] | Sequence[int] | np.ndarray
-"""A set name, a predicate of coordinates (K, 3) that returns a mask (K,), or indices / a mask."""
+"""A set name, a predicate of coordinates (K, 3) returning a mask (K,), or indices / a mask."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,13 +31,13 @@ class Mesh:
     """A mesh of one cell type in metres. All arrays are read-only; the node order is the file's.
 
     The cell types are solids ("tetra", "tetra10", "hexahedron"), the surface in space "quad" (shells), and two that
-    files don't hold: "line" (beams) and "tetra_faces", a tetrahedron with a node at each face's centroid. What is
-    called a face of a cell is an edge of a quad, and a line has none.
+    files don't hold: "line" (beams) and "tetra_faces", a tetrahedron with a node at each face's centroid. The
+    "faces" of a quad are its edges, a line has none.
 
     Parameters
     ----------
     points : (N, 3) float64
-        Reference positions X (m). Nodes that no cell uses ("orphans") keep their place in the numbering.
+        Reference positions X (m). Unused nodes ("orphans") keep their numbers.
     cells : (M, n) int64
         Node numbers in meshio's order, n = 4, 10, 8, 4, 2, 8 in the order of ``cell_type`` below. T10 mid-edge
         nodes of the corner pairs 01, 12, 20, 03, 13, 23; face nodes 4 .. 7 of the faces 021, 013, 123, 032.
@@ -49,7 +49,7 @@ class Mesh:
     name : str
         Stem of the file, or the generator's name.
     path : str or None
-        The file it was read from.
+        Source file.
 
     Raises
     ------
@@ -105,7 +105,7 @@ class Mesh:
             + ")"
         )
 
-    # what it is
+    # identification
 
     @property
     def kind(self) -> CellType:
@@ -114,17 +114,17 @@ class Mesh:
 
     @property
     def label(self) -> str:
-        """How messages call this mesh: the path if it has one, else the name."""
+        """Name in messages: the path if there is one, else the name."""
         return self.path or self.name
 
     @cached_property
     def used_nodes(self) -> Ints:
-        """Sorted numbers of the nodes that belong to a cell."""
+        """Sorted numbers of used nodes."""
         return _frozen(np.flatnonzero(self._used_mask), np.int64)
 
     @cached_property
     def orphan_nodes(self) -> Ints:
-        """Sorted numbers of the nodes that belong to no cell."""
+        """Sorted numbers of unused nodes."""
         return _frozen(np.flatnonzero(~self._used_mask), np.int64)
 
     @cached_property
@@ -173,8 +173,8 @@ class Mesh:
     # surfaces
 
     def faces(self, table: Selection) -> Ints:
-        """Node numbers of a surface: (K, 3) of T4, (K, 6) of T10, (K, 4) of hexahedra, corners so that their
-        normal points outward, then mid-edges; (K, 4) with face nodes, that node last; (K, 2) of quads, the two
+        """Node numbers of a surface: (K, 3) of T4, (K, 6) of T10, (K, 4) of hexahedra, corners in outward order,
+        then mid-edges; (K, 4) with face nodes, that node last; (K, 2) of quads, the two
         ends of each edge.
 
         Parameters
@@ -190,7 +190,8 @@ class Mesh:
 
     def boundary(self) -> Ints:
         """All outer faces, (K, 2) rows of (element, local face), in the order of the elements; of quads the
-        (element, local edge) of edges that belong to one quad only."""
+        (element, local edge) of border edges.
+        """
         return self._boundary
 
     @cached_property
@@ -204,7 +205,7 @@ class Mesh:
 
     @cached_property
     def _face_keys(self) -> Ints:
-        """One key per (element, local face), (M * faces,): faces with the same corners have the same key."""
+        """Key per (element, local face), (M * faces,), equal for faces with the same corners."""
         corners = self.kind.faces[:, : self.kind.face_corners]
         table = np.sort(self.cells[:, corners].reshape(-1, self.kind.face_corners), axis=1)
         return row_keys(table, len(self.points))
@@ -219,7 +220,7 @@ class Mesh:
         Raises
         ------
         MeshError
-            Unknown name (the message lists the names there are), numbers out of range, or a mask of another
+            Unknown name (the message lists the known ones), numbers out of range, or a mask of another
             length.
         """
         if isinstance(selection, str):
@@ -278,7 +279,7 @@ class Mesh:
         return sets[name]
 
     def _kinds_of(self, name: str) -> list[str]:
-        """What a name stands for in this mesh: "nodes", "elements", "faces"."""
+        """Kinds of sets of this name in the mesh: "nodes", "elements", "faces"."""
         kinds = {"elements": self.element_sets, "faces": self.surface_sets, "nodes": self.node_sets}
         return [kind for kind, sets in kinds.items() if name in sets]
 
@@ -308,7 +309,7 @@ class Mesh:
         check_range(numbers, limit, f"{self.label}: {what}")
         return numbers.astype(np.int64)
 
-    # changes
+    # transformation
 
     def transformed(self, *, scale: float = 1.0, transform: Any = None) -> Mesh:
         """A copy with X' = A (scale X) + t; see :func:`transformation` for ``transform``.
@@ -358,7 +359,7 @@ def transformation(scale: float, transform: Any, label: str) -> tuple[Floats, Fl
 
 
 def _frozen(values: Any, dtype: Any) -> np.ndarray:
-    """A read-only C-contiguous array; copies only what could be written through."""
+    """Read-only C-contiguous array; copied only if it is writable elsewhere."""
     array = np.asarray(values)
     if dtype == np.int64 and array.dtype.kind not in "iub" and array.size:
         raise MeshError(f"expected integers, got {array.dtype}")
@@ -369,7 +370,7 @@ def _frozen(values: Any, dtype: Any) -> np.ndarray:
 
 
 def check_range(numbers: np.ndarray, limit: int, where: str) -> None:
-    """Raise a MeshError that begins with ``where`` if a number is not in 0 .. limit - 1."""
+    """Raise a MeshError that begins with ``where`` for numbers outside 0 .. limit - 1."""
     bad = np.flatnonzero((numbers.reshape(-1) < 0) | (numbers.reshape(-1) >= limit))
     if bad.size:
         raise MeshError(f"{where}: {numbers.reshape(-1)[bad[0]]} is out of range 0 .. {limit - 1}")

@@ -1,1 +1,1 @@
-"""The constant side of a scene: bodies, their surfaces, tables and topology."""
+"""Constant model data: bodies, surfaces, tables, topology."""

@@ -34,13 +34,13 @@ __all__ = [
 ]
 
 CHUNK = 20000
-"""Most elements handled at once where a table per element would be large."""
+"""Maximum elements per pass for tables with one row per element."""
 TABLE = 20_000_000
-"""Most entries (elements x points x slots) of a table that is made at once."""
+"""Maximum entries (elements x points x slots) of a table computed at once."""
 
 
 def chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[np.ndarray]:
-    """The elements in runs for which tables at `points` points stay small."""
+    """Runs of elements with small tables at `points` points."""
     per_element = points * body.family.slots if body.family.has_gradients else 1
     size = max(1, min(CHUNK, TABLE // per_element))
     for first in range(0, len(elements), size):
@@ -49,7 +49,7 @@ def chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[
 
 @dataclass(frozen=True)
 class BlockKey:
-    """What elements must have in common to be processed by one kernel."""
+    """Key of an element block: elements with equal keys share a kernel."""
 
     family: str
     scheme: str
@@ -61,13 +61,13 @@ class BlockKey:
 
     @property
     def output_scheme(self) -> str | None:
-        """The integration that stress output takes in place of a tied part, if the family has one."""
+        """Integration of stress output in place of a tied part, if the family has one."""
         name = f"{self.integral.name} stress"
         return name if name in families.get(self.family).output_schemes else None
 
     @property
     def integral(self) -> Part:
-        """The part of the strain energy that the block integrates."""
+        """Part of the strain energy integrated by the block."""
         return families.get(self.family).scheme(self.scheme)[self.part]
 
     @property
@@ -77,20 +77,20 @@ class BlockKey:
 
     @property
     def vertex(self) -> bool:
-        """Whether kernels/elements/vertex.py can do the product: straight T10 with points on lines to the vertices."""
+        """True if kernels/elements/vertex.py applies: straight T10 with points on lines to the vertices."""
         family = families.get(self.family)
         quadratic = family.cell_type == "tetra10" and family.slots == 10
         return self.affine and quadratic and not self.framed and self.rule.radial
 
     @property
     def tying(self) -> Tying | None:
-        """The tying of assumed strains, of parts that have them; else None."""
+        """Tying of assumed strains of parts that have them; else None."""
         return self.integral.tying
 
 
 @dataclass(eq=False)
 class HostBlock:
-    """The elements of one body that have one key.
+    """Elements of one body with one key.
 
     Attributes:
         body: the body.
@@ -140,44 +140,44 @@ def gradients(ds: np.ndarray, J0: np.ndarray) -> np.ndarray:
 
 
 def straight(body: Discretisation) -> np.ndarray:
-    """(E,) whether an element has the same J0 everywhere."""
+    """(E,) True for elements with constant J0."""
     if not body.family.affine:
         return np.zeros(len(body.mesh.cells), dtype=bool)
     return body.mesh.straight_sided()
 
 
 def mass_rule(body: Discretisation, affine: bool) -> Rule:
-    """The rule that integrates the mass: exact, also with curved sides; richer with a density that varies in space."""
+    """Mass rule: exact, also for curved sides; higher for a density that varies in space."""
     varying = any(callable(m.density) for _, m in body.materials)
     return body.family.mass_rule if affine and not varying else body.family.curved_mass_rule
 
 
 UNIT = 1.0
-"""Density, kg/m^3, that stands in tables where a material has none; nothing that uses the mass is done with it."""
+"""Placeholder density, kg/m^3, of materials without one; uses of the mass are refused."""
 
 
 def density_of(material: Material) -> Any:
-    """The density of a material as it was given, or `UNIT`."""
+    """Density of a material as given, or `UNIT`."""
     return UNIT if material.density is None else material.density
 
 
 def require_density(bodies: Iterable[Discretisation], what: str) -> None:
-    """Raise ModelError for the first material without a density; `what`: what needs one."""
+    """Raise ModelError for the first material without a density; `what`: the purpose."""
     for body in bodies:
         for group, material in body.materials:
             if material.density is None:
                 law = f"{type(material).__name__} of group {group!r}" if group else type(material).__name__
                 without = ", or gravity=(0, 0, 0)" if what == "gravity" else ""
                 raise ModelError(
-                    f"body {body.name!r}: the material {law} has no density, which {what} needs; give it density=..., "
-                    f"kg/m^3 (steel 7850, water 1000){without}"
+                    f"body {body.name!r}: missing density of {law}, required by {what}: give it density=..., kg/m^3 "
+                    f"(steel 7850, water 1000){without}"
                 )
 
 
 def density_at(
     body: Discretisation, elements: np.ndarray, s: np.ndarray, conn: np.ndarray, number: float | None = None
 ) -> np.ndarray:
-    """(E, Q) density of elements at points; `number` stands for densities that are one number."""
+    """(E, Q) density of elements at points; `number` replaces densities that are one number."""
     out = np.empty((len(elements), s.shape[1]))
     index = body.material_of[elements]
     for k, (_, material) in enumerate(body.materials):
@@ -202,21 +202,21 @@ def density_at(
 
 
 def parent_mass(family: Any) -> np.ndarray:
-    """(S, S) int s_i s_j over the parent element, for families whose functions do not depend on the element."""
+    """(S, S) int s_i s_j over the parent element, for families with element-independent functions."""
     s, _ = family.shape(family.mass_rule.points, np.zeros((1, len(family.node_slots), 3)))
     table = np.asarray(s[0])
     return np.einsum("q,qi,qj->ij", family.mass_rule.weights, table, table)
 
 
 def law_of(integral: Part, material: Material) -> tuple[str, tuple[Any, ...]]:
-    """The device law of a part of the energy, and its coefficients; arrays where those of the material are."""
+    """Device law of a part of the energy, and its coefficients; arrays if those of the material are."""
     law, values = integral.law(material) if integral.law else (material.law, material.coefficients())
     assert law is not None
     return law, values
 
 
 def coefficient_rows(values: Sequence[Any], material: Material, worlds: int = 1) -> np.ndarray:
-    """(worlds, NCOEF) coefficients as the device reads them, those of the damping last."""
+    """(worlds, NCOEF) coefficients in device layout, those of the damping last."""
     rows = np.zeros((worlds, NCOEF))
     for k, value in enumerate(values):
         rows[:, k] = value
@@ -226,7 +226,7 @@ def coefficient_rows(values: Sequence[Any], material: Material, worlds: int = 1)
 
 
 def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
-    """The elements of a body by key; `tables`: straight elements get tables of h_i as well, like curved ones."""
+    """Elements of a body by key; `tables`: tables of h_i for straight elements, too."""
     flat = straight(body)
     for k, (_, material) in enumerate(body.materials):
         damping = material.damping.form if material.damping else None
@@ -265,7 +265,7 @@ def orthonormal(J0: np.ndarray) -> np.ndarray:
 
 
 def check_orientation(body: Discretisation, integral: Part) -> None:
-    """Raise MeshError where det J0 <= 0 at a point where the part of the energy takes strains or is integrated."""
+    """Raise MeshError for det J0 <= 0 at an integration or tying point."""
     points = integral.rule.points
     if integral.tying:
         points = np.vstack([points, integral.tying.points])
@@ -280,9 +280,9 @@ def check_orientation(body: Discretisation, integral: Part) -> None:
 
 
 def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.ndarray]:
-    """The contributions to each slot as CSR: start (slots + 1,) and indices into the contributions of all blocks.
+    """Gather table (CSR): start (slots + 1,) and contribution indices per slot.
 
-    Those lie in the order of `conn`, within a block as [local, elem].
+    Contributions are ordered as `conn`, within a block as [local, elem].
     """
     flat = np.concatenate([c.T.ravel() for c in conn]) if conn else np.zeros(0, dtype=np.int64)
     order = np.argsort(flat, kind="stable")
@@ -291,7 +291,7 @@ def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.nda
 
 
 def slot_graph(conn: list[np.ndarray], slots: int) -> sp.csr_matrix:
-    """Which slots share an element. The mass matrix does not tell: between some of them its entry is zero."""
+    """Pairs of slots that share an element. The mass matrix is no substitute: some of its entries are zero."""
     rows = np.concatenate([np.repeat(first + np.arange(len(c)), c.shape[1]) for first, c in _offsets(conn)])
     columns = np.concatenate([c.ravel() for c in conn])
     incidence = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(rows.max() + 1, slots))
@@ -307,7 +307,7 @@ def _offsets(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
 
 @dataclass(eq=False)
 class FacetTables:
-    """Functions of the faces of a surface, for the slots whose functions do not vanish there.
+    """Functions of the faces of a surface, for the slots with functions that do not vanish there.
 
     Attributes:
         conn: (F, n) body slots; faces that have fewer repeat their first one with functions of zero.
@@ -358,7 +358,7 @@ def facet_tables(surface: SurfaceSet, parts: int = 1, rules: Mapping[int, Rule] 
 
 
 def facet_places(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.ndarray]:
-    """Reference positions X (F, Q, 3), m, of the points of faces, and the areas (F, Q), m^2, that they stand for."""
+    """Reference positions X (F, Q, 3), m, of face points, and their areas (F, Q), m^2."""
     x = body.reference[t.conn]
     normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
     X = np.einsum("fqi,fik->fqk", t.shape, x) + body.origin
@@ -366,7 +366,7 @@ def facet_places(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.n
 
 
 def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
-    """Body slots, and the integral of the function of each over a surface, curved or flat (m^2; m^3 of gradients)."""
+    """Body slots, and integrals of their functions over a surface, curved or flat (m^2; m^3 for gradients)."""
     t = facet_tables(surface)
     _, dA = facet_places(surface.body, t)
     weights = np.einsum("fq,fqi->fi", dA, t.shape)
@@ -375,7 +375,7 @@ def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rigid_modes(x: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """(6, slots, 3) rigid motions of slots with values x: translations, and rotations about the mean position."""
+    """(6, slots, 3) rigid-body modes of slots with values x: translations, and rotations about the mean position."""
     modes = np.zeros((6, len(x), 3))
     position = kind == 0
     arm = x.copy()

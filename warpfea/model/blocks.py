@@ -1,4 +1,4 @@
-"""Blocks of elements: tables on the device for elements that one kernel does."""
+"""Element blocks: device tables of elements processed by one kernel."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ __all__ = ["Block", "build_block", "output_block", "output_rows"]
 
 @dataclass(eq=False)
 class Block:
-    """Elements that one kernel does: their kind, device data, and where they came from.
+    """Element block: kind, device data, source elements; one kernel launch.
 
-    `coupled`: each world has its own couplings of assumed strains. `det`: det J0 of straight elements, where the mass
-    of an element is one table times a number.
+    `coupled`: couplings of assumed strains per world. `det`: det J0 of straight elements, whose mass is det J0 times
+    one table.
     """
 
     key: assembly.BlockKey
@@ -53,7 +53,7 @@ class Block:
 
     @property
     def with_mass(self) -> bool:
-        """Whether the mass of an element is one table times a number."""
+        """True if the element mass is a number times one table."""
         return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
 
     def kernels_for(self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False) -> Any:
@@ -70,7 +70,7 @@ class Block:
         return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
 
     def dissipative_data(self, dtype: str, dissipation: float) -> Any:
-        """Its constants for the dissipative mid-point scheme, with chi of that."""
+        """Constants for the dissipative mid-point scheme with its chi."""
         kind = tied_struct if self.key.tying else block_struct
         out = kind(dtype, True)()
         for name in kind(dtype).vars:
@@ -79,13 +79,13 @@ class Block:
         return out
 
     def take_couplings(self, dtype: str) -> None:
-        """Use the kernels that read couplings of each world."""
+        """Select the kernels that read couplings per world."""
         assert self.key.tying is not None
         self.coupled = True
         self.kernels = tied_kernels(dtype, self.slots, self.points, self.key.tying.width, False, True)
 
     def mixed_product(self, dtype: str) -> wp.Kernel:
-        """The kernel of K p with the stress of the linear prediction, without viscosity."""
+        """Kernel of K p with the stress of the linear prediction, without viscosity."""
         k = self.key
         if k.tying:
             return self.kernels.mixed_product
@@ -94,7 +94,7 @@ class Block:
     def with_mass_product(
         self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False
     ) -> wp.Kernel:
-        """The kernel of the product of a with_mass block, with a form of damping; others: see `kernels_for`."""
+        """Kernel of the product of a with_mass block, with a form of damping; others: see `kernels_for`."""
         k = self.key
         if midpoint:
             kind = (k.law, self.slots, self.points, mean_damping(damping), k.vertex, self.cluster)
@@ -103,14 +103,14 @@ class Block:
 
 
 def mean_damping(damping: str | None) -> str | None:
-    """Damping over a step of the conserving scheme: (E1 - E0)/h, where the incremental form and that of rates meet."""
+    """Damping form of the conserving scheme: Edot = (E1 - E0)/h for incremental and rate forms."""
     return "rate" if damping == "incremental" else damping
 
 
 def build_block(
     model: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock], contribution: int, element: int, history: int
 ) -> Block:
-    """The block of a key; offsets of its contributions, elements and strain history."""
+    """Block of a key; offsets of its contributions, elements and strain history."""
     family = elements.get(key.family)
     conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
     data = (tied_struct if key.tying else block_struct)(model.dtype)()
@@ -187,7 +187,7 @@ def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[asse
 
 
 def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> np.ndarray | None:
-    """Gradients, weights, maps and axes at the points of elements; det J0 where the mass of one is a table times it."""
+    """Gradients, weights, maps and axes at the points of elements; det J0 if the mass is det J0 times a table."""
     T, vec3, mat33 = model.types.T, model.types.vec3, model.types.mat33
     family, rule = elements.get(key.family), key.rule
     Q = len(rule.weights)

@@ -1,4 +1,4 @@
-"""Bodies as a builder returns them: sets by name, points, what is drawn."""
+"""Bodies as returned by a builder: named sets, points, drawn geometry."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["Body"]
 
 @dataclass(eq=False, repr=False)
 class Body(Discretisation):
-    """A flexible body. Made by ModelBuilder; nodes and elements are counted as in its mesh."""
+    """Flexible body. Made by ModelBuilder; nodes and elements are numbered as in its mesh."""
 
     # named sets
 
     def nodes(self, selection: Any) -> NodeSet:
-        """Nodes by group name, predicate of X (n, 3) -> mask, or indices. MeshError lists the names there are."""
+        """Nodes by group name, predicate of X (n, 3) -> mask, or indices. MeshError lists the known names."""
         return NodeSet(self, self.mesh.nodes(selection), _label(selection))
 
     def surface(self, selection: Any) -> SurfaceSet:
@@ -37,7 +37,7 @@ class Body(Discretisation):
         return ElementSet(self, self.mesh.elements(selection), _label(selection))
 
     def at(self, X: Any) -> MaterialPoint:
-        """The material point at the reference position X (3,), m. Raises ModelError if X lies outside of the body."""
+        """The material point at the reference position X (3,), m. Raises ModelError for X outside the body."""
         return locate(self, X)
 
     @property

@@ -1,4 +1,4 @@
-"""Points at which contact with obstacles is integrated on the faces of a body, and what its law needs of the body."""
+"""Integration points of contact with obstacles on faces, and effective body constants of the contact law."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RULES: Mapping[int, Mapping[int, Rule]] = {
     3: {3: triangle_3(), 7: triangle_7()},
     4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
 }
-"""Rules with the corners of a face, by the number of its corners and of their points."""
+"""Rules including the face corners, by the numbers of corners and of points."""
 DEFAULT = {3: 7, 4: 16}
 """Points of a face by the number of its corners."""
 
@@ -53,7 +53,7 @@ class ContactPoints:
         area: (F, P) reference area of each point, m^2; their sum is the area of the surface. Faces with fewer points
             than others repeat their last one with area 0.
         X: (F, P, 3) reference places, m.
-        normal: (F, P, 3) outward unit normals in the reference; 0 where a face has no tangent plane.
+        normal: (F, P, 3) outward unit normals in the reference; 0 for degenerate faces.
         faces: (F, 2) rows (element, local face).
     """
 
@@ -73,11 +73,11 @@ def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoi
 
     Args:
         surface: faces of a body of any family; beams with their section, shells with their thickness.
-        points: another number of points per face: 3 (the vertices, degree 1: on a T10 face they miss the mid-side
+        points: number of points per face: 3 (the vertices, degree 1: on a T10 face they miss the mid-side
             nodes) or 7 of triangles; 4, 9, 16 or 25 of quadrilaterals.
 
     Raises:
-        ModelError: another number, or one that does not fit all faces of the surface.
+        ModelError: another number, or one without a rule for all faces.
     """
     check_points(surface, points)
     return points_by_rules(surface, RULES, DEFAULT, points)
@@ -100,7 +100,7 @@ def points_by_rules(
 
 
 def corner_points(p: ContactPoints) -> np.ndarray:
-    """(F, 3) points of each face whose cross product (x_1 - x_0) x (x_2 - x_0) points outward; -1 where none does.
+    """(F, 3) points of each face whose cross product (x_1 - x_0) x (x_2 - x_0) points outward; -1 if none.
 
     The second is the farthest from the first, the third spans the largest triangle with both.
     """
@@ -117,7 +117,7 @@ def corner_points(p: ContactPoints) -> np.ndarray:
 
 
 def lagrange_basis(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lagrange's polynomials of the points of a rule in `RULES`, which two faces share on a common edge.
+    """Lagrange polynomials of the points of a rule in `RULES`, equal on common edges.
 
     Returns:
         Coefficients (P, M), and the exponents (M, 2) of the monomials; of 7 points all of degree 2 and the bubble
@@ -141,7 +141,7 @@ def lagrange_basis(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_points(surface: SurfaceSet, points: Any) -> None:
-    """Raise ModelError unless `points` is None or a number of points for which all faces have a rule."""
+    """Raise ModelError unless `points` is None or has a rule for all faces."""
     if points is None:
         return
     family = surface.body.family
@@ -159,10 +159,10 @@ def check_points(surface: SurfaceSet, points: Any) -> None:
 def effective_modulus(
     body: Discretisation, surface: SurfaceSet | None = None, materials: Sequence[Material] = ()
 ) -> tuple[float, float]:
-    """Young's modulus, Pa, and Poisson's ratio at small strain, whatever the law.
+    """Young's modulus, Pa, and Poisson's ratio at small strain, for any law.
 
-    Of several materials at the faces of the surface (None: in the body) that with the largest Young's modulus counts:
-    the stiffness of a contact is one number. `materials`: those of the body in a world, by default as it was built.
+    Of several materials at the surface (None: in the body), that with the largest Young's modulus: a contact has one
+    stiffness. `materials`: those of the body in a world, by default as built.
     """
     materials = materials or [material for _, material in body.materials]
     elements = slice(None) if surface is None else surface.faces[:, 0]
@@ -174,7 +174,7 @@ def effective_modulus(
 
 
 def body_mass_total(body: Discretisation) -> float:
-    """Mass of a body as it was built, kg; 0 where a material has no density, so that only statics are possible."""
+    """Mass of a body as built, kg; 0 for a material without density (statics only)."""
     if any(material.density is None for _, material in body.materials):
         return 0.0
     return sum(part.scale * part.total for part in mass_parts(body))

@@ -1,4 +1,4 @@
-"""Contact with obstacles as a builder describes it: colliders, which move rigid shapes, and contacts."""
+"""Contact description: colliders (moving rigid shapes) and contacts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Collider", "ColliderRotation", "Contact", "ContactOptions"]
 
 @dataclass(frozen=True, eq=False)
 class ColliderRotation:
-    """A checked wf.Rotation: a turn by angle(t) about an axis through an anchor.
+    """Checked wf.Rotation: rotation by angle(t) about an axis through an anchor.
 
     Attributes:
         anchor: (3,) m.
@@ -34,7 +34,7 @@ class Collider:
     """A rigid obstacle; made by ModelBuilder.add_collider.
 
     Attributes:
-        shape: the shape where it is at displacement 0.
+        shape: the shape at displacement 0.
         name: unique among the colliders of its builder.
         law: vector law of the displacement, m, or None.
         rotation: of the shape, or None; not both.
@@ -49,7 +49,7 @@ class Collider:
 
     @property
     def moves(self) -> bool:
-        """Whether it has a path; a constant displacement counts as one."""
+        """True with a path, also a constant displacement."""
         return self.law is not None or self.rotation is not None
 
     def __repr__(self) -> str:
@@ -58,7 +58,7 @@ class Collider:
 
 @dataclass(eq=False, kw_only=True)
 class ContactOptions:
-    """What a contact of either kind is made with.
+    """Options common to contacts with colliders and between bodies.
 
     Attributes:
         mu, mu_static: coefficients of friction in slip and in stick, 0 <= mu <= mu_static.
@@ -94,7 +94,7 @@ class ContactOptions:
 
 @dataclass(eq=False)
 class Contact(ContactOptions):
-    """Contact of a surface with a collider; made by ModelBuilder.add_contact, which says what each value means.
+    """Contact of a surface with a collider; made by ModelBuilder.add_contact, which documents the values.
 
     Attributes:
         surface: faces of the body.

@@ -1,4 +1,4 @@
-"""What a builder has collected of a scene, and the checks of what users pass in."""
+"""Collected scene description of a builder, and argument checks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Rotation:
 
 @dataclass(eq=False)
 class DeadLoad:
-    """Force weight_i x value(t) on slots; kept for point loads and tractions alike."""
+    """Force weight_i x value(t) on slots; used for point loads and tractions."""
 
     body: Body
     slots: np.ndarray
@@ -67,11 +67,11 @@ class Pressure:
 
 @dataclass(eq=False)
 class Moment:
-    """A moment shared equally by K points, on the spin of vectors y_k = sum_i vectors_ik e_i of each.
+    """Moment shared equally by K points, conjugate to the spin of vectors y_k = sum_i vectors_ik e_i of each.
 
     Attributes:
         slots: (K, n) body slots.
-        vectors: (K, n, 3) coefficients; columns that the element's spin does not use are 0.
+        vectors: (K, n, 3) coefficients; columns unused by the element's spin are 0.
         axes: (K, 3, 3) reference values of the vectors, columns.
     """
 
@@ -115,7 +115,7 @@ class Probe:
 
 @dataclass(eq=False)
 class Description:
-    """All that a builder has collected."""
+    """All data collected by a builder."""
 
     bodies: list[Body] = field(default_factory=list)
     supports: list[Support] = field(default_factory=list)
@@ -136,7 +136,7 @@ class Description:
         return [*self.contacts, *self.pairs]
 
     def summary(self) -> str:
-        """What there is, in one line; "" of an empty description."""
+        """One-line summary; "" for an empty description."""
         loads = len(self.dead_loads) + len(self.pressures) + len(self.moments) + len(self.body_forces)
         counts = {"support": len(self.supports), "load": loads, "joint": len(self.joints)}
         counts |= {
@@ -149,7 +149,7 @@ class Description:
 
 
 def support_slots(nodes: NodeSet, which: str) -> np.ndarray:
-    """Body slots of a node set, of the kinds named (see Family.kinds)."""
+    """Body slots of a node set, of the named kinds (see Family.kinds)."""
     body = nodes.body
     try:
         kinds = body.family.kinds(which)

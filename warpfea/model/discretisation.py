@@ -1,4 +1,4 @@
-"""A discretised body: its mesh, element family and slots, from which the tables of a model are made."""
+"""Discretised body: mesh, element family and slots; basis of the model tables."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .partition import morton_order
 __all__ = ["Discretisation", "boundary_faces", "element_boxes", "element_functions"]
 
 LARGE = 20000
-"""Bodies of more nodes have their slots and elements ordered by place; smaller ones fit into caches anyway."""
+"""Node count above which slots and elements are ordered spatially; smaller bodies fit into caches."""
 
 
 @dataclass(eq=False)
 class Discretisation:
-    """A meshed body with its slots; nodes and elements are counted as in its mesh.
+    """Meshed body with its slots; nodes and elements are numbered as in its mesh.
 
     Attributes:
         name: unique in its model.
@@ -31,7 +31,7 @@ class Discretisation:
         materials: distinct materials with the names of their groups.
         material_of: (elements,) index into materials.
         rule: name of the force quadrature rule.
-        curved_rule: the same of elements with curved sides.
+        curved_rule: force rule of elements with curved sides.
         frames: (elements, n, 3, 3) parent gradients dX/dxi at the element nodes, in the axes of the node, m; of
             families with gradient slots.
         section: section of a beam.
@@ -70,7 +70,7 @@ class Discretisation:
 
     @cached_property
     def node_slot_count(self) -> np.ndarray:
-        """(nodes,) slots of each mesh node; 0 for nodes that no element uses."""
+        """(nodes,) number of slots of each mesh node; 0 for unused nodes."""
         counts = np.zeros(len(self.mesh.points), dtype=np.int64)
         per_node = np.array([len(kinds) for kinds in self.family.node_slots])
         counts[self.mesh.cells] = per_node[None, :]
@@ -80,7 +80,7 @@ class Discretisation:
     def node_slot(self) -> np.ndarray:
         """(nodes,) first body slot of each mesh node, -1 for unused nodes.
 
-        Slots of large bodies are numbered along a space-filling curve, so that neighbours lie close in memory.
+        Slots of large bodies are numbered along a space-filling curve, for memory locality.
         """
         counts = self.node_slot_count
         order = morton_order(self.mesh.points) if len(counts) > LARGE else np.arange(len(counts))
@@ -134,7 +134,7 @@ class Discretisation:
 
     @cached_property
     def element_order(self) -> np.ndarray:
-        """(elements,) the order in which elements are processed: in large bodies along a space-filling curve."""
+        """(elements,) processing order: along a space-filling curve in large bodies."""
         if len(self.mesh.points) <= LARGE:
             return np.arange(len(self.mesh.cells))
         return morton_order(self.mesh.points[self.mesh.cells].mean(axis=1))
@@ -146,7 +146,7 @@ class Discretisation:
 
     @cached_property
     def element_boxes(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Bounding boxes of the elements, for finding points; see `element_boxes`."""
+        """Element bounding boxes for point location; see `element_boxes`."""
         return element_boxes(self)
 
 

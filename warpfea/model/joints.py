@@ -14,12 +14,12 @@ from .discretisation import Discretisation
 __all__ = ["NEGLIGIBLE", "Joint", "Part", "Row", "Vector", "constant"]
 
 NEGLIGIBLE = 1e-13
-"""Weights below this share of a vector's largest are rounding of functions that vanish there."""
+"""Weights below this fraction of a vector's largest are round-off of vanishing functions."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The share of a body in a vector: sum of weights x slot values. `child`: it is the joint's child side."""
+    """One body's part of a vector: sum_i w_i e_i; `child`: on the joint's child side."""
 
     body: Discretisation
     slots: np.ndarray
@@ -50,7 +50,7 @@ class Vector:
 
 
 def constant(value: Any) -> Vector:
-    """A vector that does not move."""
+    """Constant vector."""
     return Vector(np.asarray(value, dtype=float))
 
 
@@ -61,7 +61,7 @@ class Row:
     Attributes:
         kind: DOT, DISTANCE or TURN.
         a, b, a2: its vectors.
-        scale: makes metres of it; with `angular` it is taken times the model's size.
+        scale: factor to metres; with `angular` times the model's size.
         law: right side over time, or None: `fixed`.
         component: of the law's value.
     """
@@ -78,13 +78,13 @@ class Row:
 
     @property
     def terms(self) -> tuple[Vector, Vector, Vector]:
-        """The three vectors; absent ones are constants."""
+        """The three vectors; missing ones are constant."""
         none = constant(np.zeros(3))
         return self.a, self.b, self.a2 or none
 
     @property
     def constant(self) -> float:
-        """A.B of the reference, |A|^2 of a distance. Vectors made perpendicular are so exactly."""
+        """A.B of the reference, |A|^2 of a distance; exactly 0 for vectors made perpendicular."""
         A, B = self.a.value, self.b.value
         if self.kind == DISTANCE:
             return float(A @ A)
@@ -100,10 +100,10 @@ class Joint:
         name: unique in its model.
         kind: "revolute", "DP1", "weld", ...
         rows: its scalar constraints.
-        anchor: where it acts on the child, for the reaction's moment.
-        angle: vectors (a, a2, b) whose angle from a towards a2 is the joint's, or None.
+        anchor: point on the child, reference of the reaction moment.
+        angle: vectors (a, a2, b) of the angle atan2(a2.b, a.b), or None.
         travel: vectors (a, b): the joint's travel is a.b, b the parent's axis F n, or None.
-        between: what it ties, for messages.
+        between: connected bodies, for messages.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The material point at a reference position: which element holds it, and where in its parent domain."""
+"""Point location: element and parent coordinates of a reference position."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ __all__ = ["locate"]
 
 
 def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
-    """The material point at X (3,), m, in the reference of a body, by Newton's method in every element near it.
+    """Material point at X (3,), m, in the reference of a body, by Newton's method in every nearby element.
 
-    A point that lies outside by at most `slack` times the size of an element counts as inside that element.
+    Points outside by at most `slack` times the element size count as inside.
 
     Raises:
         ModelError: X is not three finite numbers, or lies outside of the body.
@@ -78,6 +78,6 @@ def _own_point(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tu
 
 
 def _near(body: Discretisation, x: np.ndarray) -> tuple[np.ndarray, float]:
-    """Elements whose bounding box, enlarged by a tenth of the largest, holds x; and the size of the largest (m)."""
+    """Elements whose bounding box, enlarged by a tenth of the largest, contains x; and the largest size (m)."""
     low, high, size = body.element_boxes
     return np.flatnonzero(np.all((low - 0.1 * size <= x) & (high + 0.1 * size >= x), axis=1)), size

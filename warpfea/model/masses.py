@@ -1,4 +1,4 @@
-"""Masses: one matrix for all worlds, or one of each world where densities were set (Model.set_parameter)."""
+"""Mass matrices: one for all worlds, or one per world after densities were set (Model.set_parameter)."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ __all__ = ["MassPart", "Masses", "body_mass", "center_of_mass", "is_number", "ma
 
 
 def _keys(matrix: sp.csr_matrix) -> np.ndarray:
-    """Numbers of the entries, row by row."""
+    """Row-major indices of the entries."""
     n = np.int64(matrix.shape[0])
     return np.repeat(np.arange(n), np.diff(matrix.indptr)) * n + matrix.indices
 
 
 @dataclass(frozen=True)
 class MassPart:
-    """What a material adds to the mass of its body: `scale` times a matrix.
+    """Mass contribution of a material: scale x matrix.
 
     Attributes:
-        scale: the density, kg/m^3, or 1 where it is a function or one per element.
-        matrix: scalar mass matrix over it, (slots, slots) CSR of the body.
-        total: mass over it.
+        scale: the density, kg/m^3, or 1 if it is a function or given per element.
+        matrix: scalar mass matrix / scale, (slots, slots) CSR of the body.
+        total: mass / scale.
     """
 
     scale: float
@@ -40,7 +40,7 @@ class MassPart:
 
 
 def is_number(material: Material) -> bool:
-    """Whether the density of a material is one number."""
+    """True if the density of a material is one number."""
     return not callable(assembly.density_of(material)) and np.ndim(assembly.density_of(material)) == 0
 
 
@@ -86,19 +86,19 @@ def center_of_mass(body: Discretisation, values: np.ndarray) -> np.ndarray:
 class Masses:
     """The consistent mass matrix (Eq. 20) as a sum over materials: density times the matrix of a density of 1.
 
-    Densities that are functions or one per element are in the matrix, and scaled by a factor. Arrays on the device have
-    a row of each world where densities were set, else one row that all worlds read.
+    Densities given as functions or per element are included in the matrix, and scaled by a factor. Device arrays
+    have one row per world if densities were set, else one shared row.
 
     Attributes:
         matrix: (slots, slots) CSR as the bodies were built, kg.
         table, lumped: (worlds or 1, entries), its entries; (worlds or 1, slots), its sums over position slots.
-        values, lumped_values: the same on the device.
+        values, lumped_values: device copies.
     """
 
     def __init__(self, model: Any) -> None:
         self.model = model
         self.parts = {(b, k): part for b, body in enumerate(model.bodies) for k, part in enumerate(mass_parts(body))}
-        # with zeros in it that a matrix has where others have entries
+        # includes zeros at entries of other matrices
         patterns = [
             sum(abs(self.parts[b, k].matrix) for k in range(len(body.materials))) for b, body in enumerate(model.bodies)
         ]
@@ -113,7 +113,7 @@ class Masses:
 
     @property
     def varied(self) -> bool:
-        """Whether worlds have masses of their own."""
+        """True with one mass matrix per world."""
         return len(self.table) != 1
 
     def of_world(self, world: int) -> sp.csr_matrix:
@@ -125,7 +125,7 @@ class Masses:
         return np.broadcast_to(self.lumped, (worlds, self.lumped.shape[1]))
 
     def of_body(self, body: Discretisation, world: int = 0) -> float:
-        """Mass of a body, kg; 0 where a material has no density, so that only statics are possible."""
+        """Mass of a body, kg; 0 for a material without density (statics only)."""
         if any(material.density is None for _, material in body.materials):
             return 0.0
         index = self.model.bodies.index(body)
@@ -163,7 +163,7 @@ class Masses:
         return np.concatenate([np.broadcast_to(row, (worlds, row.shape[1])) for row in rows], axis=1)
 
     def set(self, scales: dict[tuple[int, int], np.ndarray]) -> None:
-        """Take densities, or factors on them, (worlds,), by the index of a body and the number of a material."""
+        """Set densities, or factors on them, (worlds,), by body index and material index."""
         self.scales |= scales
         self._sum()
         m, known = self.model, self.model.cache
@@ -182,7 +182,7 @@ class Masses:
                 block.data.density = self._renew("elements", block.data.density, table)
 
     def _renew(self, name: str, array: wp.array, values: np.ndarray) -> wp.array:
-        """Write values into an array of the device, or into a new one where they are of more worlds."""
+        """Write values into a device array, or into a new one if the number of worlds differs."""
         if array.shape == values.shape:
             array.assign(values)
             return array
@@ -201,7 +201,7 @@ class Masses:
             self.lumped[:, rows] += scale[:, None] * (part.matrix @ self.model.is_position_host[rows])
 
     def _places(self, key: tuple[int, int], pattern: sp.csr_matrix) -> slice | np.ndarray:
-        """Where the entries of a part are in `matrix`, whose rows of a body have the body's pattern."""
+        """Entry indices of a part in `matrix`, whose rows of a body have the body's pattern."""
         part = self.parts[key].matrix
         for matrix in (pattern, part):
             matrix.sort_indices()

@@ -1,4 +1,4 @@
-"""Model: the constant side of a scene on one device, and functions that evaluate it at a state."""
+"""Model: constant data of a scene on one device, and functions evaluated at a state."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ __all__ = ["Block", "Model"]
 
 
 SHOWN = 3
-"""Bodies that a repr lists by name."""
+"""Maximum number of bodies listed by a repr."""
 
 
 class Source(Protocol):
-    """What a Model is made from: a ModelBuilder."""
+    """Source of a Model: a ModelBuilder."""
 
     description: Description
     gravity: np.ndarray
@@ -40,22 +40,22 @@ class Source(Protocol):
 
     @property
     def bodies(self) -> list[Body]:
-        """In the order they were added."""
+        """Bodies in the order of addition."""
 
     def assemble(self, model: Model) -> tuple[Any, Any]:
-        """The TermSet of a model, and what evaluates it at a state."""
+        """TermSet of a model and its evaluation at a state."""
 
 
 class Model:
-    """Made by ModelBuilder.finalize; constant but for `set_gravity` and `set_parameter`.
+    """Made by ModelBuilder.finalize; constant except for `set_gravity` and `set_parameter`.
 
     Attributes:
         bodies: the bodies, in the order they were added.
         worlds, dtype, device, up_axis: as given.
         slots: number of slots of all bodies.
-        size: diagonal of the box of all nodes, m; tolerances of constraints are measured with it.
+        size: diagonal of the box of all nodes, m; reference length of constraint tolerances.
         blocks: element blocks.
-        cache: tables that solvers made of the model and share.
+        cache: tables shared by solvers.
         mass_host: scalar mass matrix (slots, slots), CSR on the host, kg.
     """
 
@@ -89,11 +89,11 @@ class Model:
             self._build(builder, tables)
 
     def resized(self, worlds: int, dtype: str | None = None) -> Model:
-        """The model as it was built, with so many worlds, in its precision or another."""
+        """The model as built, with another number of worlds or precision."""
         return Model(self._source, device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
 
     def _build(self, builder: Source, tables: bool) -> None:
-        """Number, assemble and upload what the builder describes."""
+        """Number, assemble and upload the description."""
         self._number()
         self._assemble_mass()
         self._build_blocks(tables)
@@ -116,7 +116,7 @@ class Model:
 
     @property
     def mass(self) -> float | None:
-        """kg, of the first world; None where a material has no density."""
+        """Mass, kg, of the first world; None for a material without density."""
         laws = [law for body in self.bodies for _, law in body.materials]
         if any(law.density is None for law in laws):
             return None
@@ -125,24 +125,23 @@ class Model:
     # construction
 
     def array(self, name: str, values: Any, dtype: Any) -> wp.array:
-        """Upload a constant; its bytes are counted under `name`."""
+        """Upload a constant array; its bytes are counted under `name`."""
         out: Any = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
         self.count(name, out)
         return out
 
     def count(self, name: str, *arrays: wp.array) -> None:
-        """Count the bytes of arrays made on the device under `name`."""
+        """Count the bytes of device arrays under `name`."""
         for array in arrays:
             self._memory[name] = self._memory.get(name, 0) + array.size * wp.types.type_size_in_bytes(array.dtype)
 
     def forget(self, name: str, *arrays: wp.array) -> None:
-        """Take arrays that are let go of off what is counted under `name`."""
+        """Subtract the bytes of released arrays under `name`."""
         for array in arrays:
             self._memory[name] -= array.size * wp.types.type_size_in_bytes(array.dtype)
 
     def element_array(self, values: np.ndarray, dtype: Any) -> wp.array:
-        """Upload a constant of elements, [..., element]: neighbours stand side by side on a GPU, where threads do
-        elements together, and what belongs to an element on a CPU, which does one after the other."""
+        """Upload element data [..., element]: coalesced on a GPU, contiguous per element on the CPU."""
         if self.device.is_cuda:
             return self.array("elements", values, dtype)
         last = np.ndim(values) - (2 if dtype is self.types.mat33 else 1 if dtype is self.types.vec3 else 0) - 1
@@ -214,17 +213,17 @@ class Model:
         return term and term.tables
 
     def _upload_components(self) -> None:
-        """Group slots by component, and in each by materials of like stiffness, for residuals; by part for errors."""
+        """Residual groups (component and stiffness), and groups of parts for the error estimate."""
         self.residual_groups = slot_groups(self, self.component)
         self.residual_parts = slot_groups(self, self.part)
         if self.component_count > 1:
             self.component_of_slot = self.array("components", self.component, wp.int32)
 
     def graph(self) -> sp.csr_matrix:
-        """Which slots share an element."""
+        """Pairs of slots that share an element."""
         return assembly.slot_graph([b.connectivity for b in self.blocks], self.slots)
 
-    # what users call
+    # public methods
 
     @property
     def free_slots(self) -> np.ndarray:
@@ -233,12 +232,12 @@ class Model:
 
     @property
     def needs_positive_J(self) -> bool:
-        """Whether a law of the model is defined for J > 0 only."""
+        """True if a law of the model requires J > 0."""
         return any(b.key.law not in ANY_J for b in self.blocks)
 
     @property
     def features(self) -> dict[str, bool]:
-        """Which optional features the scene uses."""
+        """Optional features used by the scene."""
         return self.terms.features | {
             "driven nodes": any(s.law or s.node_laws for s in self.description.supports),
             "free groups": self.group_count > 0,
@@ -252,7 +251,7 @@ class Model:
         return dict(self._memory)
 
     def info(self) -> dict[str, Any]:
-        """Features in and left out, counts, contacts, bytes of the constants, kernels' modules of the elements."""
+        """Features used and unused, counts, contacts, bytes of the constants, kernel modules of the elements."""
         features = self.features
         return {
             "bodies": [
@@ -306,7 +305,7 @@ class Model:
                 u[rows] = body.initial_displacement
             if body.velocity is not None:
                 v[rows] = body.velocity
-        v[self.clamped_host] = 0.0  # driven components keep what the user says
+        v[self.clamped_host] = 0.0  # driven components keep the user's initial velocities
         out.register("displacement", vec3, (self.slots,), u)
         out.register("velocity", vec3, (self.slots,), v)
         out.register("time", wp.float64)
@@ -359,7 +358,7 @@ class Model:
         return self.evaluation.constraint_curvature(state, np.asarray(multipliers), np.asarray(direction))
 
     def set_gravity(self, gravity: Any, *, mask: Any = None) -> None:
-        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2; of the worlds that `mask` (worlds,) chooses.
+        """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2; for the worlds of `mask` (worlds,).
 
         Raises:
             ModelError: wrong shape, a value that is not finite, a material without a density, or a model built without
@@ -370,8 +369,8 @@ class Model:
     def contact_force(self, state: State) -> np.ndarray:
         """Elastic part of the forces of contact at a state, without damping, [world, slot, 3], N; on the bodies.
 
-        The state of a simulation knows the springs of friction and where colliders are; with another they are where
-        their paths are at its time, and there is no friction.
+        The state of a simulation has the friction springs and collider positions; for another state colliders follow
+        their paths at its time, without friction.
         """
         out = np.zeros((self.worlds, self.slots, 3))
         for term in (self.terms.contact, self.terms.pairs):
@@ -380,27 +379,27 @@ class Model:
         return out
 
     def set_parameter(self, name: str, values: Any, *, mask: Any = None) -> None:
-        """Set a parameter in all worlds or some; simulations take the new values from their next step on.
+        """Set a parameter in all or some worlds; simulations use the new values from their next step on.
 
         Args:
             name: "B.E" with the name B of a body, or "B.G.E" with a group G that has a material of its own: a constant
-                of the material (E and nu where it was made of them, else those of the law), eta and lambda_v of its
-                damping, which a value of 0 leaves in, or density, kg/m^3; density_factor where densities are a function
-                or one per element. The first value of such a name precedes the simulations.
+                of the material (E and nu if made from them, else those of the law), eta and lambda_v of its damping,
+                kept if 0, or density, kg/m^3; density_factor for densities given as a function or per element. Set
+                such a name for the first time before making simulations.
                 "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
-                ModelBuilder.add_contact; where mu_static equals mu, it follows mu. "K.offset" with the name K of a
-                collider: of a HalfSpace the offset of its plane, m; of other shapes by how much the surface lies
-                further out, m. A surface that comes to lie in a body pushes it out. "gravity", as set_gravity.
+                ModelBuilder.add_contact; mu_static follows mu if equal to it. "K.offset" with the name K of a
+                collider: of a HalfSpace the offset of its plane, m; of other shapes the outward offset of the
+                surface, m. A surface moved into a body pushes it out. "gravity", as set_gravity.
             values: a number, or (worlds,), on the host or on a device; of gravity (3,) or (worlds, 3).
             mask: (worlds,), on the host or on a device: the worlds to set. None: all.
 
         Raises:
-            ModelError: an unknown name or what all worlds share, a wrong shape, or a value out of range.
+            ModelError: an unknown or shared name, a wrong shape, or a value out of range.
         """
         self.terms.set_parameter(name, values, mask)
 
     def fingerprint(self) -> str:
-        """Hash of all that a checkpoint must agree with: topology, geometry, laws, precision, supports, worlds."""
+        """Hash of the data that a checkpoint must match: topology, geometry, laws, precision, supports, worlds."""
         h = hashlib.sha256(f"{self.dtype} {self.worlds} {self.slots}".encode())
         for block in self.blocks:
             h.update(repr(block.key).encode())

@@ -1,4 +1,4 @@
-"""Contact between bodies as a builder describes it, and the facets of its master surfaces."""
+"""Contact between bodies: description, and facets of master surfaces."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ PAIR_RULES: dict[int, dict[int, Rule]] = {
     3: {7: triangle_7(), 16: triangle_16()},
     4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
 }
-"""Rules of points between bodies: 16 by default, and so many because meshes need not match."""
+"""Slave point rules: 16 by default, since meshes need not match."""
 SIZES = 1.25
 """Ratio of element sizes beyond which the coarser surface is the master."""
 MITRE = 2.0
-"""Longest outward vector, over a normal: of a corner it has the length that keeps layers parallel to all faces."""
+"""Maximum length of the mitred corner normal, over the unit normal."""
 STEEP = 0.1
-"""Singular values below this part of the largest do not tell the normals of a node apart."""
+"""Relative singular value below which the normals at a node count as dependent."""
 
 
 @dataclass(eq=False)
 class PairContact(ContactOptions):
-    """Contact of two surfaces; made by ModelBuilder.add_contact, which says what each value means.
+    """Contact of two surfaces; made by ModelBuilder.add_contact, which documents the values.
 
     Attributes:
         first, second: faces of two bodies; forces of reports are those on the first.
-        slave, master: the same two: contact acts at points of the slave, against facets of the master.
+        slave, master: their roles: points of the slave against facets of the master.
     """
 
     first: SurfaceSet
@@ -80,12 +80,12 @@ class MasterFacets:
 
 
 def pair_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:
-    """The points of a slave surface: 16 of each face, corners included."""
+    """Points of a slave surface: 16 per face, corners included."""
     return points_by_rules(surface, PAIR_RULES, {3: 16, 4: 16}, points)
 
 
 def choose_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, SurfaceSet]:
-    """Slave and master: the coarser surface is the master; of as fine ones the stiffer, then the second."""
+    """Master selection: the coarser surface; at equal size the stiffer, then the second."""
     sides = []
     for surface in (first, second):
         area = pair_points(surface).area.sum(axis=1)
@@ -102,7 +102,7 @@ def exponents(corners: int, degree: int) -> np.ndarray:
 
 
 def nodes_of(corners: int, degree: int) -> np.ndarray:
-    """(M, 2) points that determine such a polynomial."""
+    """(M, 2) interpolation points of such a polynomial."""
     return exponents(corners, degree) / degree
 
 
@@ -148,7 +148,7 @@ def _functions(surface: SurfaceSet, ab: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _outward(places: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
-    """(F, Q, 3) vectors of the nodes of facets whose product with the normal of each facet that meets there is 1."""
+    """(F, Q, 3) node vectors with unit product with the normal of each facet at the node (mitred normals)."""
     key = np.round(places.reshape(-1, 3) / (1e-7 * size)).astype(np.int64)
     _, inverse = np.unique(key, axis=0, return_inverse=True)
     inverse = inverse.ravel()
@@ -168,7 +168,7 @@ def _outward(places: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
 
 
 def master_facets(surface: SurfaceSet) -> MasterFacets:
-    """The facets of a surface as polynomials of the lowest degree that holds their functions.
+    """Facets of a surface as polynomials of the lowest exact degree.
 
     Raises:
         ModelError: faces of triangles and squares in one surface, or functions of degree above 3.
@@ -204,7 +204,7 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
 
 
 def thickness(surface: SurfaceSet) -> np.ndarray:
-    """(F,) distance, m, from the middle of each facet to the other side of its body, straight inward."""
+    """(F,) thickness, m: inward distance from the middle of each facet to the opposite side of its body."""
     import warp as wp
 
     from ..kernels.terms.pair_thickness import thickness_kernel

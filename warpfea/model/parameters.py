@@ -1,4 +1,4 @@
-"""Constants of materials that differ between worlds: what Model.set_parameter sets of bodies."""
+"""Per-world material constants: Model.set_parameter for bodies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["MaterialParameters"]
 
 Owner = tuple["Discretisation", int]
-"""A body and the number of one of its materials."""
+"""A body and the index of one of its materials."""
 RATES = ("eta", "lambda_v")
 SHARED = {
     "cells": "the mesh",
@@ -45,20 +45,20 @@ SHARED = {
     "thickness": "the reference geometry",
     "width": "the reference geometry",
 }
-"""What users may want to set of a body and what all worlds share because of it."""
+"""Body data that can't be parameters, and the shared data they belong to."""
 
 
 class MaterialParameters:
-    """Values of constants of materials in each world.
+    """Material constants of each world.
 
-    Until the first is set, all worlds read the one table of coefficients that the model was built with. It is replaced
-    by a table with a row of each world, and so are the couplings of assumed strains that depend on the constant: the
-    kernels' arrays are others then, which is why a first value precedes the simulations.
+    Until one is set, all worlds read the single coefficient table of the model. It is then replaced by a table with
+    one row per world, as are the dependent couplings of assumed strains: kernels get other arrays, so the first
+    value must precede the simulations.
 
     Attributes:
-        values: (worlds,) of what was set, by (index of the body, number of the material, name).
-        begun: a simulation of the model was made.
-        version: how often values were written.
+        values: (worlds,) set values by (body index, material index, name).
+        begun: True once a simulation of the model exists.
+        version: number of writes.
     """
 
     def __init__(self, model: Any) -> None:
@@ -66,13 +66,13 @@ class MaterialParameters:
         self.values: dict[tuple[int, int, str], np.ndarray] = {}
         self.begun = False
         self.version = 0
-        # made when it is read: a model may ask for more worlds than there is room
+        # allocated on first use: a model may have more worlds than fit into memory
         self._changes: np.ndarray | None = None
         self._couplings: dict[int, np.ndarray] = {}
 
     @property
     def changes(self) -> np.ndarray:
-        """(worlds,) how often values of a world were written."""
+        """(worlds,) number of writes to each world."""
         if self._changes is None:
             self._changes = np.zeros(self.model.worlds, dtype=np.int64)
         return self._changes
@@ -80,7 +80,7 @@ class MaterialParameters:
     # names
 
     def owners(self) -> dict[str, list[Owner]]:
-        """Materials by the name of their group, "hook.arm", and all of a body by that of the body, "hook"."""
+        """Materials by group name, "hook.arm", and all of a body by its name, "hook"."""
         out: dict[str, list[Owner]] = {}
         for body in self.model.bodies:
             out[body.name] = [(body, k) for k in range(len(body.materials))]
@@ -88,7 +88,7 @@ class MaterialParameters:
         return out
 
     def setters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
-        """What sets a constant in the chosen worlds, by its name; of a body those that all of its materials have."""
+        """Settable constants by name; for a body those common to all its materials."""
         out: dict[str, Callable[[Any, np.ndarray], None]] = {}
         for owner, members in self.owners().items():
             every = [body.materials[k][1].constants for body, k in members]
@@ -98,7 +98,7 @@ class MaterialParameters:
         return out
 
     def explain(self, name: Any) -> str | None:
-        """Why something of a body is none of the parameters, where there is more to say than their names."""
+        """Reason why a name is not a parameter, or None."""
         owners = self.owners()
         owner, _, what = str(name).rpartition(".")
         if owner not in owners:
@@ -106,7 +106,7 @@ class MaterialParameters:
         laws = [body.materials[k][1] for body, k in owners[owner]]
         kinds = " and ".join(dict.fromkeys(type(law).__name__ for law in laws))
         if what in SHARED:
-            return f"all worlds share {SHARED[what]}, of which {what!r} is a part; build a model of its own for another"
+            return f"shared by all worlds ({SHARED[what]}): build a separate model"
         if what in RATES:
             return f"the material {kinds} has no damping, so its kernels were left out; give it KelvinVoigt(eta=0)"
         for law in laws:
@@ -119,20 +119,20 @@ class MaterialParameters:
     # values
 
     def in_world(self, body: Discretisation, k: int, world: int) -> Material:
-        """A material of a body as one world has it."""
+        """Material of a body in one world."""
         return self._material((body, k), self.values, world)
 
     def varies(self, body: Discretisation) -> bool:
-        """Whether constants of a body's materials were set."""
+        """True if constants of a body's materials were set."""
         return any(index == self._index(body) for index, _, _ in self.values)
 
     def mass(self, body: Discretisation, world: int | None) -> float:
-        """Mass of a body as a world has it, or as it was built, kg; 0 where a material has no density."""
+        """Mass of a body in a world or as built, kg; 0 for a material without density."""
         masses = self.model.masses
         return masses.of_body(body) if world is None else masses.of_body(body, world)
 
     def modulus(self, world: int | None) -> Modulus:
-        """`effective_modulus` as a world has it, or as the bodies were built."""
+        """`effective_modulus` in a world, or as built."""
         if world is None:
             return effective_modulus
 
@@ -142,7 +142,7 @@ class MaterialParameters:
         return of
 
     def of_worlds(self, body: Discretisation, k: int) -> Material:
-        """A material of a body, with arrays of what differs between worlds."""
+        """Material of a body, with arrays for constants that differ between worlds."""
         return self._material((body, k), self.values)
 
     def _material(self, owner: Owner, values: Mapping[Any, np.ndarray], world: int | None = None) -> Material:
@@ -157,7 +157,7 @@ class MaterialParameters:
         return self.model.bodies.index(body)  # type: ignore[arg-type]
 
     def _set(self, owner: str, members: list[Owner], name: str, values: Any, mask: np.ndarray) -> None:
-        """Take values (worlds,), of which those of the chosen worlds count, as a constant of some materials."""
+        """Set a constant of some materials to values (worlds,) in the chosen worlds."""
         wanted = per_world(owner, name, values, self.model.worlds)
         good, text = LIMITS.get(name, (np.isfinite, "finite"))
         refuse(owner, name, wanted, ~mask | (np.isfinite(wanted) & good(wanted)), text)
@@ -166,8 +166,8 @@ class MaterialParameters:
         keys = [(self._index(body), k, name) for body, k in members]
         if self.begun and any(key not in self.values for key in keys):
             raise ModelError(
-                f"set_parameter: a Simulation of this model was made with one value of '{owner}.{name}' for all "
-                "worlds; call this once before the first Simulation, and later as often as wanted"
+                f"set_parameter: '{owner}.{name}' was uniform when a Simulation of this model was made: set it "
+                "before the first Simulation"
             )
         fresh = dict(self.values)
         for key, (body, k) in zip(keys, members):
@@ -181,7 +181,7 @@ class MaterialParameters:
         self.version += 1
 
     def _refuse_density(self, name: str, bodies: list[Discretisation]) -> None:
-        """Refuse to set densities where all worlds share what was made of them."""
+        """Refuse densities if data derived from them is shared by all worlds."""
         forces = [force for force in self.model.description.body_forces if set(force.bodies) & set(bodies)]
         if forces:
             raise ModelError(
@@ -197,7 +197,7 @@ class MaterialParameters:
     # tables
 
     def _write(self, members: list[Owner], name: str, mask: np.ndarray) -> None:
-        """Bring the tables on the device up to date with the values of some materials."""
+        """Update the device tables of some materials."""
         m = self.model
         if name in DENSITIES:
             keys = [(self._index(body), k) for body, k in members]
@@ -226,9 +226,9 @@ class MaterialParameters:
             block.data.coefficients = m.coefficients
 
     def _couple(self, block: Block, mask: np.ndarray) -> None:
-        """The couplings of assumed strains of a block in the chosen worlds, in each of which they are of that world.
+        """Couplings of assumed strains of a block in the chosen worlds, per world.
 
-        What they do not depend on is as the bodies were built: E/mu, which is a function of nu, then rounds the same.
+        Other constants are those of the bodies as built: E/mu, a function of nu, then rounds identically.
         """
         m, tying = self.model, block.key.tying
         assert tying is not None
@@ -261,7 +261,7 @@ class MaterialParameters:
 
     @contextmanager
     def window(self, first: int, last: int) -> Iterator[None]:
-        """For a while the tables are those of some worlds, for launches over them alone."""
+        """Context: tables restricted to some worlds, for launches over them."""
         blocks = self.model.blocks if self.values else []
         kept: list[tuple[Block, Any, Any]]
         kept = [(block, block.data.coefficients, getattr(block.data, "coupling", None)) for block in blocks]
@@ -281,11 +281,11 @@ class MaterialParameters:
     # checkpoints
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """What was set, by names "body.number.constant"."""
+        """Set values by names "body.number.constant"."""
         return {f"{self.model.bodies[b].name}.{k}.{name}": v for (b, k, name), v in self.values.items()}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Raise CheckpointError where `numpy` of another model gave other constants than were set here, or bad ones."""
+        """Raise CheckpointError for invalid values of `numpy`, or constants other than those set here."""
         here = set(self.numpy())
         for name in sorted(here ^ set(saved)):
             owner, number, constant = name.rsplit(".", 2)
@@ -303,11 +303,11 @@ class MaterialParameters:
                 raise CheckpointError(f"the values of {name!r} are damaged")
 
     def load(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Take what `numpy` gave."""
+        """Restore the values of `numpy`."""
         self.take({owner: saved[key] for owner, key in zip(list(self.values), self.numpy())})
 
     def take(self, values: Mapping[tuple[int, int, str], np.ndarray]) -> None:
-        """Take `values` of the same model, or of one in another precision."""
+        """Copy `values` of the same model, or of one in another precision."""
         every = np.ones(self.model.worlds, dtype=bool)
         for (b, k, name), of_worlds in values.items():
             body = self.model.bodies[b]

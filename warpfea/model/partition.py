@@ -1,4 +1,4 @@
-"""Grouping of nearby nodes by recursive bisection, and an order of nodes that keeps neighbours together."""
+"""Node clustering by recursive bisection, and a locality-preserving node order."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ __all__ = ["bisect", "connected_groups", "morton_order"]
 def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity: int) -> np.ndarray:
     """Group of each item: groups are compact, of one label, and of a total weight up to `capacity`.
 
-    Groups are halved across their longest side until they fit, so that groups of twice the capacity consist of whole
-    ones of the capacity.
+    Groups are halved across their longest side until they fit; those of twice the capacity are unions of those of
+    the capacity.
 
     Args:
         places: (n, 3) m.
@@ -27,7 +27,7 @@ def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity
     """
     if np.any(weights > capacity):
         raise ValueError(f"an item of weight {weights.max()} does not fit into a group of {capacity}")
-    # a multiple of the largest weight can be filled however the weights are cut
+    # multiples of the largest weight can be filled for any split of the weights
     room = capacity // int(weights.max()) * int(weights.max())
     group = np.unique(labels, return_inverse=True)[1].ravel().astype(np.int64)
     while True:
@@ -43,7 +43,7 @@ def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity
         along = places[np.arange(len(places)), axis[group]]
         order = np.lexsort((along, group))
         before = np.cumsum(weights[order]) - weights[order]
-        before = before - before[start][group[order]]  # weight of the items before it in its group
+        before = before - before[start][group[order]]  # weight of the preceding items of its group
         left = parts // 2
         share = np.where(parts > 1, total * left / np.maximum(parts, 1), np.inf)
         second = np.zeros(len(group), dtype=np.int64)
@@ -52,7 +52,7 @@ def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity
 
 
 def connected_groups(group: np.ndarray, graph: sp.csr_matrix) -> np.ndarray:
-    """(n,) numbers of the groups when split into connected parts; `graph` says which items touch."""
+    """(n,) group numbers after splitting into connected parts; `graph`: adjacency of the items."""
     links = graph.tocoo()
     inside = group[links.row] == group[links.col]
     within = sp.coo_matrix(

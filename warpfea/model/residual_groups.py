@@ -1,4 +1,4 @@
-"""Groups of slots whose residuals are judged apart: what is joined by materials of like stiffness."""
+"""Residual groups: connected slots of similar stiffness, each with its own convergence norm."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from .assembly import components_of
 __all__ = ["SlotGroups", "slot_groups"]
 
 LIKE = 30.0
-"""Stiffnesses that differ by less than this factor, one from the next, are alike."""
+"""Largest ratio of successive stiffnesses in one class."""
 
 
 def stiffness_classes(stiffness: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """(n,) number, from 0 for the softest, of the class of like `stiffness` (n,) within each `label`."""
+    """(n,) class number, from 0 for the softest, of similar `stiffness` (n,) within each `label`."""
     out = np.zeros(len(stiffness), dtype=np.int64)
     for one in np.unique(label):
         values, which = np.unique(stiffness[label == one], return_inverse=True)
@@ -27,7 +27,7 @@ def stiffness_classes(stiffness: np.ndarray, label: np.ndarray) -> np.ndarray:
 
 
 def slenderness(model: Any) -> np.ndarray:
-    """(parts,) squared ratio of the least to the largest radius of gyration of each part, which bending softens by.
+    """(parts,) squared ratio of the least to the largest radius of gyration of each part: softening by bending.
 
     With x = sum_i s_i E_i the second moments of a part are E^T M E.
     """
@@ -43,12 +43,12 @@ def slenderness(model: Any) -> np.ndarray:
 
 
 def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Piece of like stiffness, the softest first, of each slot, and of each element in the order of the model's blocks.
+    """Piece of similar stiffness, softest first, of each slot, and of each element in block order.
 
-    A piece is what elements of one class of stiffness, and ties between their slots, connect: stiff bodies on both
-    sides of a soft one are two, since a residual of the loaded one's forces moves the other far. A slot between
-    materials is one of the stiffest there, which its forces come from; an element belongs with the softest of its
-    slots. Moduli are those that the model was built with.
+    A piece is connected by elements of one stiffness class and by constraints: stiff bodies on both sides of a soft
+    one are two pieces, since a small residual relative to the loaded one's forces displaces the other far. A slot
+    between materials belongs to the stiffest, which dominates its forces; an element to its softest slot. Moduli are
+    those of the model as built.
     """
     parts = [host for block in model.blocks for host in block.parts]
     first = np.concatenate([host.conn[:, 0] + host.body.slot_offset for host in parts])
@@ -69,7 +69,7 @@ def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def connected_slots(sets: list[np.ndarray], slots: int) -> np.ndarray:
-    """(slots,) number of what the rows of `sets`, (n, m) slots with -1 for none, connect."""
+    """(slots,) connected component number from the rows of `sets`, (n, m) slots padded with -1."""
     count = np.cumsum([0] + [len(rows) for rows in sets])
     row = np.concatenate([np.repeat(first + np.arange(len(rows)), rows.shape[1]) for first, rows in zip(count, sets)])
     slot = np.concatenate([rows.ravel() for rows in sets])
@@ -80,7 +80,7 @@ def connected_slots(sets: list[np.ndarray], slots: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SlotGroups:
-    """Slots and elements by group, on the device; with one group the lists are empty and stand for all in order.
+    """Slots and elements by group, on the device; with one group the lists are empty (all in order).
 
     Attributes:
         slot_start, element_start: [group + 1] into slot and element.
@@ -96,7 +96,7 @@ class SlotGroups:
 
 
 def slot_groups(model: Any, label: np.ndarray) -> SlotGroups:
-    """Groups of one `label` (slots,), each of whose elements has one, and of one piece of like stiffness."""
+    """Groups of one `label` (slots,), constant within each element, and one piece of similar stiffness."""
     of_slot, of_element = like_stiffness(model)
     first = np.concatenate([block.connectivity[:, 0] for block in model.blocks])
     keys, of = np.unique(label * (of_slot.max() + 1) + of_slot, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Rigid shapes that bodies touch: where they are, how large, and how they are drawn."""
+"""Rigid shapes for contact: placement, size, drawing."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ __all__ = [
 ]
 
 ORTHONORMAL = 1e-6
-"""How far from 0 and 1 the products of axes may be; they are made orthonormal to rounding."""
+"""Tolerance of orthonormality; axes are then orthonormalised to round-off."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A rigid solid in the place where it is at displacement 0; base of the shapes.
+    """Rigid solid at displacement 0; base of the shapes.
 
     Attributes:
         kind: HALF_SPACE, SPHERE, BOX, CAPSULE or CYLINDER; MESH of a TriMesh.
@@ -46,13 +46,14 @@ class Shape:
 
     @property
     def sizes(self) -> np.ndarray:
-        """(3,) m: half-space 0, 0, 0; sphere radius, 0, 0; box half of each edge; capsule and cylinder radius, half of
-        the axis, 0."""
+        """Sizes (3,), m: half-space 0, 0, 0; sphere radius, 0, 0; box half edges; capsule and cylinder radius, half
+        axis, 0.
+        """
         raise NotImplementedError
 
     @property
     def radius_of_curvature(self) -> float:
-        """m: the radius of spheres, capsules and cylinders; infinite for half-spaces and boxes."""
+        """Radius, m, of spheres, capsules and cylinders; infinite for half-spaces and boxes."""
         raise NotImplementedError
 
     def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
@@ -65,14 +66,14 @@ class Shape:
             points (n, 3), m, and triangles (m, 3), outward by the right hand, each edge shared by two.
 
         Raises:
-            ModelError: a resolution that is no whole number or below 3.
+            ModelError: a resolution that is not a whole number, or below 3.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace(Shape):
-    """The half-space n.x <= offset; bodies are on the side that the normal points to.
+    """Half-space n.x <= offset; bodies are on the side of the normal.
 
     Args:
         normal: (3,), any length but zero; kept with length 1.
@@ -90,7 +91,7 @@ class HalfSpace(Shape):
         set_checked(self, normal=_direction(self, "normal"), offset=_number(self, "offset"))
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
-        """A point of the plane, the one closest to the origin, and axes whose third is the normal."""
+        """Point of the plane closest to the origin, and axes with the normal as third."""
         return self.offset * self.normal, _axes_along(self.normal)
 
     @property
@@ -104,7 +105,7 @@ class HalfSpace(Shape):
     def mesh(
         self, resolution: int = 24, *, size: float = 2.0, around: Any = (0.0, 0.0, 0.0)
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A square of the plane, with sides `size`, m, about the point of the plane closest to `around` (3,), m."""
+        """Square of the plane with sides `size`, m, centred at the projection of `around` (3,), m."""
         _, axes = self.frame()
         place = np.asarray(around, dtype=float)
         middle = place + (self.offset - place @ self.normal) * self.normal
@@ -114,7 +115,7 @@ class HalfSpace(Shape):
 
 @dataclass(frozen=True, eq=False)
 class Sphere(Shape):
-    """A ball.
+    """Sphere.
 
     Args:
         center: (3,) m.
@@ -132,7 +133,7 @@ class Sphere(Shape):
         set_checked(self, center=_vector(self, "center"), radius=_positive(self, "radius"))
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
-        """The centre, and the axes of the world."""
+        """Centre, and global axes."""
         return self.center.copy(), np.eye(3)
 
     @property
@@ -151,7 +152,7 @@ class Sphere(Shape):
 
 @dataclass(frozen=True, eq=False)
 class Box(Shape):
-    """A box.
+    """Box.
 
     Args:
         center: (3,) m.
@@ -196,7 +197,7 @@ class Box(Shape):
 
 @dataclass(frozen=True, eq=False)
 class _Round(Shape):
-    """What capsules and cylinders share: an axis from start to end, and a radius."""
+    """Common parts of capsules and cylinders: axis from start to end, and radius."""
 
     start: Any
     end: Any
@@ -210,7 +211,7 @@ class _Round(Shape):
             )
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
-        """The middle of the axis, and axes whose third points from start to end."""
+        """Middle of the axis, and axes whose third points from start to end."""
         along = self.end - self.start
         return 0.5 * (self.start + self.end), _axes_along(along / np.linalg.norm(along))
 
@@ -225,10 +226,10 @@ class _Round(Shape):
 
 @dataclass(frozen=True, eq=False)
 class Capsule(_Round):
-    """A cylinder with half a ball at each end: all within `radius` of the line from start to end.
+    """Cylinder with hemispherical ends: all points within `radius` of the segment from start to end.
 
     Args:
-        start, end: (3,) m, the centres of the two balls.
+        start, end: (3,) m, centres of the hemispheres.
         radius: m.
 
     Raises:
@@ -267,7 +268,7 @@ class Cylinder(_Round):
         return _revolved(self, profile, _segments(self, resolution))
 
 
-# checks; each returns the value as it is kept
+# checks; each returns the stored value
 
 
 def _name(shape: Shape) -> str:
@@ -275,7 +276,7 @@ def _name(shape: Shape) -> str:
 
 
 def set_checked(shape: Shape, **values: Any) -> None:
-    """Set checked values of a frozen shape; arrays can't be written to."""
+    """Set checked values of a frozen shape; arrays become read-only."""
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             value.flags.writeable = False
@@ -302,7 +303,7 @@ def _direction(shape: Shape, name: str) -> np.ndarray:
     out = _array(shape, name, (3,), "three finite numbers that are not all zero")
     length = np.linalg.norm(out)
     if not length > 0.0:
-        raise ModelError(f"{_name(shape)}: {name} = {out.tolist()} is zero; it must point out of the solid")
+        raise ModelError(f"{_name(shape)}: {name} = {out.tolist()} is zero; give the outward normal")
     return out / length
 
 
@@ -341,7 +342,7 @@ def _segments(shape: Shape, resolution: Any) -> int:
 
 
 def _axes_along(n: np.ndarray) -> np.ndarray:
-    """Right-handed orthonormal axes (columns) whose third is n (3,)."""
+    """Right-handed orthonormal axes (columns) with third axis n (3,)."""
     least = np.eye(3)[int(np.argmin(np.abs(n)))]
     first = np.cross(least, n)
     first /= np.linalg.norm(first)
@@ -349,7 +350,7 @@ def _axes_along(n: np.ndarray) -> np.ndarray:
 
 
 def _arc(start: float, end: float, parts: int) -> np.ndarray:
-    """(parts + 1, 2) distance from the axis, and height, on a circle of radius 1, from low to high."""
+    """(parts + 1, 2) distance from the axis, and height, on a unit circle, from low to high."""
     angle = np.linspace(start, end, parts + 1)
     distance = np.cos(angle)
     distance[np.abs(distance) < 1e-15] = 0.0
@@ -357,7 +358,9 @@ def _arc(start: float, end: float, parts: int) -> np.ndarray:
 
 
 def _revolved(shape: Shape, profile: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """A profile (k, 2) of distances from the local z axis and heights, turned about it; its ends lie on the axis."""
+    """Surface of revolution of a profile (k, 2) of radii and heights about the local z axis; its ends lie on the
+    axis.
+    """
     center, axes = shape.frame()
     turn = 2.0 * np.pi * np.arange(n) / n
     circle = np.column_stack([np.cos(turn), np.sin(turn)])

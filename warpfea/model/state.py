@@ -1,7 +1,7 @@
 """State: the registry of all arrays that vary with time, one row per world.
 
-Features register what they need once; copying, rejection, reset, freezing, checkpoints and the bytes report loop over
-the registry and so know of every array.
+Features register their arrays once; copying, rejection, reset, freezing, checkpoints and the memory report loop over
+the registry.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["ArraySpec", "State", "words_of"]
 
 MEMORY = ("preconditioner", "operator", "predictor", "summed")
-"""What names of arrays begin with that a state can do without: memory of solvers, roundings of the time."""
+"""Name prefixes of optional state arrays (solver history, summed time)."""
 WATCH = ("energy_growth",)
-"""Arrays of what is watched, without which a state goes on as well."""
+"""Monitor arrays, optional in a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ArraySpec:
 
 
 class State:
-    """Arrays [world, ...] on one device; each is an attribute by its name.
+    """Arrays [world, ...] on one device; accessible as attributes.
 
     Attributes:
         displacement: [world, slot] vec3, m (gradient slots: 1), from the reference.
@@ -72,10 +72,10 @@ class State:
         raise AttributeError(f"state has no array {name!r}; it has {sorted(arrays)}")
 
     def register(self, name: str, dtype: Any, shape: tuple[int, ...] = (), initial: Any = 0) -> wp.array:
-        """Add an array [world, *shape]; `initial` broadcasts to it. A name that is there already keeps its array.
+        """Add an array [world, *shape]; `initial` broadcasts to it. An existing array is kept.
 
         Raises:
-            ModelError: the name is taken by an array of another kind, or rows are no multiple of 4 bytes.
+            ModelError: an existing array of another kind, or rows that are not a multiple of 4 bytes.
         """
         spec = ArraySpec(name, dtype, tuple(shape), initial)
         self.asked.append(name)
@@ -114,7 +114,7 @@ class State:
         return {name: array.size * wp.types.type_size_in_bytes(array.dtype) for name, array in self._arrays.items()}
 
     def like(self) -> State:
-        """A state with the same registry and values of its own, copied from this one."""
+        """Copy of the state with the same registry."""
         out = State(self.worlds, self.device)
         out.specs = dict(self.specs)
         with enough_memory(f"a copy of a state with {self.worlds} worlds", self.device):
@@ -122,7 +122,7 @@ class State:
         return out
 
     def copy_rows(self, launch: Launcher, flags: wp.array, source: State, skip: tuple[str, ...] = ()) -> None:
-        """Copy the rows of the worlds with flag 1 from another state, bit for bit."""
+        """Copy the rows of the flagged worlds from another state, bitwise."""
         kernel = state_kernels().copy_rows
         for name in self._arrays:
             if name in skip:
@@ -132,7 +132,7 @@ class State:
                 launch(kernel, b.shape, [flags, a, b])
 
     def words(self, name: str) -> wp.array:
-        """An array seen as [world, 32-bit word]."""
+        """Array viewed as [world, 32-bit word]."""
         if name not in self._words:
             self._words[name] = words_of(self._arrays[name])
         return self._words[name]
@@ -142,8 +142,8 @@ class State:
         return {name: array.numpy().copy() for name, array in self._arrays.items()}
 
     def load(self, values: dict[str, np.ndarray]) -> None:
-        """Set all arrays from the host. What solvers remember begins anew where `values` are of another solver, and so
-        does a watch that they lack.
+        """Set all arrays from the host. Solver history is reset if `values` come from another solver, as are
+        monitors missing in them.
 
         Raises:
             CheckpointError: a missing name or another shape; nothing is set then.
@@ -174,12 +174,12 @@ class State:
 
 
 def remembered(name: str) -> bool:
-    """Whether an array is a solver's memory."""
+    """True for arrays of solver history."""
     return name.partition("_")[0] in MEMORY
 
 
 def words_of(array: wp.array) -> wp.array:
-    """The array seen as [world, 32-bit word]."""
+    """Array viewed as [world, 32-bit word]."""
     size = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
     out: Any = wp.array(
         ptr=array.ptr, dtype=wp.uint32, shape=(array.shape[0], size // max(array.shape[0], 1)), device=array.device

@@ -1,4 +1,4 @@
-"""Faces of a body, and how it is drawn by its elements' functions: with its curved faces, sections and thickness."""
+"""Faces of a body, and its drawn geometry by the shape functions: curved faces, sections, thickness."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def _cut(corners: int, parts: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Points:
-    """Collects material points of elements, and merges those that have the same weights on the same slots."""
+    """Collects material points of elements, and merges those with equal weights on the same slots."""
 
     def __init__(self, body: Discretisation) -> None:
         self.body = body
@@ -153,7 +153,7 @@ class _Points:
         self.count = 0
 
     def add(self, elements: np.ndarray, xi: np.ndarray, label: int) -> np.ndarray:
-        """Add the points xi (P, 3) of each element; returns their (E, P) numbers before merging.
+        """Add the points xi (P, 3) of each element; returns their (E, P) indices before merging.
 
         Points of different `label` are not merged.
         """
@@ -182,7 +182,7 @@ class _Points:
         return first + np.arange(E * P).reshape(E, P)
 
     def merge(self) -> tuple[np.ndarray, sp.csr_matrix, sp.csr_matrix]:
-        """The new number of each point, and the slot and sample weights of the merged points."""
+        """Merged index of each point, and slot and sample weights of the merged points."""
         _, first, inverse = np.unique(np.concatenate(self._keys), return_index=True, return_inverse=True)
         rank = np.empty(len(first), dtype=np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
@@ -205,7 +205,7 @@ def _sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sp.csr_matri
 
 
 def make_skin(body: Discretisation) -> Skin:
-    """The outer faces cut into triangles; faces of beams and shells share no points, so that their edges stay sharp."""
+    """Outer faces as triangles; faces of beams and shells share no points, for sharp edges."""
     points = _Points(body)
     triangles = []
     for face, rows in _by_face(body.boundary):

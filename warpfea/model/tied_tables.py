@@ -31,7 +31,7 @@ class TiedTables:
 
 
 def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
-    """Tables of the tied part of some elements of a block."""
+    """Tables of the tied part of elements of a block."""
     part, body = host.key.integral, host.body
     tying = part.tying
     assert tying is not None
@@ -49,7 +49,7 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
 
 
 def couplings(host: HostBlock, materials: Sequence[Material]) -> np.ndarray:
-    """(materials, E, n, width) A of the tied elements of a block, were they of other materials."""
+    """(materials, E, n, width) A of the tied elements of a block for other materials."""
     tying, rule = host.key.tying, host.key.rule
     assert tying is not None
     members = chunks(host.body, host.elements, len(rule.weights))

@@ -1,4 +1,4 @@
-"""Who contributes to which slot, connected components, free groups, and what statics asks of supports."""
+"""Gather topology, connected components, free bodies, static support check."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def make_topology(model: Any) -> Any:
 
 
 def label_components(graph: sp.csr_matrix, groups: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Connected component of each slot: by elements alone, and with what terms tie, given as `groups` of slots."""
+    """Connected component of each slot: by elements alone, and with constraints, given as `groups` of slots."""
     part = assembly.components_of(graph)
     if not groups:
         return part, part
@@ -44,9 +44,9 @@ def label_components(graph: sp.csr_matrix, groups: list[np.ndarray]) -> tuple[np
 
 
 def free_groups(model: Any) -> tuple[Any, int]:
-    """Components that nothing holds in some direction, on the device, and their number (DESIGN 5).
+    """Components with an unconstrained translation, on the device, and their number (DESIGN 5).
 
-    Their translations pass through the mass alone: each solve is corrected by them, so that momentum does not leak.
+    Only the mass resists their translations: each solve is corrected for them, so that momentum is conserved.
     """
     label, count = model.component, model.component_count
     free = np.ones((count, 3))
@@ -74,7 +74,7 @@ def free_groups(model: Any) -> tuple[Any, int]:
 
 
 def check_static_supports(model: Any) -> None:
-    """Raise ModelError for a part that can move as a rigid body: statics has no answer for it."""
+    """Raise ModelError for an unconstrained rigid-body mode."""
     state = model.state()
     touches = model.description.all_contacts
     held_by = "hold what rests on contact with solve_static(stabilise=True), " if touches else ""
@@ -104,19 +104,19 @@ def check_static_supports(model: Any) -> None:
         rank = int(np.sum(values > 1e-9))
         free = len(modes) - rank
         if free:
-            moves = (turned[:, rank:] ** 2).reshape(len(parts), -1).sum(axis=1)  # of each part in these motions
+            moves = (turned[:, rank:] ** 2).reshape(len(parts), -1).sum(axis=1)  # amplitude of each part
             loose = slots[part == int(np.argmax(moves > 1e-6))]
             first = loose[0]
             body = next(b for b in model.bodies if b.slot_offset <= first < b.slot_offset + b.slot_count)
             raise ModelError(
-                f"{_piece(body, loose)} is not supported: supports, joints and terms leave {free} rigid "
-                f"motion{'s' * (free > 1)} free, and statics has no unique answer (that gravity would hold it is "
-                f"not counted): clamp or drive more nodes, {held_by}or let a damped dynamic run come to rest"
+                f"{_piece(body, loose)} has {free} unconstrained rigid-body mode{'s' * (free > 1)}: no unique static "
+                f"equilibrium (gravity does not count as a support): clamp or drive more nodes, {held_by}or let a "
+                "damped dynamic run come to rest"
             )
 
 
 def _piece(body: Any, slots: np.ndarray) -> str:
-    """A body, or a piece of it that shares no node with the rest, with these slots of the model."""
+    """Text of a body, or of a disconnected piece of it, with these model slots."""
     inside = np.zeros(body.slot_count, dtype=bool)
     inside[slots - body.slot_offset] = True
     if inside.all():

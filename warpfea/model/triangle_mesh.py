@@ -1,4 +1,4 @@
-"""Rigid triangle meshes as obstacles: what they must be, and the tables that contact searches."""
+"""Rigid triangle meshes as obstacles: requirements and contact search tables."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from .shapes import Shape, set_checked
 __all__ = ["TriMesh", "TriangleTables"]
 
 NEEDLE = 1e-10
-"""Least height of a triangle over its longest edge."""
+"""Minimum height of a triangle over its longest edge."""
 PLANE = 1e-12
 """Sine of the angle up to which triangles count as coplanar."""
 FOLD = 1e-6
-"""Least length of the sum of the normals at an edge."""
+"""Minimum length of the sum of the normals at an edge."""
 LEAF = 4
-"""Most triangles of a leaf."""
+"""Maximum triangles per leaf."""
 
 
 @dataclass(frozen=True)
 class TriangleTables:
-    """What the device reads of a mesh, in its own frame; see kernels/terms/contact_mesh.py.
+    """Device tables of a triangle mesh in local coordinates (BVH, normals, edge kinds); see
+    kernels/terms/contact_mesh.py.
 
     Attributes:
         low, high: (boxes, 3) m, of a balanced tree.
-        start: (leaves + 1,) first triangle of each leaf, and their number.
+        start: (leaves + 1,) first triangle of each leaf; last: total number.
         corner: (3, triangles, 3) m, in the order of the leaves.
         normal: (7, triangles, 3) of face, edges ab, bc, ca and corners a, b, c.
         border: (7, triangles) FLAT, SHARP or RIM.
@@ -49,10 +50,10 @@ class TriangleTables:
 
 @dataclass(frozen=True, eq=False)
 class TriMesh(Shape):
-    """The solid within a closed mesh of triangles, or a sheet of triangles that has no thickness.
+    """Solid within a closed triangle mesh, or a sheet of zero thickness.
 
-    A mesh in which each edge has two triangles is closed, and solid behind its triangles. Any other is a sheet: bodies
-    touch it from both sides, and one that begins on it is in front. Points at exactly one place are one point.
+    A mesh in which each edge has two triangles is closed, and solid behind its triangles. Any other is a sheet with
+    contact on both sides; a body that starts on it is in front. Coincident points are merged.
 
     Args:
         points: (n, 3), m over `scale`, or a file that meshio reads, such as .stl, .obj, .ply, .vtk or .msh.
@@ -61,8 +62,8 @@ class TriMesh(Shape):
 
     Raises:
         ModelError: a file that can't be read, no triangles, a triangle without an area, a point number out of range or
-            a value that is not finite; an edge of more than two triangles, or run through twice in one direction, or
-            where the surface folds back on itself; a closed mesh that is inside out.
+            a value that is not finite; an edge of more than two triangles, inconsistent orientation, or coincident
+            triangles at an edge; an inverted closed mesh.
     """
 
     points: Any
@@ -98,13 +99,13 @@ class TriMesh(Shape):
         return f"TriMesh({len(self.points)} points, {len(self.triangles)} triangles, {box} m, {kind})"
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
-        """The middle of its box, and the axes of the world."""
+        """Centre of the bounding box, and global axes."""
         used = self.points[self.triangles.ravel()]
         return 0.5 * (used.min(axis=0) + used.max(axis=0)), np.eye(3)
 
     @property
     def sizes(self) -> np.ndarray:
-        """(3,) diagonal of its box, thickness 2 V/A (of a sheet the diagonal), m, and 1 if it is closed."""
+        """(3,) diagonal of the bounding box, thickness 2 V/A (of a sheet the diagonal), m, and 1 if closed."""
         used = self.points[self.triangles.ravel()]
         size = float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
         area = 0.5 * float(np.linalg.norm(self._cross, axis=1).sum())
@@ -115,17 +116,17 @@ class TriMesh(Shape):
         return np.inf
 
     def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
-        """Points and triangles as they are."""
+        """Points and triangles, unchanged."""
         return self.points, self.triangles
 
     @property
     def closed(self) -> bool:
-        """Whether each edge has two triangles."""
+        """True if each edge has two triangles."""
         return bool((self._neighbours >= 0).all())
 
     @property
     def volume(self) -> float:
-        """m^3, of a closed mesh."""
+        """Volume of a closed mesh, m^3."""
         a, b, c = np.moveaxis(self._corners, 1, 0)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
@@ -136,19 +137,19 @@ class TriMesh(Shape):
 
     @property
     def _cross(self) -> np.ndarray:
-        """(m, 3) normals as long as twice the area, m^2."""
+        """(m, 3) normals of length 2 x area, m^2."""
         p = self._corners
         return np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
 
     @cached_property
     def _welded(self) -> np.ndarray:
-        """(m, 3) triangles by numbers of places."""
+        """(m, 3) triangles by merged point indices."""
         _, number = np.unique(self.points, axis=0, return_inverse=True)
         return number.reshape(-1)[self.triangles]
 
     @cached_property
     def _neighbours(self) -> np.ndarray:
-        """(m, 3) the triangle beyond each edge ab, bc, ca, or -1. ModelError names an edge that is wrong."""
+        """(m, 3) neighbour across each edge ab, bc, ca, or -1. ModelError names an invalid edge."""
         t = self._welded
         start, end = t.ravel(), np.roll(t, -1, axis=1).ravel()
         low, high = np.minimum(start, end), np.maximum(start, end)
@@ -161,27 +162,27 @@ class TriMesh(Shape):
         one, other = order[:-1][same], order[1:][same]
         for k in np.flatnonzero(start[one] == start[other])[:1]:
             raise ModelError(
-                f"TriMesh: {self._edge(one[k])} is run through in one direction by triangles {one[k] // 3} and "
-                f"{other[k] // 3}; turn one of them round"
+                f"TriMesh: inconsistent orientation of triangles {one[k] // 3} and {other[k] // 3} at "
+                f"{self._edge(one[k])}: flip one"
             )
         normal = self._cross / np.linalg.norm(self._cross, axis=1, keepdims=True)
         folded = np.linalg.norm(normal[one // 3] + normal[other // 3], axis=1) < FOLD
         for k in np.flatnonzero(folded)[:1]:
-            raise ModelError(f"TriMesh: at {self._edge(one[k])} triangles {one[k] // 3} and {other[k] // 3} lie on "
-                             "each other: the surface folds back on itself")  # fmt: skip
+            raise ModelError(f"TriMesh: coincident triangles {one[k] // 3} and {other[k] // 3} at "
+                             f"{self._edge(one[k])}: the surface folds back on itself")  # fmt: skip
         out = np.full(t.size, -1)
         out[one], out[other] = other // 3, one // 3
         return out.reshape(-1, 3)
 
     def _edge(self, number: int) -> str:
-        """What an edge (3 x triangle + edge) is called: the points at its ends."""
+        """Text of an edge (3 x triangle + edge): the points at its ends."""
         triangle, k = divmod(int(number), 3)
         a, b = self.triangles[triangle, [k, (k + 1) % 3]]
         return f"the edge between points {a} and {b}"
 
     @cached_property
     def tables(self) -> TriangleTables:
-        """What contact searches."""
+        """Contact search tables."""
         normal, border = self._parts()
         order, start, low, high = tree(self._corners)
         corner = np.moveaxis(self._corners[order], 1, 0)
@@ -218,9 +219,9 @@ class TriMesh(Shape):
 
 
 def tree(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A balanced tree of boxes: order of the triangles, start of leaves, low and high corners of boxes.
+    """Balanced bounding volume hierarchy: order of the triangles, start of leaves, low and high corners of boxes.
 
-    Each box is halved by the number of its triangles across the longest axis of their middles.
+    Each box is split at the median triangle centre along the longest axis.
 
     Args:
         corners: (m, 3, 3) m.
@@ -257,7 +258,7 @@ def _points(values: Any) -> np.ndarray:
 
 
 def _triangles(values: Any, points: np.ndarray) -> np.ndarray:
-    """(m, 3) numbers of points, of triangles that have an area."""
+    """(m, 3) point indices of non-degenerate triangles."""
     count = len(points)
     out = np.array([] if values is None else values)
     if not out.size:

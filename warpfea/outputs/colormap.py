@@ -36,8 +36,8 @@ def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def map_colors(values: npt.ArrayLike, low: float, high: float, *, linear: bool = False) -> npt.NDArray[np.float32]:
     """Colours (..., 3) of scalars (...): `low` and below is dark violet, `high` and above yellow.
 
-    An empty range (low = high) gives the lowest colour, a value that is not finite mid grey. The table is
-    interpolated in sRGB; with `linear=True` the result is linear light, as USD's displayColor wants it.
+    An empty range (low = high) gives the lowest colour, a non-finite value mid grey. The table is interpolated in
+    sRGB; `linear=True` returns linear light, as required by USD's displayColor.
     """
     v = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(v)

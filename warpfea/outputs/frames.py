@@ -1,6 +1,6 @@
-"""What all output writers share: the protocol, due frames, safe file replacement and the drawn surface.
+"""Common parts of output writers: protocol, frame times, file replacement, drawn surface.
 
-A writer gets the simulation itself and asks it for `time` (B,), of statics `load` (B,), `dt`, `model.bodies`,
+A writer receives the simulation and reads `time` (B,), of statics `load` (B,), `dt`, `model.bodies`,
 `model.worlds`, `model.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for nodal formats,
 `positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
 """
@@ -29,7 +29,7 @@ __all__ = [
 
 Array = npt.NDArray[Any]
 
-# name -> (title, units) of the fields that are known by name
+# name -> (title, units) of known fields
 FIELDS: dict[str, tuple[str, str]] = {
     "von_mises": ("von Mises stress", "Pa"),
     "displacement": ("displacement", "m"),
@@ -42,26 +42,26 @@ FIELDS: dict[str, tuple[str, str]] = {
 
 
 def field_label(name: str) -> tuple[str, str]:
-    """(title, units) of a field; an unknown name stands for itself, without units."""
+    """(title, units) of a field; an unknown name is its own title, without units."""
     return FIELDS.get(name, (name.replace("_", " "), ""))
 
 
 def time_of(sim: Any) -> float:
-    """The simulated time (s) of a frame: that of the world which is furthest (frozen worlds stay behind).
+    """The simulated time (s) of a frame: that of the most advanced world (frozen worlds lag).
 
-    Of statics the part of the load that acts, 0 to 1.
+    In statics the load factor, 0 to 1.
     """
     load = getattr(sim, "load", None)
     return float(np.max(np.asarray(sim.time if load is None else load, dtype=np.float64)))
 
 
 def is_static(sim: Any) -> bool:
-    """Whether a simulation is one of statics, whose frames are parts of the load."""
+    """True for statics, whose frames are load factors."""
     return getattr(sim, "load", None) is not None
 
 
 def check_fields(sim: Any, names: Sequence[str]) -> None:
-    """Raise the simulation's ModelError for a field that it does not have, before anything is computed."""
+    """Raise the simulation's ModelError for a missing field, before any computation."""
     check = getattr(sim, "check_field", None)
     if check is not None:
         for name in names:
@@ -82,12 +82,11 @@ def check_colors(pair: Any) -> tuple[float, float] | None:
 
 
 class FrameClock:
-    """Says when a frame is due: frame k at time k / fps.
+    """Frame schedule: frame k at time k / fps.
 
-    The first state is always due. Then a frame is due with the first state at or after its time, and when one
-    step passes several frame times, once for the latest of them. Writers store the state under its own time,
-    never under the nominal one: what a file says about a time is true at that time, and players interpolate
-    linearly in between.
+    The first state is always due. A frame is due at the first state at or after its time; once for the latest if a
+    step passes several frame times. Writers store the state under its own time, never the nominal one: samples are
+    exact at their times, and players interpolate linearly in between.
     """
 
     def __init__(self, fps: float) -> None:
@@ -98,7 +97,7 @@ class FrameClock:
         self._next = -np.inf
 
     def due(self, time: float) -> bool:
-        """Whether the state at `time` (s) is a frame; answers yes once per frame."""
+        """True if the state at `time` (s) is a frame; once per frame."""
         frame = time * self.fps
         slack = 1e-6 + 1e-12 * abs(frame)
         if frame < self._next - slack:
@@ -108,7 +107,7 @@ class FrameClock:
         return True
 
     def code(self, time: float) -> float:
-        """Time code of `time`: time * fps, as a whole number where it is one but for round-off."""
+        """Time code of `time`: time * fps, rounded to a whole number within round-off."""
         frame = time * self.fps
         nearest = float(np.round(frame))
         return nearest if abs(frame - nearest) <= 1e-6 + 1e-12 * abs(frame) else frame
@@ -125,7 +124,7 @@ def grid_offsets(worlds: int, spacing: tuple[float, float], up_axis: str = "Z") 
 
 
 class Surface:
-    """The drawn surfaces of a simulation: which bodies and obstacles, and where each world is laid out.
+    """Drawn surfaces of a simulation: bodies and obstacles, and the grid of worlds.
 
     `spacing` (m) is the distance of neighbouring worlds, one number or (first, second horizontal axis);
     without it, 1.25 times the size of one world when the run starts, at least half of its largest size.
@@ -145,7 +144,7 @@ class Surface:
         start += [np.asarray(near(points, low, high, 0.5), dtype=np.float64) for points in self.obstacles.bounded()]
         distance = self._spacing(start, spacing)
         self.offsets = grid_offsets(self.worlds, distance, self.up_axis)
-        if min(distance) > 0.0:  # a plane may not hide the bodies of other worlds
+        if min(distance) > 0.0:  # a plane must not hide the bodies of other worlds
             self.obstacles.narrow(min(distance))
 
     def _spacing(
@@ -166,7 +165,7 @@ class Surface:
 
     @staticmethod
     def points_of(sim: Any, body: Any) -> npt.NDArray[np.float64]:
-        """(B, P, 3) present surface points (m) without the grid offsets; OutputError if one is not finite."""
+        """(B, P, 3) current surface points (m) without the grid offsets; OutputError for non-finite ones."""
         points = np.asarray(sim.skin_points(body), dtype=np.float64)
         if not np.isfinite(points).all():
             world = int(np.argmin(np.isfinite(points).all(axis=(1, 2))))
@@ -189,11 +188,11 @@ class Surface:
 
     @property
     def body_points(self) -> int:
-        """How many of `points` belong to bodies; they come first."""
+        """Number of `points` of bodies, which come first."""
         return self.worlds * sum(self.counts)
 
     def sheets(self) -> list[int]:
-        """First point of each square that stands for a half-space, in the order of `points`."""
+        """First point of each square drawn for a half-space, in the order of `points`."""
         out, first = [], self.body_points
         for obstacle in self.obstacles.all:
             count = obstacle.points.shape[1]
@@ -203,7 +202,7 @@ class Surface:
         return out
 
     def points(self, sim: Any) -> npt.NDArray[np.float64]:
-        """(P, 3) present points (m) of all worlds, of the bodies and then the obstacles, with the grid offsets."""
+        """(P, 3) current points (m) of all worlds, of the bodies and then the obstacles, with the grid offsets."""
         blocks = [self.points_of(sim, body) for body in self.bodies] + self.obstacles.points()
         return np.concatenate([(block + self.offsets[:, None, :]).reshape(-1, 3) for block in blocks])
 

@@ -1,4 +1,4 @@
-"""Normals of triangle meshes, and which corners of their triangles share one."""
+"""Normals of triangle meshes, and grouping of triangle corners by shared normal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = npt.NDArray[Any]
 
 
 def vertex_normals(points: Array, triangles: Array) -> npt.NDArray[np.float32]:
-    """(P, 3) unit normals, area-weighted over the triangles of each point; (0, 0, 1) where there are none."""
+    """(P, 3) unit normals, area-weighted over the triangles of each point; (0, 0, 1) for points without."""
     points = points - points.mean(axis=0)
     corner = [points[triangles[:, k]] for k in range(3)]
     area = np.cross(corner[1] - corner[0], corner[2] - corner[0])
@@ -39,7 +39,7 @@ def smooth_corners(
 ) -> tuple[npt.NDArray[np.int64], int]:
     """Groups of triangle corners that share a normal: (3 T,) group of each corner, number of groups.
 
-    Corners at a point share one when their triangles are linked over edges flatter than `angle` (degrees).
+    Corners at a point share one if their triangles are connected by edges flatter than `angle` (degrees).
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

@@ -1,7 +1,7 @@
-"""Colliders as writers draw them: meshes in their own axes, and where they are in every world.
+"""Collider meshes and poses for output.
 
-A simulation with contact has `collider_poses()`: places (B, K, 3), m, turns (B, K, 3, 3) whose columns are the local
-axes, and by how much surfaces lie further out (B, K), m. Others have nothing to draw here.
+A simulation with contact has `collider_poses()`: positions (B, K, 3), m, rotations (B, K, 3, 3) whose columns are
+the local axes, and outward offsets of the surfaces (B, K), m. Others have no colliders to draw.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Floats = npt.NDArray[np.float64]
 GREY = (0.60, 0.60, 0.61)
 """Colour of obstacles, sRGB."""
 SHEET = 6.0
-"""Side of the square that stands for a half-space, over the size of the bodies at the start."""
+"""Side of the square drawn for a half-space, over the initial size of the bodies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +34,9 @@ class Obstacle:
     Attributes:
         name: of the collider.
         kind: name of its shape's class.
-        points: (B, n, 3) in its local axes, m; points on sharp edges are there once for each smooth face.
+        points: (B, n, 3) in its local axes, m; points on sharp edges are duplicated for each smooth face.
         triangles: (T, 3), outward.
-        moves: it has a path.
+        moves: True with a path.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Obstacles:
     """The colliders of a simulation.
 
     Args:
-        low, high: box of the bodies at the start, (3,) m: half-spaces are drawn around it.
+        low, high: initial bounding box of the bodies, (3,) m: half-spaces are drawn around it.
     """
 
     def __init__(self, sim: Any, low: Floats, high: Floats) -> None:
@@ -71,7 +71,7 @@ class Obstacles:
             shape = collider.shape
             center, axes = shape.frame()
             if shape.kind == HALF_SPACE:
-                # the plane may be turned already: the square lies where the bodies are now
+                # the plane may be rotated already: centre the square at the bodies' current position
                 around = center + axes @ (turn[0, k].T @ (middle - place[0, k]))
                 points, triangles = shape.mesh(size=side, around=around)
             else:
@@ -81,7 +81,7 @@ class Obstacles:
             self.all.append(Obstacle(collider.name, type(shape).__name__, grown, triangles, collider.moves))
 
     def narrow(self, width: float) -> None:
-        """Make squares at most so wide, m."""
+        """Limit the side of squares, m."""
         for k, obstacle in enumerate(self.all):
             if obstacle.sheet:
                 middle = obstacle.points.mean(axis=1, keepdims=True)
@@ -92,14 +92,14 @@ class Obstacles:
         return len(self.all)
 
     def poses(self) -> tuple[Floats, Floats]:
-        """Places (B, K, 3), m, and turns (B, K, 3, 3) now."""
+        """Current positions (B, K, 3), m, and rotations (B, K, 3, 3)."""
         assert self._sim is not None
         place, turn, grow = self._sim.collider_poses()
         sheets = np.array([obstacle.sheet for obstacle in self.all])
         return place + np.where(sheets, grow, 0.0)[:, :, None] * turn[:, :, :, 2], turn
 
     def points(self) -> list[Floats]:
-        """(B, n, 3) present points of each, m."""
+        """(B, n, 3) current points of each, m."""
         if not self.all:
             return []
         place, turn = self.poses()
@@ -109,18 +109,18 @@ class Obstacles:
         ]
 
     def bounded(self) -> list[Floats]:
-        """(B, n, 3) present points of those that are no half-spaces, m."""
+        """(B, n, 3) current points of those other than half-spaces, m."""
         return [points for points, obstacle in zip(self.points(), self.all) if not obstacle.sheet]
 
 
 def near(points: Array, low: Array, high: Array, part: float) -> Array:
-    """Points (..., 3) brought into the box from low to high, grown each way by a part of its diagonal."""
+    """Points (..., 3) clamped to the box from low to high, enlarged each way by a fraction of its diagonal."""
     margin = part * float(np.linalg.norm(high - low))
     return np.clip(points, low - margin, high + margin)
 
 
 def split_edges(points: Floats, triangles: npt.NDArray[np.integer[Any]]) -> tuple[Floats, npt.NDArray[np.int32]]:
-    """The same triangles with a point of their own for each smooth face at an edge."""
+    """The same triangles with separate points for each smooth face at an edge."""
     group, count = smooth_corners(points, triangles)
     corner = np.empty(count, dtype=np.int64)
     corner[group] = triangles.ravel()
@@ -128,7 +128,7 @@ def split_edges(points: Floats, triangles: npt.NDArray[np.integer[Any]]) -> tupl
 
 
 def _grown(shape: Any, points: Floats, triangles: npt.NDArray[np.int32], by: float) -> Floats:
-    """Local points of a shape whose surface lies further out; half-spaces are moved instead."""
+    """Local points of a shape with an outward offset of the surface; half-spaces are translated instead."""
     if by == 0.0 or shape.kind == HALF_SPACE:
         return points
     if shape.kind == MESH:
@@ -146,7 +146,7 @@ def _grown(shape: Any, points: Floats, triangles: npt.NDArray[np.int32], by: flo
 
 
 def names_beside(taken: Sequence[str], wanted: Sequence[str]) -> list[str]:
-    """Names made unique among each other and those that are taken."""
+    """Names made unique among each other and the given ones."""
     out: list[str] = []
     for name in wanted:
         while name in taken or name in out:

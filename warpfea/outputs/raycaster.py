@@ -1,4 +1,4 @@
-"""The ray caster: a picture of a triangle surface, drawn on Warp's CPU device without OpenGL or a display."""
+"""Ray caster: pictures of triangle surfaces on Warp's CPU device, without OpenGL or a display."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ VIEW = (-65.0, 20.0)  # default azimuth, elevation (degrees)
 class Camera:
     """A perspective camera in a frame with z up.
 
-    eye, target: (3,) float64, m. fov: vertical opening (degrees). center: where the target lies in the
-    picture, each in [-1, 1]. size: radius (m) of what is looked at; it sets the scale of ground and shadows.
+    eye, target: (3,) float64, m. fov: vertical opening (degrees). center: position of the target in the picture,
+    each in [-1, 1]. size: radius (m) of the scene, the scale of ground and shadows.
     """
 
     eye: Floats
@@ -55,13 +55,13 @@ class Camera:
     ) -> Camera:
         """The camera at (azimuth, elevation) degrees that shows all `points` (P, 3).
 
-        `margins` (left, right, bottom, top) are the shares of the picture kept free. ModelError for a `view` that is
+        `margins` (left, right, bottom, top) are free fractions of the picture. ModelError for a `view` that is
         not two finite numbers, or an elevation beyond +-90.
         """
         view = check_view(view)
         low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
         size = max(0.5 * float(np.linalg.norm(high - low)), 1e-9)
-        # straight down or up the vertical leaves the picture's right side open: a hair off it, the azimuth tells
+        # straight up or down the picture's right side is undefined: tilt slightly, keeping the azimuth
         azimuth, elevation = np.radians((view[0], np.clip(view[1], -89.999, 89.999)))
         back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         left, right_, bottom, top = margins
@@ -92,9 +92,9 @@ def check_view(view: Any) -> tuple[float, float]:
 
 
 def _centre(side: Floats, depth: Floats) -> float:
-    """Where the eye stands along one axis so that the points (P,) reach as far to both sides of the picture."""
+    """Eye position along one axis that centres the points (P,) in the picture."""
     low, high = float(side.min()), float(side.max())
-    for _ in range(60):  # what is seen moves one way as the eye moves: halve
+    for _ in range(60):  # monotonic in the eye position: bisection
         eye = 0.5 * (low + high)
         seen = (side - eye) / depth
         low, high = (eye, high) if seen.max() + seen.min() > 0.0 else (low, eye)
@@ -112,12 +112,12 @@ class Renderer:
 
     Args:
         triangles: (T, 3) int, outward.
-        reference: (P, 3) points whose dihedral angles tell edges (sharper than 40 degrees) from smooth
-            surface; without it those of the first picture.
-        up_axis: "Z" or "Y"; points are turned so that this axis is up.
+        reference: (P, 3) points whose dihedral angles define edges (sharper than 40 degrees); default: those of the
+            first picture.
+        up_axis: "Z" or "Y"; points are rotated so that this axis is up.
         ground: height (m) of the ground along the up axis, None for no ground.
 
-    The mesh is built once and refitted when points move. Not to be used inside a graph capture.
+    The mesh is built once and refitted when points move. Not usable inside a graph capture.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class Renderer:
         return scene
 
     def _cast_shadow(self, wp: Any, raycast: Any, scene: Any, unit: Floats, cells: int = 160) -> None:
-        """Fill the map of light on the ground, over the area that the surface can darken."""
+        """Fill the light map of the ground, over the area of possible shadow."""
         scene.shadow = wp.ones((1, 1), dtype=float)
         scene.shadow_cell = 1.0
         if not scene.has_ground:
@@ -240,7 +240,7 @@ class Renderer:
 
 _SUBPIXELS = np.array(
     [[(k + 0.5) / 8, ((5 * k + 2) % 8 + 0.5) / 8] for k in range(8)], dtype=np.float32
-)  # 8 rooks: each row and column of an 8 x 8 raster once
+)  # 8 rooks: one per row and column of an 8 x 8 raster
 
 
 def pixel_grid(width: int, height: int) -> npt.NDArray[np.float32]:
@@ -250,9 +250,9 @@ def pixel_grid(width: int, height: int) -> npt.NDArray[np.float32]:
 
 
 def rough_pixels(image: Floats, limit: float = 0.025) -> npt.NDArray[np.bool_]:
-    """(height, width) pixels of an sRGB picture that differ from a neighbour; they are sampled again."""
+    """(height, width) pixels of an sRGB picture that differ from a neighbour, for resampling."""
     rough = np.zeros(image.shape[:2], dtype=bool)
-    for channel in np.moveaxis(image, 2, 0):  # a reduction over an axis of three is slow in numpy
+    for channel in np.moveaxis(image, 2, 0):  # reductions over an axis of length three are slow in numpy
         down = np.abs(np.diff(channel, axis=0)) > limit
         across = np.abs(np.diff(channel, axis=1)) > limit
         rough[1:] |= down

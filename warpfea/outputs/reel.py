@@ -1,4 +1,4 @@
-"""Frames of a run and how they become pictures: camera, colour bar, time label, palette of an animation."""
+"""Frames of a run and their rendering: camera, colour bar, time label, palette of an animation."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["Frame", "Reel"]
 Floats = npt.NDArray[np.floating[Any]]
 _INK = (45, 50, 60)
 _GREY = (0.62, 0.66, 0.72)
-_BAR = 0.17  # share of the width that the colour bar takes
+_BAR = 0.17  # width fraction of the colour bar
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))  # the font has no µ
-_PAUSE = 0.6  # s that an animation rests on its last frame
+_PAUSE = 0.6  # duration of the last frame, s
 
 
 @dataclass
@@ -37,13 +37,13 @@ class Frame:
 
 @dataclass
 class Reel:
-    """Frames of one surface and how to show them.
+    """Frames of one surface and their display options.
 
     Attributes:
         shown: colour range; None: the extremes.
-        static: the frames' times are parts of a static load.
-        bodies: how many of the points belong to bodies, which come first; None: all. The others are of obstacles.
-        sheets: first of the four points of each square that stands for a half-space.
+        static: the frames' times are load factors.
+        bodies: number of points of bodies, which come first; None: all. The others belong to obstacles.
+        sheets: first of the four points of each square drawn for a half-space.
     """
 
     triangles: npt.NDArray[np.integer[Any]]
@@ -95,15 +95,15 @@ class Reel:
             )
 
     def _obstacles(self, low: Floats, high: Floats) -> list[Floats]:
-        """Points of the obstacles, brought near the box of the bodies: what surrounds these is in the picture."""
+        """Points of the obstacles, clamped to the neighbourhood of the bodies' bounding box, for the camera."""
         first = self.bodies or len(self.reference)
         return [near(frame.points[first:], low, high, 0.15) for frame in self.frames if len(frame.points) > first]
 
     def _floor(self, camera: Camera) -> tuple[float | None, list[int]]:
-        """Height of the ground, and squares that are not drawn.
+        """Height of the ground, and hidden squares.
 
-        A half-space that stays level is the ground; among others there is none, and without any it is at the lowest
-        point. Squares that the camera sees from behind would hide the bodies.
+        A horizontal fixed half-space is the ground; with other half-spaces there is none, without any it is at the
+        lowest point. Squares seen from behind are hidden, as they would cover the bodies.
         """
         level: dict[int, float] = {}
         hidden = []
@@ -124,7 +124,7 @@ class Reel:
         return max(level.values()), hidden + list(level)
 
     def range(self) -> tuple[float, float]:
-        """The colour range: as wanted, or the extremes over all frames."""
+        """Colour range: as given, or the extremes over all frames."""
         if self.shown is not None:
             return self.shown
         values = [frame.values[np.isfinite(frame.values)] for frame in self.frames if frame.values is not None]
@@ -149,7 +149,7 @@ class Reel:
         speed: float = 1.0,
         progress: bool | None = None,
     ) -> None:
-        """Draw all frames. A palette is made from five of them, so that it serves the whole animation."""
+        """Draw all frames, with one palette made from five of them."""
         count = len(self.frames)
         keys = sorted({round(k) for k in np.linspace(0, count - 1, min(5, count))})
         palette = make_palette(list(self.draw(size, view, keys, ground)), self.frames[0].values is not None)
@@ -209,7 +209,7 @@ def label(image: Image, time: str, bar: tuple[float, float, str, str] | None) ->
 
 
 def _numbers(ticks: Floats) -> list[str]:
-    """The ticks with as many decimals as tell neighbours apart."""
+    """Ticks with the decimals needed to distinguish neighbours."""
     step = float(np.ptp(ticks)) / 4.0
     largest = float(np.abs(ticks).max())
     if largest and not 1e-4 <= largest < 1e6:
@@ -222,7 +222,7 @@ def make_palette(images: list[Image], barred: bool) -> Any:
     """A PIL picture holding 256 colours for all `images`.
 
     With a colour bar 64 of them are the colour map. Vivid pixels (bodies) and dull ones (ground, sky) are
-    reduced apart, since the latter are many and smooth and would take nearly all.
+    quantised separately, since the latter are numerous and smooth and would take nearly all entries.
     """
     from PIL import Image as Pictures
 
@@ -242,7 +242,7 @@ def make_palette(images: list[Image], barred: bool) -> Any:
 
 
 def to_palette(image: Image, palette: Any) -> Any:
-    """A picture in the palette's colours, with ordered dithering: it hides bands and stands still."""
+    """Picture in the palette's colours, with ordered dithering: no banding, static pattern."""
     from PIL import Image as Pictures
 
     pattern = np.zeros((1, 1))

@@ -1,7 +1,7 @@
 """Pictures and animations: `PNGWriter` and `GIFWriter` of a run, `render_usd` of a file made by `USDWriter`.
 
-All draw the same way: worlds on the grid of the USD file, a camera that frames everything the run passes
-through, one colour range for all frames, a colour bar and the time.
+Common layout: worlds on the grid of the USD file, a camera that frames the whole motion, one colour range for all
+frames, a colour bar and the time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _checked_size(size: Any) -> tuple[int, int]:
 
 
 class _Drawing(Output):
-    """What PNGWriter and GIFWriter share: collecting frames."""
+    """Common parts of PNGWriter and GIFWriter: collection of frames."""
 
     suffix = ""
 
@@ -96,7 +96,7 @@ class _Drawing(Output):
         return Frame(time_of(sim), points, values)
 
     def abort(self) -> None:
-        """Drop the frames; nothing is on disk before `close`."""
+        """Discard the frames; nothing is on disk before `close`."""
         self._reel = None
 
 
@@ -104,11 +104,11 @@ class PNGWriter(_Drawing):
     """Draws one state to `path` (.png).
 
     Args:
-        field: scalar that is shown in colour, or None for plain grey. size: (width, height), pixels.
+        field: scalar shown in colour, or None for grey. size: (width, height), pixels.
         time: the first state at or after this time (s) is drawn; without it, or if never reached, the last.
         view: (azimuth, elevation) of the camera, degrees.
-        color_range: (low, high) of the colours, by default the extremes of what is drawn.
-        spacing: of worlds (m). ground: whether to draw the ground, at the lowest point.
+        color_range: (low, high) of the colours, by default the extremes of the drawn values.
+        spacing: of worlds (m). ground: True to draw the ground at the lowest point.
 
     ModelError: a bad size, view or field. OutputError: a bad colour range, a bad suffix or folder (at `open`), a file
     that can't be written (at `close`).
@@ -156,11 +156,11 @@ class GIFWriter(_Drawing):
     Args:
         fps: frames per second of the animation, at most 50 (the format counts hundredths of a second).
         speed: simulated seconds per second of the animation.
-        max_frames: when there are more, every second one is dropped and the rest come half as often.
-        progress: show a bar while drawing; None: when stderr is a terminal.
+        max_frames: above this, every second one is dropped and the frame rate halved.
+        progress: show a bar while drawing; None: if stderr is a terminal.
         field, size, view, color_range, spacing, ground: see :class:`PNGWriter`.
 
-    Frames (points and field, float32) are kept in memory and drawn at `close`, knowing the colour range.
+    Frames (points and field, float32) are kept in memory and drawn at `close`, when the colour range is known.
     """
 
     suffix = ".gif"
@@ -217,7 +217,7 @@ class GIFWriter(_Drawing):
 
 
 def check_rates(fps: float, speed: float, max_frames: int) -> None:
-    """ModelError for values that an animation can't have."""
+    """ModelError for invalid options of an animation."""
     if not (is_number(fps) and 0 < fps <= 50):
         raise ModelError(f"a GIF plays up to 50 frames per second, got fps={fps!r}")
     if not (is_number(speed) and speed > 0):
@@ -244,7 +244,7 @@ def render_usd(
     """Draw a USD file of :class:`warpfea.USDWriter` to `out` (.png or .gif) and return that path.
 
     Args:
-        field: a field of the file, or "none" for grey; None: the one that it shows in colour.
+        field: a field of the file, or "none" for grey; None: the field of its colours.
         time: of a PNG (s); None: the last.
         fps, speed, max_frames: of a GIF, which spans the whole file; more frames are spread over the span.
         color_range: (low, high) of the colours; None: those of the file, or the extremes of the run.
@@ -312,7 +312,7 @@ class _Source:
         )
 
     def reel(self, field: str | None, times: Floats) -> Reel:
-        """The frames at `times` (s); values between samples are interpolated linearly by USD."""
+        """Frames at `times` (s); USD interpolates linearly between samples."""
         from pxr import UsdGeom
 
         name = None if field == "none" else field or self.about["color"] or None

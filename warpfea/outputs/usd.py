@@ -2,18 +2,16 @@
 
 Layout of a stage (metres, kilograms):
 
-    /World                          Xform, default prim; customData["warpfea"] says what the file holds
+    /World                          Xform, default prim; customData["warpfea"]: contents
     /World/world_0000               Xform; its translate lays the worlds out on a grid
     /World/world_0000/<body>        Xform; a double-precision translate per frame, the centre of the body
     /World/world_0000/<body>/skin   Mesh; points, normals, extent and fields per frame, about that centre
     /World/world_0000/<collider>        Xform; translate and orient, per frame of one that moves
-    /World/world_0000/<collider>/shape  Mesh in the shape's own axes; customData["warpfea:collider"] says its kind;
-                                        of a half-space a square
-    /World/Camera /World/Sky /World/Sun
+    /World/world_0000/<collider>/shape  Mesh in the shape's own axes; customData["warpfea:collider"]: its kind;
+    of a half-space a square /World/Camera /World/Sky /World/Sun
 
-Points are float32 about the body's own centre, so nothing is lost far from the origin. The time code of a
-sample is its time times `fps`, a fraction where no step ended on the frame's time. Of statics the time is the part of
-the load, 0 to 1.
+Points are float32 relative to the body's centre, accurate far from the origin. The time code of a sample is its time
+times `fps`, fractional if no step ended at the frame's time. In statics the time is the load factor, 0 to 1.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
 
 SCHEMA = 1
 SUFFIXES = (".usdc", ".usda", ".usd")
-_SAVE_BYTES = 32 << 20  # unsaved data (bytes) after which a binary layer goes to disk
+_SAVE_BYTES = 32 << 20  # unsaved data (bytes) above which a binary layer is flushed to disk
 _GREY = (0.55, 0.57, 0.60)
 
 
@@ -57,22 +55,22 @@ class USDWriter(Output):
     """Writes `path` (.usdc, .usda or .usd).
 
     Args:
-        path: the target; overwritten if it exists, and only when the new file is complete and valid.
-        fps: frames and time codes per second; :class:`warpfea.outputs.frames.FrameClock` says what is a frame.
+        path: the target; replaced once the new file is complete and valid.
+        fps: frames and time codes per second; :class:`warpfea.outputs.frames.FrameClock` defines the frames.
         fields: scalar fields kept as vertex primvars, SI units.
-        color: the field shown as display colour (kept as primvar too), or None for plain grey.
+        color: the field shown as display colour (also a primvar), or None for grey.
         color_range: (low, high) of the colours; without it the extremes over the whole run and all worlds.
         spacing: distance of worlds (m); see :class:`warpfea.outputs.frames.Surface`.
-        extend: go on with the file if it is there, of the run that this one resumes: it must be of the same bodies and
-            settings and end at the present time.
+        extend: extend the file of the resumed run, if it exists: same bodies and settings, ending at the current
+            time.
 
-    Frames go into the layer as they come, and binary layers to disk every 32 MB. The state at `close` is always the
-    last frame.
+    Frames are written to the layer as they occur, binary layers flushed every 32 MB. The state at `close` is always
+    the last frame.
 
     Raises:
         ModelError: a bad `fps`, `fields` or `color`.
-        OutputError: bad suffix or folder, or a file that can't be extended (at `open`), positions that are not finite
-            (at `write`), a file that does not validate (at `close`; the target is then left as it was).
+        OutputError: bad suffix or folder, or a file that can't be extended (at `open`), non-finite positions (at
+            `write`), an invalid file (at `close`; the target is then unchanged).
     """
 
     def __init__(
@@ -143,7 +141,7 @@ class USDWriter(Output):
         return names_beside((), [Tf.MakeValidIdentifier(body.name) for body in self._surface.bodies])
 
     def _take_up(self, sim: Any, target: pathlib.Path) -> None:
-        """Open a copy of the file that is there, to go on with it."""
+        """Open a copy of the existing file for extension."""
         from pxr import Usd, UsdGeom
 
         assert self._temporary is not None
@@ -164,11 +162,11 @@ class USDWriter(Output):
         self._obstacles = ObstaclePrims(stage, self._surface, self._names())
         if not self._obstacles.take_up():
             raise OutputError(f"{target}: can't go on with this file: it has other colliders; give another file name")
-        for name in ("Camera", "Sky", "Sun"):  # they are made anew, for all frames
+        for name in ("Camera", "Sky", "Sun"):  # authored for all frames at the end
             stage.RemovePrim(f"/World/{name}")
 
     def _define(self) -> None:
-        """Author all that does not change: transforms, topology, attributes without samples."""
+        """Author constant data: transforms, topology, attributes without samples."""
         from pxr import Gf, UsdGeom, Vt
 
         names = self._names()
@@ -205,7 +203,7 @@ class USDWriter(Output):
             taken = [
                 (self._surface.points_of(sim, body), {n: self._field(sim, n, body) for n in self.fields})
                 for body in self._surface.bodies
-            ]  # all of it first: a frame that can't be had leaves nothing in the stage
+            ]  # evaluate all first: a failed frame must leave nothing in the stage
             for body, meshes, (points, fields) in zip(self._surface.bodies, self._meshes, taken, strict=True):
                 for world, mesh in enumerate(meshes):
                     values = {name: field[world] for name, field in fields.items()}
@@ -270,7 +268,7 @@ class USDWriter(Output):
             self._temporary = None
 
     def _finish(self, sim: Any) -> None:
-        """Author what is known at the end only: time span, colours, camera, lights and customData."""
+        """Author data known at the end only: time span, colours, camera, lights and customData."""
         stage = self._stage
         if self._codes:
             stage.SetStartTimeCode(min(self._codes))

@@ -1,4 +1,4 @@
-"""Is a USD file valid? USD's own validators, and what they do not look at."""
+"""Validation of USD files: USD's own validators, and additional checks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["in_words", "validate_usd"]
 
 
 def in_words(error: Exception) -> str:
-    """What USD says went wrong, without the places in its source."""
+    """USD error text without source locations."""
     texts = re.findall(r" : '(.*)'\s*$", str(error), re.MULTILINE)
     if texts and texts[0].startswith("Cannot determine file format"):
         return "it is no USD file"
@@ -20,9 +20,9 @@ def in_words(error: Exception) -> str:
 
 
 def validate_usd(path: str | os.PathLike[str], max_samples: int = 64) -> list[str]:
-    """Problems of a USD file, none for a valid one: all of USD's validators, and what they do not look at.
+    """Problems of a USD file, none for a valid one: all of USD's validators, and additional checks.
 
-    The own checks: units, up axis, default prim; per mesh face indices in range, and at up to `max_samples`
+    Additional checks: units, up axis, default prim; per mesh face indices in range, and at up to `max_samples`
     of its times (evenly spread, first and last included) finite points, unit normals, extents that hold the
     points, and counts of normals and primvars. No message of a validator is filtered out.
     """

@@ -1,4 +1,4 @@
-"""Going on with an animation that an earlier part of a run has written: does it fit, and what does it hold."""
+"""Consistency check and contents of an existing USD stage to be extended."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from warpfea.outputs.frames import Surface, is_static, time_of
 __all__ = ["Earlier", "read_earlier"]
 
 SAME = 1e-4
-"""Distance, over the size of what is drawn, at which the last frame and the present state are not one motion."""
+"""Largest distance of the last frame from the current state, over the size of the drawn surface."""
 
 
 @dataclass(frozen=True, eq=False)
 class Earlier:
-    """What a stage of :class:`warpfea.USDWriter` holds.
+    """Contents of a stage of :class:`warpfea.USDWriter`.
 
     Attributes:
         codes: time codes of its frames.
@@ -42,17 +42,16 @@ class Earlier:
 def read_earlier(
     target: pathlib.Path, stage: Any, sim: Any, surface: Surface, paths: list[list[str]], wanted: dict[str, Any]
 ) -> Earlier:
-    """The contents of a stage that the run of `sim` goes on with.
+    """Contents of a stage extended by the run of `sim`.
 
     Args:
         target: its file, for messages.
-        surface: what is drawn of the simulation.
+        surface: drawn surface of the simulation.
         paths: prims of the bodies' meshes, [body][world].
         wanted: "fps", "fields" and "color" of the writer.
 
     Raises:
-        OutputError: it is of another writer, scene or setting, does not end where the simulation is, or shows another
-            motion.
+        OutputError: another writer, scene or setting, another end time than the simulation's, or another motion.
     """
     from pxr import UsdGeom
 
@@ -79,7 +78,7 @@ def read_earlier(
     time, now = codes[-1] / wanted["fps"], time_of(sim)
     slack = 1e-6 * max(1.0 / wanted["fps"], abs(now))
     if time > now + slack:
-        raise _refused(target, f"it goes on to t = {time:.6g} s, and the run is resumed at t = {now:.6g} s")
+        raise _refused(target, f"its last frame, t = {time:.6g} s, is later than the checkpoint, t = {now:.6g} s")
     if time < now - slack - 1.001 / wanted["fps"]:
         raise _refused(
             target, f"it ends at t = {time:.6g} s, and the run is resumed at t = {now:.6g} s: frames are missing"
@@ -93,7 +92,7 @@ def read_earlier(
 
 
 def _check_faces(target: pathlib.Path, surface: Surface, meshes: list[list[Any]]) -> None:
-    """OutputError where the meshes of the stage are not those that are drawn."""
+    """OutputError for meshes of the stage other than the drawn ones."""
     for body, worlds in zip(surface.bodies, meshes, strict=True):
         for mesh in worlds:
             faces = np.asarray(mesh.GetFaceVertexIndicesAttr().Get() if mesh else ()).reshape(-1)
@@ -104,7 +103,7 @@ def _check_faces(target: pathlib.Path, surface: Surface, meshes: list[list[Any]]
 def _check_frame(
     target: pathlib.Path, sim: Any, surface: Surface, meshes: list[list[Any]], code: float, bound: float
 ) -> None:
-    """OutputError where a point of the frame at a time code is further than `bound`, m, from the simulation's."""
+    """OutputError for a point of the frame at a time code farther than `bound`, m, from the simulation's."""
     for body, worlds in zip(surface.bodies, meshes, strict=True):
         points = surface.points_of(sim, body)
         for world, mesh in enumerate(worlds):
@@ -126,7 +125,7 @@ def _center(mesh: Any, code: float) -> npt.NDArray[np.float64]:
 
 
 def _offset(stage: Any, mesh: Any) -> npt.NDArray[np.float64]:
-    """Where the world of a mesh lies on the grid, (3,) m."""
+    """Grid origin of the world of a mesh, (3,) m."""
     from pxr import UsdGeom
 
     (op,) = UsdGeom.Xformable(mesh.GetPrim().GetParent().GetParent()).GetOrderedXformOps()

@@ -1,4 +1,4 @@
-"""Colliders in a USD stage: meshes that do not change, moved by the transform above them."""
+"""Colliders in a USD stage: constant meshes moved by a parent transform."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class ObstaclePrims:
     """The prims of the obstacles of a simulation.
 
     Args:
-        stage: the stage that is written.
-        surface: what is drawn of the simulation.
+        stage: the written stage.
+        surface: drawn surface of the simulation.
         bodies: names of the bodies' prims.
     """
 
@@ -39,7 +39,7 @@ class ObstaclePrims:
         return f"/World/world_{world:04d}/{name}"
 
     def define(self) -> None:
-        """Author meshes, and the transforms of obstacles that stay where they are."""
+        """Author meshes, and the transforms of fixed obstacles."""
         from pxr import UsdGeom
 
         for obstacle, name in zip(self.obstacles.all, self.names):
@@ -71,7 +71,7 @@ class ObstaclePrims:
         mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([grey]))
 
     def take_up(self) -> bool:
-        """Find the prims in a stage that is continued; False if it has others."""
+        """Find the prims in an extended stage; False if it has others."""
         from pxr import UsdGeom
 
         there = {str(prim.GetParent().GetPath()) for prim in self.stage.Traverse() if prim.GetCustomDataByKey(KEY)}
@@ -85,7 +85,7 @@ class ObstaclePrims:
         return True
 
     def write(self, code: float) -> None:
-        """Where the obstacles that move are now."""
+        """Current transforms of moving obstacles."""
         self._place(lambda obstacle: obstacle.moves, code)
 
     def _place(self, chosen: Any, *code: float) -> None:

@@ -1,4 +1,4 @@
-"""VTU series for ParaView: a file per frame, body and world, and a .pvd that lists them with their times."""
+"""VTU series for ParaView: a file per frame, body and world, and a .pvd index with their times."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ class VTUWriter(Output):
         folder: the target folder; made if its parent exists. Files of the same names are overwritten.
         every: write each n-th accepted step (the default, with 1). fps: or by time, as USD does. Not both.
         fields: scalar fields at the mesh nodes, SI units.
-        extend: go on with the series that is there, of the run that this one resumes; frames after the present time
-            are left out of it, and written anew.
+        extend: extend the existing series of the resumed run; its frames after the current time are removed and
+            rewritten.
 
-    Points are the *current* positions in float64, each world where it is simulated (no grid); subtract the
-    point data `displacement` for the reference shape. `velocity` is written where the simulation has it.
+    Points are the *current* positions in float64, without grid offsets of worlds; subtract the
+    point data `displacement` for the reference shape. `velocity` is written if the simulation has it.
     Element groups are 0/1 cell data named `set:<group>`. In the .pvd, `part` counts bodies and within them
-    worlds. Every file is written whole and renamed, so the series is valid at any time; the .pvd lags by at
+    worlds. Every file is written atomically, so the series is always valid; the .pvd lags by at
     most a tenth of the frames until `close`, which also writes the last state.
 
     Colliders are a series of their own, <folder name>_colliders.pvd, of files collider_<name>_<world>_<frame>.vtu:
-    triangles where they are, of a half-space a square. While a collider rests, its frames share a file.
+    triangles at the current position, a square for a half-space. Frames of a resting collider share a file.
 
-    OutputError: a folder that can't be made or written (at `open`), a file that can't (at `write`).
+    OutputError: a folder that can't be created or written (at `open`), or a file (at `write`).
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class VTUWriter(Output):
 
     @property
     def collider_series(self) -> pathlib.Path:
-        """The .pvd file of the colliders; there is none without them."""
+        """The .pvd file of the colliders, if any."""
         return self.folder / f"{self.folder.resolve().name}_colliders.pvd"
 
     def open(self, sim: Any) -> None:
@@ -101,7 +101,7 @@ class VTUWriter(Output):
             self._take_up(time_of(sim))
 
     def _take_up(self, now: float) -> None:
-        """Go on with the frames of the series up to the time `now`, s."""
+        """Extend the frames of the series up to the time `now`, s."""
         self._frames = self._read_series(self.series, now)
         if self.collider_series.is_file():
             self._colliders = self._read_series(self.collider_series, now)
@@ -129,7 +129,7 @@ class VTUWriter(Output):
 
     @staticmethod
     def _obstacles_of(sim: Any) -> Obstacles:
-        """The colliders, with half-spaces drawn around the bodies."""
+        """Colliders, with half-spaces drawn around the bodies."""
         bodies = [body for body in sim.model.bodies if getattr(body, "mesh", None) is not None]
         points = np.concatenate(
             [np.asarray(sim.positions(body)).reshape(-1, 3) for body in bodies] or [np.zeros((1, 3))]
@@ -138,7 +138,7 @@ class VTUWriter(Output):
 
     @staticmethod
     def _names_of(given: Sequence[str]) -> list[str]:
-        """Names made fit for file names, still unique."""
+        """Names valid in file names, still unique."""
         names: list[str] = []
         for text in given:
             name = re.sub(r"[^A-Za-z0-9.-]", "_", text).strip(".") or "body"
@@ -174,7 +174,7 @@ class VTUWriter(Output):
             self._write_series()
 
     def _collider_files(self, frame: int) -> list[str]:
-        """Files of the colliders in a frame; those that moved since their last are written."""
+        """Files of the colliders in a frame; only those moved since their last are written."""
         files = []
         drawn = zip(self._obstacles.all, self._collider_names, self._obstacles.points())
         for k, (obstacle, name, points) in enumerate(drawn):
@@ -204,7 +204,7 @@ class VTUWriter(Output):
         self._open = False
 
     def abort(self) -> None:
-        """Remove the files that this run wrote, and the folder if it made it and it is empty."""
+        """Remove the files of this run, and the folder if this run created it and it is empty."""
         if not self._open:
             return
         kept = {file for _, files in self._colliders[: self._kept] for file in files}
@@ -229,7 +229,7 @@ Cells = tuple[str, np.ndarray, dict[str, np.ndarray]]
 def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray, dict[str, np.ndarray], Cells]:
     """Points and point data (worlds first) of a body, and its cells with their groups.
 
-    T4 and T10 are written as their mesh; the other elements as the cells that draw them, with section and thickness.
+    T4 and T10 are written as their mesh; other elements as drawn cells, with section and thickness.
     """
     mesh = body.mesh
     family = getattr(body, "family", None)
@@ -252,7 +252,7 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
 
 
 def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]]) -> None:
-    """The list of a series: files of each time, s."""
+    """Index of a series: files of each time, s."""
     lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
     for time, files in frames:
         lines += [
@@ -270,7 +270,7 @@ def _groups(mesh: Any, element: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _write_vtu(cells: Cells, points: np.ndarray, data: dict[str, np.ndarray], path: pathlib.Path) -> None:
-    """One VTU file. meshio changes what it is given, so everything passed is a copy."""
+    """One VTU file. All arguments are copied, since meshio modifies its input."""
     import meshio
 
     mesh = meshio.Mesh(

@@ -1,4 +1,4 @@
-"""The T10 cantilever S3 against its trajectory that is exact in time."""
+"""The T10 cantilever S3 against its time-exact trajectory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from warpfea.studies.checkout import reference as stored
 
 FILES = {False: "S3_exact_svk_q5", True: "S3_exact_damped_svk_q5"}
 MIDDLE = (0.5, 0.05, 0.05)
-"""Of the end face, m."""
+"""Centre of the end face, m."""
 
 
 def trajectory(damped: bool) -> wf.Reference:
@@ -27,7 +27,7 @@ def exact_cantilever(*, damped: bool = False) -> wf.ModelBuilder:
     """A cantilever of T10 elements falls under gravity; its motion on this mesh is known, so errors are of time.
 
     Args:
-        damped: with Kelvin-Voigt damping, which takes the fast modes that gravity sets off.
+        damped: with Kelvin-Voigt damping of the fast modes excited by gravity.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     values = stored(FILES[True])["kelvin_voigt"]

@@ -16,7 +16,7 @@ def first_mode(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def midline(sim: wf.Simulation) -> np.ndarray:
-    """Displacements at eleven places from the clamped to the free edge, (11, 3), m, on every mesh the same."""
+    """Displacements at eleven points from the clamped to the free edge, (11, 3), m, equal on every mesh."""
     plate = sim.model.bodies[0]
     X = plate.mesh.points
     middle = np.flatnonzero(np.abs(X[:, 1] - 0.5 * X[:, 1].max()) < 1e-9)
@@ -33,7 +33,7 @@ def plate_vibration(
 ) -> wf.ModelBuilder:  # fmt: skip
     """A cantilever plate, flat and unstressed, starts with the velocities of a beam's first bending mode.
 
-    Its directors turn with it: other velocities would set off waves of shear.
+    Its directors rotate with it: other velocities would excite shear waves.
 
     Args:
         length: from the clamped edge to the free one, m.
@@ -42,7 +42,7 @@ def plate_vibration(
         cells: along the length, even; half as many along the width.
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.
-        eta: shear viscosity (Kelvin-Voigt), Pa s; enough for the waves of shear that remain, little for the bending.
+        eta: shear viscosity (Kelvin-Voigt), Pa s; enough for the remaining shear waves, little for the bending.
         speed: of the free edge at t = 0, m/s.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, 0.0))

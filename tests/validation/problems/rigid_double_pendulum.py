@@ -69,7 +69,7 @@ def rigid_double_pendulum(*, E: float = 2e12, angle: float = 0.5 * np.pi) -> wf.
     """Two stiff links of one 3243 element each, on revolute joints, swing from rest.
 
     Args:
-        E: Young's modulus (SVK), Pa; the links are to be so stiff that their deformation does not count.
+        E: Young's modulus (SVK), Pa; stiff enough for negligible deformation.
         angle: of the links from the downward vertical at t = 0, rad.
     """
     return double_pendulum_links(kind="3243", E=E, angle=angle)

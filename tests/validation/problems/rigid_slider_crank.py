@@ -16,7 +16,7 @@ SLIDER_MASS, SLIDER_SIDE = STANDARD["slider_mass"], 0.02
 
 
 def inertia(angle: np.ndarray) -> np.ndarray:
-    """J in T = J(angle) angle'^2 / 2, kg m^2, of square bars and a slider that does not turn."""
+    """J in T = J(angle) angle'^2 / 2, kg m^2, of square bars and a non-rotating slider."""
     pin, slider, psi = slider_crank_velocities(angle, 1.0, CRANK, ROD)
     middle = 0.5 * (pin + np.stack([slider, 0.0 * slider], axis=-1))
     crank, rod = (DENSITY * SIDE**2 * length for length in (CRANK, ROD))
@@ -49,11 +49,11 @@ def rigid_bars(speed: float) -> wf.Reference:
 
 @wf.scene(dt=1e-3, t_end=0.4, integrator="bdf2", tol=1e-10, reference=rigid_bars)
 def rigid_slider_crank(*, speed: float = 15.0, E: float = 2e13) -> wf.ModelBuilder:
-    """A slider-crank of stiff 3243 bars, set going at the stretched position and then left to itself, without gravity.
+    """A free slider-crank of stiff 3243 bars, started at the stretched position, without gravity.
 
     Args:
         speed: of the crank at t = 0, rad/s.
-        E: Young's modulus (SVK), Pa; the bars are to be so stiff that their deformation does not count.
+        E: Young's modulus (SVK), Pa; stiff enough for negligible deformation.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     reach = CRANK + ROD

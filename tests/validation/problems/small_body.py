@@ -1,4 +1,4 @@
-"""A small bar of any family that sways: what the precision of the numbers leaves of its motion."""
+"""A small swaying bar of any family: influence of the precision."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import warpfea as wf
 from .plate_vibration import first_mode
 
 LENGTH, SIDE = 0.5, 0.05
-"""Of the bar, m."""
+"""Size of the bar, m."""
 
 
 @wf.scene(dt=2e-3, t_end=0.16, integrator="bdf2")

@@ -11,7 +11,7 @@ CASE = "stiff_E5e7_ANCF3243_SVK_nu0"
 
 
 def spectral() -> wf.Reference:
-    """Tip and middle every 20 ms, by a Legendre-Galerkin method of order 18: free of elements and of time steps."""
+    """Tip and middle every 20 ms, by a Legendre-Galerkin method of order 18, without elements or time steps."""
     case = stored("S4_pendulum_spectral")["cases"][CASE]
     probes = {name: (case["times"], np.pad(case[key], ((0, 0), (0, 1)))) for name, key in PROBES.items()}
     return wf.Reference(probes, f"S4_pendulum_spectral.json, {CASE}", case["max_change_n14_to_n18_tip"])

@@ -1,4 +1,4 @@
-"""The finer run that errors are measured against where no motion is known, and the estimate of its own error."""
+"""Finer reference run for unknown motions, and the estimate of its own error."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .settings import Axes, Setting, check_steps, order_of
 __all__ = ["check_finer", "finer_motion", "finer_setting"]
 
 STEP, MESH, TOL = 8.0, 2, 100.0
-"""By how much finer than the finest run: step, cells along an edge, tolerance."""
+"""Refinement factors relative to the finest run: step, cells along an edge, tolerance."""
 SECOND_ORDER = "bdf2"
 TIGHTEST = 1e-11
-"""Tolerance of the reference at the least; below, rounding decides."""
+"""Minimum tolerance of the reference; below, round-off dominates."""
 DEFAULT_TOL = 1e-8
 LOWEST_TIME, LOWEST_MESH, HIGHEST_MESH = 0.5, 1.0, 6.0
-"""Bounds of the orders that the estimates believe."""
+"""Bounds of the estimated orders."""
 MEASURES = ("l2", "end", "field")
 
 
 def scaled(value: Any, factor: float) -> Any:
-    """Whole numbers, also in a tuple, times a factor; None where they would not be whole."""
+    """Whole numbers, also in a tuple, times a factor; None if the result is not whole."""
     if isinstance(value, tuple):
         parts = tuple(scaled(part, factor) for part in value)
         return None if None in parts else parts
@@ -36,7 +36,7 @@ def scaled(value: Any, factor: float) -> Any:
 
 
 def check_finer(given: Mapping[str, Any]) -> None:
-    """ModelError for options of the finer run by which its own error could not be estimated."""
+    """ModelError for options of the finer run that prevent the estimate of its error."""
     if given.get("error") is not None:
         raise ModelError(
             f"study: finer error = {given['error']!r}: the finer run takes steps of one size, from which its own error "
@@ -49,11 +49,11 @@ def check_finer(given: Mapping[str, Any]) -> None:
 
 
 def finer_setting(group: Sequence[Setting], axes: Axes, given: Mapping[str, Any], default_dt: float) -> Setting:
-    """The reference of settings that share a problem: in every swept direction finer than all of them.
+    """Reference of settings that share a problem: finer than all of them in every swept direction.
 
     The step is an eighth of the smallest, with a method of order 2; swept meshes are twice as fine as the finest; of
-    swept names (element, integration) the last one counts; float64, and a hundredth of the smallest tolerance. `given`
-    options and parameters go before these.
+    swept names (element, integration) the last one is used; float64, and a hundredth of the smallest tolerance.
+    `given` options and parameters override these.
     """
     first = group[0]
     methods = [first.method, *(s.method for s in group)]
@@ -82,15 +82,15 @@ def _size(value: Any) -> float:
 def finer_motion(
     setting: Setting, axes: Axes, chosen: Sequence[str] | None, run: Callable[[Setting], Outcome]
 ) -> Motion:
-    """Run the reference, and runs that differ from it, for its own error.
+    """Run the reference, and further runs for its own error.
 
     In time: runs with 2 and 4 times its step and 10 and 100 times its tolerance, compared at order
-    p = log2(|u4 - u2| / |u2 - u1|), at most that of the method and at least 0.5: |u2 - u1| / (2^p - 1). In space, where
-    a mesh is swept: the same with a half and a quarter of the cells (p from 1 to 6; with a half alone p = 1). The
+    p = log2(|u4 - u2| / |u2 - u1|), at most that of the method and at least 0.5: |u2 - u1| / (2^p - 1). In space,
+    for a swept mesh: with a half and a quarter of the cells (p from 1 to 6; with a half alone p = 1). The
     estimates are added.
 
     Raises:
-        ConvergenceError: one of them failed.
+        ConvergenceError: a failed run.
     """
     assert setting.dt is not None
     assert setting.tol is not None
@@ -107,7 +107,7 @@ def finer_motion(
     told: dict[str, Any] = {}
 
     def add(label: str, settings: list[Setting], low: float, high: float) -> None:
-        """Add the error in one direction, from runs that are coarser in it, the nearest first."""
+        """Add the error in one direction, from coarser runs in it, the nearest first."""
         runs = [_done(run, s) for s in settings]
         near = distances(runs[0], motion)
         far = distances(runs[1], run_motion(runs[0], names, "")) if len(runs) > 1 else None

@@ -1,4 +1,4 @@
-"""One point of a study: a run with one setting, what it took and where its probes went."""
+"""One point of a study: a run with one setting, its cost and the motion of its probes."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ __all__ = ["DONE", "FAILED", "LONG", "REFUSED", "Outcome", "measure"]
 DONE, FAILED, LONG, REFUSED = "done", "failed", "too long", "refused"
 HELD = ("kinetic", "strain", "contact", "contact_pairs")
 CHANGES = ("potential", "work", "viscous", "contact_loss", "friction", "collider_work")
-"""Columns of the energy ledger that say how much energy there is to exchange: their size, or their change."""
+"""Columns of the energy ledger that define the energy exchanged: their size, or their change."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What came of a run.
+    """Outcome of a run.
 
     Attributes:
-        status: done; failed: a step was not accepted; too long; refused: this scene can't be run so.
-        why: of the others than done.
-        numbers: what it took, see `_numbers`; empty where nothing was run.
+        status: done; failed: a step was not accepted; too long; refused: invalid setting for this scene.
+        why: reason of all others than done.
+        numbers: its cost, see `_numbers`; empty if nothing was run.
         times: (n,), s. probes: by name position and velocity (n, 3) each, m and m/s. starts: by name (3,), m.
-        field: what the scene's `field` gave, or None.
+        field: value of the scene's `field`, or None.
     """
 
     status: str
@@ -49,7 +49,7 @@ class Outcome:
     field: np.ndarray | None = None
 
     def packed(self) -> dict[str, Any]:
-        """As JSON can hold it, with all digits."""
+        """JSON-compatible form, with all digits."""
         return {
             "status": self.status,
             "why": self.why,
@@ -62,7 +62,7 @@ class Outcome:
 
     @staticmethod
     def unpacked(data: dict[str, Any]) -> Outcome:
-        """The outcome that `packed` gave."""
+        """Outcome from the output of `packed`."""
         return Outcome(
             data["status"],
             data["why"],
@@ -84,10 +84,10 @@ def _unpack(data: list[Any]) -> np.ndarray:
 
 
 def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | None) -> Outcome:
-    """Run a setting `repeat` times; the results are of the first run, the times of all.
+    """Run a setting `repeat` times; results of the first run, times of all.
 
-    Only steps are timed: making the model and the simulation, which compiles kernels, stand apart. A run that takes
-    more than `limit` seconds is given up.
+    Only steps are timed; construction of model and simulation (kernel compilation) is measured separately. Runs
+    longer than `limit` seconds are given up.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C, once the step in hand is done.
@@ -128,13 +128,13 @@ def _line(error: BaseException) -> str:
 
 
 def _starts(model: Model) -> dict[str, np.ndarray]:
-    """Places of the probes at t = 0, m."""
+    """Initial positions of the probes, m."""
     u = model.state().displacement.numpy()[0].astype(float)
     return {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.probes}
 
 
 class _Run:
-    """A simulation that is run to its end as it is made, with the clock on its steps."""
+    """Timed run of a simulation to its end."""
 
     def __init__(self, model: Model, setting: Setting, limit: float | None) -> None:
         self.status, self.why, self.seconds = DONE, "", 0.0
@@ -162,10 +162,10 @@ class _Run:
         return True
 
     def numbers(self) -> dict[str, Any]:
-        """What the run took and lost: counts over all steps, bytes on the device, energies in J.
+        """Cost and losses of the run: counts over all steps, bytes on the device, energies in J.
 
-        drift: largest of |change of energy + losses of the model - work|, which is what the steps lost or won, with
-        what the solver left; exchanged: the most that one kind of energy held (kinetic, strain), or changed by; ledger:
+        drift: largest |change of energy + losses of the model - work|: error of the scheme and the solver;
+        exchanged: largest energy of one kind (kinetic, strain), or its change; ledger:
         change of each term of the energy ledger over the run.
         """
         sim, info = self.sim, self.sim.model.info()

@@ -3,9 +3,9 @@
     l2   sqrt(sum w_i |x(t_i) - x_ref(t_i)|^2 / sum w_i) / L,  w_i = t_i - t_{i-1}
     end  |x(t_n) - x_ref(t_n)| / L
 
-with L the largest travel of a chosen probe in the reference. t_i are the ends of the run's own steps, or the times of a
-reference that is given as samples: between the ends of steps a run is interpolated by cubics through its positions and
-velocities (fourth order in the step; at the ends of steps it is exact).
+with L the largest travel of a chosen probe in the reference. t_i are the ends of the run's own steps, or the sample
+times of the reference: between steps a run is interpolated by cubics through its positions and velocities (fourth
+order in the step, exact at the ends of steps).
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from .measure import Outcome
 __all__ = ["Motion", "distances", "known_motion", "observed", "run_motion"]
 
 CURVE_POINTS = 1001
-"""Times at which the travel of a reference that is a function is looked for."""
+"""Number of times at which the travel of a reference function is evaluated."""
 SLACK = 1e-9
-"""Of the end time, within which samples count as in the run."""
+"""Tolerance, relative to the end time, for samples at the end of the run."""
 RESOLVED = 10.0
-"""An error must be so many times that of the reference."""
+"""Minimum ratio of an error to that of the reference."""
 ROUNDING = 1e-13
-"""Errors below are those of the last digits, which have no order."""
+"""Round-off level: smaller errors have no order."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What errors are measured against.
+    """Reference motion of the errors.
 
     Attributes:
-        about: in words.
-        probes: by name a function of times (n,) that gives positions (n, 3).
-        times: at which alone it is known; None: at all.
+        about: text.
+        probes: by name: a function of times (n,) returning positions (n, 3).
+        times: the only known times; None: all.
         travel: L, m.
         own: its own error by measure, over L (field: over the field's norm).
-        field: what the scene's `field` is to be; None: unknown.
-        runs: how the errors of a run were estimated, for the file.
+        field: expected value of the scene's `field`; None: unknown.
+        runs: error estimates of a run, for the file.
     """
 
     about: str
@@ -66,7 +66,7 @@ def interpolant(times: np.ndarray, x: np.ndarray, v: np.ndarray) -> Callable[[np
 
 
 def known_motion(reference: Reference, chosen: Sequence[str] | None, run: Outcome, t_end: float) -> Motion:
-    """A Reference as a Motion; `run` is any finished run, which says what probes there are and where they start.
+    """Reference as a Motion; `run`: any finished run, for the probes and their initial positions.
 
     Raises:
         ModelError: a chosen probe is not in the reference, it has none of the scene, ends early, or its positions are
@@ -129,7 +129,7 @@ def _travel(probes: Mapping[str, Callable], starts: Mapping[str, np.ndarray], ti
 
 
 def run_motion(run: Outcome, chosen: Sequence[str], about: str) -> Motion:
-    """A finished run as a Motion, its own error not yet known."""
+    """Finished run as a Motion of unknown error."""
     probes = {name: interpolant(run.times, *run.probes[name]) for name in chosen}
     return Motion(about, probes, None, _travel(probes, run.starts, run.times), {}, run.field)
 
@@ -137,7 +137,7 @@ def run_motion(run: Outcome, chosen: Sequence[str], about: str) -> Motion:
 def distances(run: Outcome, motion: Motion) -> dict[str, Any]:
     """Errors of a run: end and l2, the largest of the probes, those of each probe under "probes", and field.
 
-    field is the norm of the difference from the reference's over the norm of that; None where one is unknown.
+    field is the relative norm of the difference from the reference; None if one is unknown.
     """
     times = run.times if motion.times is None else motion.times
     weights = np.diff(times, prepend=0.0)
@@ -161,7 +161,7 @@ def distances(run: Outcome, motion: Motion) -> dict[str, Any]:
 
 
 def observed(coarse: float, fine: float, ratio: float, low: float, high: float) -> float:
-    """Order p of the differences of three runs, each `ratio` times finer, kept within bounds."""
+    """Order p of the differences of three runs, each `ratio` times finer, within bounds."""
     if not (coarse > 0.0 and fine > 0.0):
         return low if coarse <= fine else high
     return float(np.clip(np.log(coarse / fine) / np.log(ratio), low, high))

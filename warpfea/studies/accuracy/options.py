@@ -1,4 +1,4 @@
-"""Options of `wf.study` besides what is run."""
+"""Options of `wf.study` besides the settings of its runs."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ class StudyOptions:
 
     Attributes:
         reference: a wf.Reference, a dict from probes to functions of time or samples, a file (.csv, .json), or "run"
-            for a finer run. By default what the scene gives, else a finer run.
+            for a finer run. By default the scene's, else a finer run.
         finer: options and parameters of the finer run, in place of the chosen ones.
         mesh: parameters that refine the mesh; by default cells, elements, across.
-        measure: the error that counts: "l2", "end", "energy" or "field".
-        target: error that the cheapest setting is wanted for: in time and, where the mesh is not swept, by the estimate
-            of `split` for its cells.
+        measure: the error used: "l2", "end", "energy" or "field".
+        target: requested error of the cheapest setting: in time and, without a swept mesh, including the mesh
+            estimate of `split`.
         split: parts of the error: of the "best" row (the answer to the target, else that with most digits of efficacy),
             of "all" rows, or "none".
         repeat: runs of each setting for the times; those longer than 2 s are not repeated.
-        limit: s, after which a run is given up.
+        limit: time limit of a run, s.
         out: folder for NAME.json, .csv, .png, and NAME.points.jsonl, from which an interrupted study goes on.
         name: of the files; by default that of the scene.
-        progress: show a bar; by default when stderr is a terminal.
-        what, words: the scene as the command line names it, and the words of that line, for the files.
+        progress: show a bar; by default if stderr is a terminal.
+        what, words: scene on the command line, and the words of that line, for the files.
 
     Raises:
         ModelError: a value out of range.

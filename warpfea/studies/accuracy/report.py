@@ -1,4 +1,4 @@
-"""What a study of error against run time found: rows, and their table, CSV, JSON and plot."""
+"""Results of a study of error against run time: rows, and their table, CSV, JSON and plot."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ class Row:
     """One setting.
 
     Attributes:
-        setting: all that it was run with. swept: what varies of it, by name.
+        setting: all options of the run. swept: its varied options, by name.
         status, why: "done"; or "failed", "too long" and "refused", with the reason.
-        error: by the study's measure, one of the next four. None where there is none.
+        error: by the study's measure, one of the next four; None if there is none.
         l2, end: root of the mean square over time, and at the end, over the largest travel; largest of the probes.
         energy: largest drift of the energy balance over the largest energy exchanged.
         field: of the scene's field at the end, over its norm.
         probes: l2 and end of each probe.
         resolved: the error is at least ten times that of the reference, and above rounding.
-        own_error: that of the reference, in the same measure.
-        mesh_error: estimate of what the mesh leaves, where `error` is in time alone and a target hangs on it.
+        own_error: error of the reference, in the same measure.
+        mesh_error: estimated error of the mesh, if `error` is in time alone and a target depends on it.
         orders: observed, from the next coarser row, by swept size.
         seconds, seconds_min: of all steps, median and minimum of `repeats` runs, without compilation and set-up.
         compile_s, setup_s: making the simulation (kernels, graphs), and making the model, in the first run.
-        steps, newton, pcg: counts over the run; of steps that adapt those that were accepted.
-        rough: steps that were accepted above the tolerance (wf.Jacobi).
+        steps, newton, pcg: counts over the run; accepted ones of adaptive steps.
+        rough: steps accepted above the tolerance (wf.Jacobi).
         bytes: of the simulation on its device. unknowns, elements: of the model.
         efficacy: digits, -log10(error x seconds).
         pareto: no other row has a smaller error in less time.
-        split: parts of the error, see split.py; None where it was not asked for.
+        split: parts of the error, see split.py; None if not requested.
         ledger: changes of the terms of the energy ledger over the run, over the largest energy exchanged.
     """
 
@@ -90,11 +90,11 @@ class Row:
 
     @property
     def reaches(self) -> float:
-        """The error, with that of the reference and of the mesh as far as it was estimated. inf where there is none."""
+        """Error plus that of the reference and of the mesh, as far as estimated; inf if there is none."""
         return math.inf if self.error is None else self.error + self.own_error + (self.mesh_error or 0.0)
 
     def curve(self, axes: Axes) -> tuple[tuple[str, Any], ...]:
-        """What the rows of one curve share."""
+        """Common key of the rows of one curve."""
         along = ("dt", "error") if axes.along == "step" else (axes.along,)
         first = {"method": self.setting.method} | {k: v for k, v in self.swept.items() if k not in along}
         if axes.along == "step" and self.setting.error is not None:
@@ -103,15 +103,15 @@ class Row:
 
 
 def mean_size(value: Any) -> float:
-    """A size as one number: of a tuple the geometric mean."""
+    """Size as one number: of a tuple the geometric mean."""
     return float(np.exp(np.mean(np.log(value)))) if isinstance(value, tuple) else float(value)
 
 
 def with_orders(rows: Sequence[Row], axes: Axes) -> list[Row]:
-    """The rows with orders observed from the next coarser one, where both errors are resolved.
+    """Rows with orders observed from the next coarser one, if both errors are resolved.
 
-    For a step p = log(e1/e2) / log(h1/h2), for a mesh with the numbers of cells turned round, and for steps that adapt
-    with the errors that were asked for.
+    p = log(e1/e2) / log(h1/h2) for a step, with the reciprocal numbers of cells for a mesh, and with the requested
+    errors for adaptive steps.
     """
     out = list(rows)
     for name in axes.sizes:
@@ -132,7 +132,7 @@ def with_orders(rows: Sequence[Row], axes: Axes) -> list[Row]:
 
 
 def with_pareto(rows: Sequence[Row]) -> list[Row]:
-    """The rows, marked where no other has a smaller error in at most the same time, or the same in less."""
+    """Rows, with those marked for which no other has a smaller error in at most the same time, or the same in less."""
 
     def beaten(row: Row) -> bool:
         assert row.error is not None
@@ -148,16 +148,16 @@ def with_pareto(rows: Sequence[Row]) -> list[Row]:
 
 @dataclass(frozen=True)
 class Study(Sequence[Row]):
-    """A study: a sequence of its rows.
+    """Study: a sequence of its rows.
 
     Attributes:
-        name: of the scene, and of the files. what: as the command line names the scene.
+        name: of the scene, and of the files. what: scene on the command line.
         rows: in the order of the sweep.
-        axes: what was swept. measure: which error counts. target: that was asked for, or None.
-        references: what errors are measured against, for each problem: about, own error, travel, values.
-        settings: all else that the numbers depend on.
-        answer: the cheapest row that reaches the target; None. command: that runs it.
-        checks: the answer rerun with about 0.9 and 1.1 times its step, or the error that it asks for.
+        axes: what was swept. measure: the error used. target: requested error, or None.
+        references: reference solutions of each problem: about, own error, travel, values.
+        settings: other options that the numbers depend on.
+        answer: the cheapest row that reaches the target; None. command: its command line.
+        checks: the answer rerun with about 0.9 and 1.1 times its step, or requested error.
     """
 
     name: str
@@ -191,13 +191,13 @@ class Study(Sequence[Row]):
 
     @property
     def kind(self) -> str:
-        """Which error it is: "in time" alone, against finer steps on the same mesh, or "in time and mesh"."""
+        """Scope of the error: "in time" alone, against finer steps on the same mesh, or "in time and mesh"."""
         swept = any(name in self.axes.over for name in self.axes.mesh)
         known = self.references and all(ref.get("known", False) for ref in self.references)
         return "in time and mesh" if swept or known else "in time"
 
     def curves(self) -> dict[str, list[Row]]:
-        """Rows by curve, in words."""
+        """Rows by curve, as text."""
         out: dict[str, list[Row]] = {}
         for row in self.rows:
             texts = [word(v) if k == "method" else f"{k}={word(v)}" for k, v in row.curve(self.axes)]
@@ -205,7 +205,7 @@ class Study(Sequence[Row]):
         return out
 
     def fits(self) -> list[dict[str, Any]]:
-        """Order of each curve along its own size, by least squares over the rows that are resolved."""
+        """Order of each curve along its own size, by least squares over the resolved rows."""
         out: list[dict[str, Any]] = []
         for label, rows in self.curves().items():
             along = self.axes.along
@@ -220,7 +220,7 @@ class Study(Sequence[Row]):
         return out
 
     def omissions(self) -> list[str]:
-        """What the picture can't show, in words."""
+        """Text of data missing in the picture."""
         reasons: dict[str, list[str]] = {}
         for r in self.rows:
             if r.status != DONE:
@@ -234,12 +234,12 @@ class Study(Sequence[Row]):
         return out
 
     def label(self, row: Row) -> str:
-        """A row in words."""
+        """Text of a row."""
         given = {"method": row.setting.method} | row.swept
         return ", ".join(word(v) if k == "method" else f"{k}={word(v)}" for k, v in given.items() if v is not None)
 
     def table(self) -> str:
-        """All of it for reading."""
+        """Readable text of the study."""
         head = ["method", *(k for k in self.axes.over if k != "method"), self.measure, *(f"order {s}" for s in
                 self.axes.sizes), "end" if self.measure != "end" else "l2", "energy"]  # fmt: skip
         head += ["s", "s min", "digits", "steps", "Newton", "PCG", "memory", ""]
@@ -315,7 +315,7 @@ class Study(Sequence[Row]):
         return (values[name] for name in head)
 
     def content(self, words: Sequence[str]) -> dict[str, Any]:
-        """What the JSON file holds."""
+        """Contents of the JSON file."""
         return {
             "schema": SCHEMA,
             **origin(words, self.rows[0].setting.device),
@@ -332,12 +332,12 @@ class Study(Sequence[Row]):
         }
 
     def write(self, folder: str | pathlib.Path, words: Sequence[str] = ("study",)) -> list[pathlib.Path]:
-        """Write NAME.json, NAME.csv and, where matplotlib is installed, NAME.png into a folder; gives their paths.
+        """Write NAME.json, NAME.csv and, with matplotlib, NAME.png into a folder; returns their paths.
 
         words: of the command line, without "warpfea".
 
         Raises:
-            OutputError: the folder can't be made or written.
+            OutputError: a folder that can't be created or written.
         """
         from ..plots import require_matplotlib
         from .plot import draw

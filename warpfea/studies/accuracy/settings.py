@@ -1,4 +1,4 @@
-"""What a study sweeps: settings of a run, the axes over which they vary, and their product."""
+"""Settings of a run, the swept axes, and their product."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from ...solvers import SOLVERS
 __all__ = ["OPTIONS", "Axes", "Setting", "check_steps", "make_axes", "method_text", "order_of", "parse_over", "product"]
 
 OPTIONS = ("method", "dt", "error", "solver", "tol", "dtype", "device")
-"""What can be swept besides the parameters of the scene."""
+"""Sweepable options besides the parameters of the scene."""
 NAMES = {"methods": "method", "integrator": "method"}
-"""Other names of options."""
+"""Synonyms of options."""
 MESH = ("cells", "elements", "across")
-"""Parameters of scenes, whole numbers, whose growth refines the mesh."""
+"""Whole-number parameters of scenes that refine the mesh."""
 DTYPES = ("float64", "float32")
 
 
 @dataclass(frozen=True)
 class Setting:
-    """How a scene is run.
+    """Options of a run.
 
     Attributes:
-        method: integrator, as text. dt: step, s, None where it adapts to `error`, the error that is asked for.
+        method: integrator, as text. dt: step, s, None if adapted to `error`, the requested error.
         solver: name. tol: relative residual; None: the solver's own. dtype, device: of the model.
         t_end: s. values: all parameters of the scene.
     """
@@ -56,7 +56,7 @@ class Setting:
         return getattr(self, name) if name in OPTIONS else self.values[name]
 
     def changed(self, changes: Mapping[str, Any]) -> Setting:
-        """The same with other options or parameters; a dt takes the place of an `error`, and the other way round."""
+        """Copy with other options or parameters; dt replaces an `error`, and vice versa."""
         own = {name: value for name, value in changes.items() if name in OPTIONS}
         if own.get("dt") is not None:
             own.setdefault("error", None)
@@ -66,11 +66,11 @@ class Setting:
         return replace(self, **own, values=values)
 
     def key(self, code: str) -> str:
-        """A name for the run: of the settings and of the version of the code."""
+        """Name of the run, from the settings and the code version."""
         return hashlib.sha256(json.dumps([plain(asdict(self)), code], sort_keys=True).encode()).hexdigest()[:20]
 
     def command(self, what: str, scene: Scene[Any]) -> str:
-        """The command line that runs it."""
+        """Command line of the run."""
         words = ["warpfea", "run", what, "--integrator", self.method]
         words += ["--dt", word(self.dt)] if self.error is None else ["--dt", "auto", "--error", word(self.error)]
         if self.t_end != scene.t_end:
@@ -88,12 +88,12 @@ class Setting:
 
 @dataclass(frozen=True)
 class Axes:
-    """What varies.
+    """Swept axes.
 
     Attributes:
         over: values by name, in the order given.
         mesh: parameters of the scene that refine the mesh, swept or not.
-        choices: swept parameters that say how the same problem is discretised: names and switches.
+        choices: swept parameters of the discretisation: names and switches.
         physical: swept parameters that change the problem; each of their values has its own reference.
     """
 
@@ -104,12 +104,12 @@ class Axes:
 
     @property
     def sizes(self) -> list[str]:
-        """Swept sizes, in which orders are observed: steps and meshes."""
+        """Swept sizes for observed orders: steps and meshes."""
         return [name for name in self.over if name in ("dt", "error", *self.mesh)]
 
     @property
     def along(self) -> str | None:
-        """The axis that a curve runs along; None where only names vary."""
+        """Axis along a curve; None if only names vary."""
         for name in ("dt", "error", *self.mesh, "tol"):
             if name in self.over:
                 return "step" if name in ("dt", "error") else name
@@ -117,7 +117,7 @@ class Axes:
 
 
 def word(value: Any) -> str:
-    """A value as the command line reads it."""
+    """A value as on the command line."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -128,12 +128,12 @@ def word(value: Any) -> str:
 
 
 def split_methods(text: str) -> list[str]:
-    """The words of a list with commas; commas in brackets belong to a word."""
+    """Words of a comma-separated list; commas in brackets belong to a word."""
     return [part.strip() for part in re.split(r",(?![^(]*\))", text)]
 
 
 def method_text(given: str | integrators.Integrator) -> str:
-    """An integrator as text: a name as it is given. ModelError for an unknown one."""
+    """An integrator as text; names are unchanged. ModelError for an unknown one."""
     label = integrators.get(given).label
     return given if isinstance(given, str) else label
 
@@ -144,7 +144,7 @@ def order_of(text: str) -> int:
 
 
 def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") -> dict[str, list[Any]]:
-    """`NAME=V1,V2` as values. ModelError for a text without values, and for a name given twice."""
+    """`NAME=V1,V2` as values. ModelError for a text without values, and for a repeated name."""
     out: dict[str, list[Any]] = {}
     for text in texts:
         name, equals, values = text.partition("=")
@@ -176,7 +176,7 @@ def _number(name: str, text: Any) -> float:
 
 
 def _check_names(scene: Scene[Any], names: Iterable[str]) -> None:
-    """ModelError for what is neither an option nor a parameter of the scene."""
+    """ModelError for a name that is neither an option nor a parameter of the scene."""
     known = [*OPTIONS, *scene.parameters]
     for name in names:
         if name not in known:
@@ -187,7 +187,7 @@ def _check_names(scene: Scene[Any], names: Iterable[str]) -> None:
 
 
 def make_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequence[str] | None) -> Axes:
-    """Check what is swept.
+    """Validate the swept values.
 
     Args:
         scene: the scene.
@@ -195,7 +195,7 @@ def make_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequen
         mesh: parameters that refine the mesh; None: those of MESH that are whole numbers.
 
     Raises:
-        ModelError: an unknown name, no values, one twice, or a value that is none of the option.
+        ModelError: an unknown name, no values, a repeated or an invalid value.
     """
     chosen = {NAMES.get(name, name): values for name, values in over.items()}
     if len(chosen) < len(over):
@@ -227,12 +227,12 @@ def make_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequen
 
 
 def is_whole(value: Any) -> bool:
-    """Whether it is a whole number or a tuple of such."""
+    """True for a whole number or a tuple of them."""
     return isinstance(value, int) or (isinstance(value, tuple) and bool(value) and all(map(is_whole, value)))
 
 
 def product(base: Setting, axes: Axes) -> list[Setting]:
-    """Every combination; steps of fixed size and adaptive ones stand side by side.
+    """Every combination, with fixed and adaptive steps.
 
     Raises:
         ModelError: a step that does not divide the duration.

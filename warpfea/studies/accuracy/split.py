@@ -3,14 +3,13 @@
 For a run u with the step h, cells of the size H, the tolerance tau and the precision of its dtype, |.| the distance of
 `motion.py` (l2, largest of the probes, over the reference's travel):
 
-    time      |u(h) - u(h/2)| 2^p / (2^p - 1), p the order of the method; where the step adapts to an asked error e
+    time      |u(h) - u(h/2)| 2^p / (2^p - 1), p the order of the method; for steps adapted to a requested error e
               |u(e) - u(e/10)|
     space     |u(H) - u(H/2)| 2^q / (2^q - 1) with q = 1, an upper bound for elements that converge faster
     algebra   |u(tau) - u(tau/100)|
-    rounding  |u(float32) - u(float64)| for a float32 run; for float64 the same times 2^-29, the ratio of both units of
-              rounding
+    rounding  |u(float32) - u(float64)| for a float32 run; for float64 times 2^-29, the ratio of both unit round-offs
 
-Each part is left empty where it can't be had: no parameter of the scene refines the mesh, the finer run was not
+A part is empty if unavailable: no parameter of the scene refines the mesh, the finer run was not
 accepted, or float32 can't hold the case. The parts may have different signs: their sum bounds the error, with that of
 the model itself (element, law) left out.
 """
@@ -27,7 +26,7 @@ from .settings import Axes, Setting, order_of
 __all__ = ["split"]
 
 UNITS = 2.0**-29
-"""Rounding of float64 over that of float32."""
+"""Unit round-off of float64 over that of float32."""
 TIGHTER = 100.0
 DEFAULTS = {"float64": 1e-8, "float32": 1e-4}
 """Tolerances of the solvers."""

@@ -1,4 +1,4 @@
-"""Finished points of a study: in memory, and in a file that an interrupted study goes on from."""
+"""Finished points of a study: in memory, and in a file for resuming an interrupted study."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ __all__ = ["Store", "code_version"]
 
 _ROOT = pathlib.Path(__file__).resolve().parents[2]
 UNRELATED = ("cli", "outputs", "studies", "__pycache__")
-"""Folders of the package whose code does not change what a run gives."""
+"""Folders of the package without influence on results."""
 
 
 @functools.cache
 def _package_version() -> str:
-    """A hash of the code that runs are made with, device code included."""
+    """Hash of the code of a run, device code included."""
     import warpfea.kernels as kernels
 
     total = hashlib.sha256()
@@ -40,18 +40,18 @@ def _package_version() -> str:
 
 
 def code_version(scene: Scene[Any], device: str) -> str:
-    """What the results and times of a run depend on besides its settings: package, the scene's file, machine."""
+    """Dependencies of results and times besides the settings: package, scene file, machine."""
     file = inspect.getsourcefile(scene.function)
     own = pathlib.Path(file).read_bytes() if file and pathlib.Path(file).is_file() else b""
     return json.dumps([_package_version(), hashlib.sha256(own).hexdigest(), scene.name, machine(device)])
 
 
 class Store:
-    """Outcomes by setting. With a file each finished run is a line of it, written at once.
+    """Outcomes by setting. With a file each finished run is appended at once.
 
     Args:
-        file: where they are kept; None: in memory alone.
-        version: function of a device that gives the version of the code there.
+        file: storage; None: memory only.
+        version: function of a device returning its code version.
 
     Raises:
         OutputError: the file can't be read or written.
@@ -69,13 +69,13 @@ class Store:
                 try:
                     data = json.loads(line)
                     self.outcomes[data["key"]] = Outcome.unpacked(data)
-                except (ValueError, KeyError, TypeError):  # the line that a kill cut short
+                except (ValueError, KeyError, TypeError):  # line truncated by a kill
                     continue
             if text and not text.endswith("\n"):
                 self._append("\n")
 
     def get(self, setting: Setting, repeat: int, limit: float | None) -> Outcome | None:
-        """The outcome of a setting, unless it was run fewer times than asked, or given up earlier than asked."""
+        """Outcome of a setting, unless it has fewer repetitions or was given up earlier than requested."""
         found = self.outcomes.get(setting.key(self.version(setting.device)))
         if found is None or found.numbers.get("asked", repeat) < repeat:
             return None
@@ -84,7 +84,7 @@ class Store:
         return found
 
     def put(self, setting: Setting, outcome: Outcome) -> None:
-        """Keep an outcome. OutputError."""
+        """Store an outcome. OutputError."""
         key = setting.key(self.version(setting.device))
         self.outcomes[key] = outcome
         if self.file is not None and outcome.status != REFUSED:
@@ -92,7 +92,7 @@ class Store:
             self._append(json.dumps(plain(line)) + "\n")
 
     def told(self) -> str:
-        """What an interrupted study leaves, in words."""
+        """Text of the partial results of an interrupted study."""
         if self.file is None:
             return "nothing is kept without a folder for it"
         count = sum(outcome.status != REFUSED for outcome in self.outcomes.values())

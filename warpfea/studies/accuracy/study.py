@@ -1,4 +1,4 @@
-"""Error against run time of a scene: the sweep, its reference, its rows."""
+"""Error against run time of a scene: sweep, reference, rows."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from .store import Store, code_version
 __all__ = ["study"]
 
 CHECKED = (0.9, 1.1)
-"""Times the step of the answer, with which it is run again."""
+"""Factors on the step of the answer for its reruns."""
 RUN = "run"
-"""As `reference`: a finer run, also where the scene knows its motion."""
+"""As `reference`: a finer run, even for a scene with a known motion."""
 
 
 @names_moved
@@ -54,26 +54,27 @@ def study(
     probes: Sequence[str] | None = None,
     options: StudyOptions | None = None,
 ) -> Study:
-    """Run a scene with every combination of settings, and tell error and run time of each.
+    """Run a scene with every combination of settings; error and run time of each.
 
     Args:
-        scene: a scene, the name of one or file.py[:NAME], or a function that gives a ModelBuilder (with dt and t_end).
+        scene: a scene, the name of one or file.py[:NAME], or a function returning a ModelBuilder (with dt and
+        t_end).
         over: lists of values by name: "dt", "tol", "solver" ("newton-pcg", "jacobi", "direct"), "dtype", "device",
             "method", "error", or a parameter of the scene.
-        methods: the same as over["method"]: integrators or their names, "generalized_alpha(rho_inf=0.8)" with options.
-        error: the same as over["error"]: runs with dt="auto" to each of these errors, beside those of fixed steps.
+        methods: as over["method"]: integrators or their names, "generalized_alpha(rho_inf=0.8)" with options.
+        error: as over["error"]: runs with dt="auto" for each of these tolerances, besides those of fixed steps.
         parameters: of the scene, for all runs.
-        dt, t_end, solver, tol, dtype, device: of runs where they are not swept; by default the scene's.
-        probes: whose error counts; by default all, or those that the reference has.
-        options: reference, target, repeat, files and all else, see StudyOptions.
+        dt, t_end, solver, tol, dtype, device: of runs, if not swept; by default the scene's.
+        probes: used for the error; by default all, or those of the reference.
+        options: reference, target, repeat, files and others, see StudyOptions.
 
     Returns:
         A Study: a sequence of rows, with `table()`, `answer` and `write(folder)`.
 
     Raises:
-        ModelError: a bad setting, a scene without probes, a reference that does not fit.
-        ConvergenceError: the reference was not accepted.
-        OutputError: the folder can't be written.
+        ModelError: a bad setting, a scene without probes, an incompatible reference.
+        ConvergenceError: the reference run failed.
+        OutputError: a folder that is not writable.
         KeyboardInterrupt: after Ctrl-C; finished runs are kept in `out`.
     """
     options = options or StudyOptions()
@@ -115,7 +116,7 @@ def study(
 
 
 def _scene(given: Any, dt: float | None, t_end: float | None) -> tuple[str, Scene[Any]]:
-    """A scene, and how the command line names it."""
+    """Scene, and its name on the command line."""
     if isinstance(given, str):
         return given, locate(given)
     if isinstance(given, Scene):
@@ -136,7 +137,7 @@ def _check_names(what: str, given: Mapping[str, Any], known: Any) -> None:
 
 
 def _check_probes(scene: Scene[Any], setting: Setting, chosen: Sequence[str] | None) -> None:
-    """ModelError for a scene without probes, and for chosen ones that are not there."""
+    """ModelError for a scene without probes, and for unknown probes."""
     names = [p.name for p in scene.build(setting.values).description.probes]
     if not names:
         raise ModelError(
@@ -152,7 +153,7 @@ def _check_probes(scene: Scene[Any], setting: Setting, chosen: Sequence[str] | N
 def _reference(
     given: Any, scene: Scene[Any], base: Setting, probes: Sequence[str] | None
 ) -> Callable[[Setting], Reference | None]:
-    """What gives the known motion for the parameters of a setting; it gives None where a finer run is to."""
+    """Function giving the known motion for the parameters of a setting; None if a finer run is needed."""
     if given == RUN:
         return lambda setting: None
     if given is None:
@@ -168,13 +169,13 @@ def _reference(
 
 
 def _answer(rows: Sequence[Row], target: float | None) -> Row | None:
-    """The row with the smallest median time of those whose error, with those of reference and mesh, is within it."""
+    """Row with the smallest median time whose error, plus those of reference and mesh, is within the target."""
     good = [r for r in rows if target is not None and r.status == DONE and r.reaches <= target]
     return min(good, key=lambda r: r.seconds or 0.0) if good else None
 
 
 class _Work:
-    """Runs what a study needs, and judges it."""
+    """Runs and evaluates a study."""
 
     def __init__(
         self,
@@ -215,12 +216,12 @@ class _Work:
         return found
 
     def run(self, setting: Setting) -> Outcome:
-        """The outcome of a setting beside those of the sweep."""
+        """Outcome of a setting besides the sweep."""
         self.bar.total = (self.bar.total or 0) + 1
         return self.point(setting, 1, None)
 
     def point(self, setting: Setting, repeat: int, limit: float | None) -> Outcome:
-        """The outcome of a setting, run unless it is known."""
+        """Outcome of a setting, run unless known."""
         found = self.store.get(setting, repeat, limit)
         if found is None:
             self.bar.set_postfix_str(_short(setting, self.axes), refresh=True)
@@ -230,7 +231,7 @@ class _Work:
         return found
 
     def rows(self, settings: Sequence[Setting]) -> tuple[list[Row], list[dict[str, Any]], dict[str, Motion]]:
-        """Rows of all settings; what references were; and those by the values of the physical parameters."""
+        """Rows of all settings; texts of the references; and the references by values of the physical parameters."""
         from tqdm import tqdm
 
         groups: dict[str, list[Setting]] = {}
@@ -293,7 +294,7 @@ class _Work:
         )  # fmt: skip
 
     def judged(self, rows: list[Row], motions: dict[str, Motion]) -> list[Row]:
-        """The rows with parts of the error, and with that of the mesh where the cheapest one hangs on it."""
+        """Rows with parts of the error, and the mesh error if the cheapest one depends on it."""
         while True:
             answer = _answer(rows, self.options.target)
             rows = self.split(rows, motions, answer)
@@ -307,12 +308,12 @@ class _Work:
                     for r in rows]  # fmt: skip
 
     def _in_time(self, row: Row) -> bool:
-        """Whether the error of a row leaves out that of the mesh, and an estimate of it can be added."""
+        """True if the error of a row excludes that of the mesh, which can be estimated."""
         swept = any(name in self.axes.over for name in self.axes.mesh)
         return self.options.measure in ("l2", "end") and not swept and self.known(row.setting) is None
 
     def split(self, rows: list[Row], motions: dict[str, Motion], answer: Row | None) -> list[Row]:
-        """The rows with parts of the error where asked for."""
+        """Rows with the requested parts of the error."""
         from tqdm import tqdm
 
         done = [r for r in rows if r.status == DONE and r.error is not None]
@@ -332,9 +333,9 @@ class _Work:
         return out
 
     def checks(self, answer: Row, motions: dict[str, Motion]) -> list[Row]:
-        """The answer with steps, or errors asked for, that are about 0.9 and 1.1 times as large; not repeated.
+        """Reruns of the answer with about 0.9 and 1.1 times its step or requested error; not repeated.
 
-        Steps are rounded to what divides the duration.
+        Steps are rounded to divide the duration.
         """
         from tqdm import tqdm
 
@@ -352,7 +353,7 @@ class _Work:
 
 
 def _short(setting: Setting, axes: Axes) -> str:
-    """A run in a few words, for the bar."""
+    """Short text of a run, for the bar."""
     step = f"dt={setting.dt:g}" if setting.dt is not None else f"error={setting.error:g}"
     more = [f"{name}={setting.values[name]}" for name in axes.over if name in setting.values]
     return " ".join([setting.method, step, *more])

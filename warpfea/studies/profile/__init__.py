@@ -1,1 +1,1 @@
-"""Where the time of a step goes."""
+"""Run time of a step by part and kernel."""

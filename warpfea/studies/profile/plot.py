@@ -1,4 +1,4 @@
-"""The picture of a profile: time per step of each part, and its bandwidth over that of a copy."""
+"""Picture of a profile: time per step of each part, and its bandwidth over that of a copy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .profiling import Profile
 __all__ = ["BETWEEN", "draw"]
 
 BETWEEN = "between kernels"
-COLORS = {  # a colour-blind-safe set (Okabe and Ito), greys for what is no arithmetic
+COLORS = {  # colour-blind-safe set (Okabe and Ito), greys for parts without arithmetic
     "residual": "#e69f00",
     "product": "#0072b2",
     "assembly": "#004c7a",
@@ -24,7 +24,7 @@ COLORS = {  # a colour-blind-safe set (Okabe and Ito), greys for what is no arit
     BETWEEN: "#cccccc",
 }
 OTHER = "#882255"
-"""Parts of terms that are not listed."""
+"""Parts of terms not listed."""
 
 
 def draw(found: Profile, title: str, path: pathlib.Path) -> None:
@@ -58,7 +58,7 @@ def draw(found: Profile, title: str, path: pathlib.Path) -> None:
 
 
 def _time(ms: float, total: float) -> str:
-    """The text at a bar."""
+    """Text at a bar."""
     share = 100.0 * ms / total
     if ms == 0.0:
         return "too short to tell"

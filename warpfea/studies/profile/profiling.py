@@ -1,12 +1,12 @@
-"""Where the time of a step goes: the recorded step as a whole, and its launches one by one.
+"""Run time of a step: the captured step as a whole, and its launches one by one.
 
-The whole step is timed as it runs, one graph per step. Then the same steps are done again from the same state without
-the graph, each launch timed alone: on the GPU by events around the kernel, on the CPU by the host's clock. What an
-empty kernel takes by the same means is taken off each launch. What the whole step takes beyond its kernels is
-`between_ms`: the starting of kernels, the conditions of loops, clearing of flags, the reading of the report.
+The whole step is timed as one graph. The same steps are then repeated from the same state without the graph, each
+launch timed alone: on the GPU by events around the kernel, on the CPU by the host's clock. The time of an empty
+kernel is subtracted from each launch. The difference of the whole step and its kernels is `between_ms`: kernel
+starts, conditions of loops, clearing of flags, reading of the report.
 
-Bytes are those of the arrays a launch can reach, each counted once. Traffic is smaller where a kernel touches an array
-in part, or finds it in a cache, and larger where it reads an array several times.
+Bytes are those of the arrays accessible to a launch, each counted once. Traffic is smaller for partly used or cached
+arrays, and larger for repeated reads.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class KernelTime:
     """Launches of one kernel for one part, per step.
 
     Attributes:
-        part: what they are for, see `PARTS`. kernel: module.kernel.
-        launches: per step. ms: time per step beyond that of empty launches. bytes: of the arrays they reach, per step.
+        part: purpose, see `PARTS`. kernel: module.kernel.
+        launches: per step. ms: time per step beyond that of empty launches. bytes: of accessible arrays, per step.
     """
 
     part: str
@@ -55,20 +55,20 @@ class KernelTime:
 
     @property
     def GBps(self) -> float | None:
-        """1e9 bytes per second; None where the time is too short to tell."""
+        """1e9 bytes per second; None if the time is too short."""
         return self.bytes / self.ms / 1e6 if self.ms > 0.0 else None
 
 
 @dataclass(frozen=True)
 class Profile:
-    """What `profile` found.
+    """Result of `profile`.
 
     Attributes:
         step_ms: time of each step as one graph, with the reading of its report, ms.
         kernels: kernels per part, the longest first.
         newton, pcg: iterations per step.
         copy_GBps: bytes read and written per second, 1e9, by a copy of a large array on the device.
-        empty_launch_us: time of an empty kernel, taken off each launch, us.
+        empty_launch_us: time of an empty kernel, subtracted from each launch, us.
         about: a line about each part.
     """
 
@@ -82,7 +82,7 @@ class Profile:
 
     @property
     def parts(self) -> dict[str, KernelTime]:
-        """Sums over the kernels of each part that launches: those of `PARTS` in their order, then those of terms."""
+        """Sums over the kernels of each part with launches: `PARTS` in order, then those of terms."""
         out = {}
         for name in dict.fromkeys([*PARTS, *(k.part for k in self.kernels)]):
             rows = [k for k in self.kernels if k.part == name]
@@ -98,12 +98,12 @@ class Profile:
 
     @property
     def between_ms(self) -> float:
-        """What a step of the mean length takes beyond its kernels, ms; 0 where timed alone they took longer."""
+        """Mean step time beyond its kernels, ms; 0 if the single launches took longer."""
         return max(statistics.mean(self.step_ms) - self.kernels_ms, 0.0)
 
     @property
     def total_ms(self) -> float:
-        """What shares are of: the kernels and what lies between them, ms."""
+        """Reference of the shares: kernels and the time between them, ms."""
         return self.kernels_ms + self.between_ms
 
     @property
@@ -122,9 +122,9 @@ class _Booked:
 
 
 class Recorder:
-    """Does launches one by one and books time and bytes by part and kernel.
+    """Executes launches one by one and books time and bytes by part and kernel.
 
-    Commands are kept, so that little happens between two launches that come again: caches stay warm.
+    Commands are cached, for little host work between repeated launches: caches stay warm.
     """
 
     def __init__(self, device: Any) -> None:
@@ -136,12 +136,12 @@ class Recorder:
     def __call__(
         self, part: str, kernel: wp.Kernel, size: Sequence[int], inputs: list[Any], make: Callable[[], wp.Launch]
     ) -> None:
-        """Do the launch; on the CPU time it."""
+        """Execute the launch; on the CPU time it."""
         key = (part, kernel, *size, *map(_identity, inputs))
         known = self._known.get(key)
         if known is None:
             booked = self._booked.setdefault((part, kernel_name(kernel)), _Booked())
-            # the inputs are held, so that the identity of a struct stays its own
+            # the inputs are referenced, so that the id of a struct stays unique
             known = self._known[key] = make(), booked, launch_bytes(inputs, _members(kernel)), inputs
         command, booked, reached, _ = known
         if self.device.is_cuda:
@@ -155,16 +155,16 @@ class Recorder:
         booked.bytes += reached
 
     def clear(self) -> None:
-        """Forget what was booked; commands are kept."""
+        """Clear the bookings; commands are kept."""
         self._pending.clear()
         for booked in self._booked.values():
             booked.launches, booked.seconds, booked.bytes = 0, 0.0, 0
 
     def measure(self, work: Callable[[], object]) -> None:
-        """Call `work`, whose launches come here; on the GPU collect their times."""
+        """Call `work` with its launches recorded; on the GPU collect their times."""
         if not self.device.is_cuda:
             collects = gc.isenabled()
-            gc.disable()  # what the host tidies up meanwhile would be booked on a launch
+            gc.disable()  # host garbage collection would be booked on a launch
             try:
                 work()
             finally:
@@ -179,7 +179,7 @@ class Recorder:
         self.collect([r.elapsed for r in results])
 
     def collect(self, elapsed_ms: list[float]) -> None:
-        """Book the times of the pending launches, in their order. ModelError where others were timed too."""
+        """Book the times of the pending launches, in their order. ModelError if others were timed too."""
         if len(elapsed_ms) != len(self._pending):
             raise ModelError(
                 f"profile: {len(elapsed_ms)} kernels were timed and {len(self._pending)} launched; others run that "
@@ -190,7 +190,7 @@ class Recorder:
         self._pending.clear()
 
     def kernels(self, steps: int, empty: float) -> tuple[KernelTime, ...]:
-        """What was booked, per step, less `empty` seconds per launch; the longest first."""
+        """Bookings per step, less `empty` seconds per launch; the longest first."""
         rows = []
         for (part, kernel), b in self._booked.items():
             if b.launches:
@@ -200,14 +200,14 @@ class Recorder:
 
 
 def _identity(value: Any) -> Any:
-    """What tells arguments of a launch apart."""
+    """Key of the arguments of a launch."""
     if isinstance(value, wp.array):
         return value.ptr, value.shape, value.strides
     return value if isinstance(value, (int, float)) else id(value)
 
 
 def launch_bytes(inputs: list[Any], members: set[str] | None = None) -> int:
-    """Bytes of the arrays among arguments and in their structs, each once; `members`: the only ones of structs."""
+    """Bytes of the arrays among arguments and in their structs, each once; `members`: the used ones of structs."""
     found: dict[int, int] = {}
 
     def visit(value: Any) -> None:
@@ -228,7 +228,7 @@ def launch_bytes(inputs: list[Any], members: set[str] | None = None) -> int:
 
 @functools.cache
 def _members(kernel: wp.Kernel) -> set[str] | None:
-    """Names of all members that a kernel and the functions it calls mention; None if that can't be told."""
+    """Names of all struct members in a kernel and its functions; None if unknown."""
     names: set[str] = set()
     seen: set[int] = set()
     waiting = [kernel.adj]
@@ -248,7 +248,7 @@ def _members(kernel: wp.Kernel) -> set[str] | None:
 
 @dataclass(frozen=True)
 class Replay:
-    """Steps that were done as graphs, and again launch by launch.
+    """Steps executed as graphs, and again launch by launch.
 
     Attributes:
         step_ms: of each step as a graph, ms.
@@ -263,15 +263,15 @@ class Replay:
 
 
 def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] | None = None) -> Profile:
-    """Profile the `steps` steps that follow a warm-up of two; the simulation is at their end then, as after `step`.
+    """Profile the `steps` steps after a warm-up of two; the simulation is then at their end, as after `step`.
 
     Args:
-        sim: a simulation that records its steps (capture=True).
-        steps: that are timed, as graphs and then again launch by launch.
-        on_step: called after each of the 2 steps + 3 that are done.
+        sim: a simulation with captured steps (capture=True).
+        steps: number of timed steps, as graphs and then launch by launch.
+        on_step: called after each of the 2 steps + 3 executed steps.
 
     Raises:
-        ModelError: steps out of range, or a simulation whose steps are not recorded.
+        ModelError: steps out of range, or a simulation without captured steps.
         ConvergenceError, ConstraintError: a step failed.
     """
     done = replay(sim, steps, on_step)
@@ -288,7 +288,7 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
 
 
 def replay(sim: Simulation, steps: int, on_step: Callable[[], object] | None = None) -> Replay:
-    """Warm up, do the steps, and do them again from the same state launch by launch; arguments as of `profile`.
+    """Warm up, do the steps, and repeat them from the same state launch by launch; arguments as of `profile`.
 
     Raises:
         ModelError, ConvergenceError, ConstraintError: as `profile`.
@@ -320,7 +320,7 @@ def replay(sim: Simulation, steps: int, on_step: Callable[[], object] | None = N
     try:
         sim.state.load(start)
         stepper.forget()
-        do(1, stepper.sequence)  # makes the commands, and what does not belong to the state
+        do(1, stepper.sequence)  # creates the commands, and data outside the state
         recorder.clear()
         do(steps, lambda: recorder.measure(stepper.sequence))
     finally:
@@ -329,16 +329,16 @@ def replay(sim: Simulation, steps: int, on_step: Callable[[], object] | None = N
 
 
 def _empty_launch(device: Any) -> float:
-    """Seconds that an empty launch takes by the recorder's means: the median of single ones."""
+    """Seconds of an empty launch measured by the recorder: the median of single ones."""
     device = wp.get_device(device)
     flags = wp.zeros(1, dtype=wp.int32, device=device)
-    with quiet_warp():  # its module is loaded now
+    with quiet_warp():  # load its module now
         command = wp.launch(probe_kernels().empty, dim=1, inputs=[flags], device=device, record_cmd=True)
         command.launch()
     if device.is_cuda:
         wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
         for _ in range(EMPTY_LAUNCHES):
-            wp.synchronize_device(device)  # small kernels that are launched one by one meet an idle device too
+            wp.synchronize_device(device)  # small kernels launched one by one also meet an idle device
             command.launch()
         return 1e-3 * statistics.median(r.elapsed for r in wp.timing_end())
     times = []
@@ -350,7 +350,7 @@ def _empty_launch(device: Any) -> float:
 
 
 def copy_bandwidth(device: Any) -> float:
-    """1e9 bytes per second, read and written, of a copy from one large array to another: the best of several."""
+    """1e9 bytes per second, read and written, of a copy between large arrays: the best of several."""
     device = wp.get_device(device)
     size = COPY_BYTES["cuda" if device.is_cuda else "cpu"]
     if device.is_cuda:

@@ -1,4 +1,4 @@
-"""What the cases share: bars and beams, static solutions with their counts, differences."""
+"""Common parts of the cases: bars and beams, static solutions with their counts, differences."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ __all__ = [
 DOWN = (0.0, 0.0, -9.81)
 STEEL = wf.SVK(E=2e11, nu=0.3, density=7800.0)
 SOUND = 1e-12
-"""J that counts as positive."""
+"""Smallest J that counts as positive."""
 REFINED = 1e-10
-"""Relative residual of references that are solved in float64."""
+"""Relative residual of float64 references."""
 BUILT_IN = {
     "T4": "all",
     "T10": "all",
@@ -43,13 +43,13 @@ BUILT_IN = {
     "3243": "position+section",
     "3443": "position+director",
 }
-"""Slots that a wall x = const holds."""
+"""Slots constrained by a wall x = const."""
 
 
 def bar(
     element: str, cells: Sequence[int], size: Sequence[float], law: Any, gravity: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[wf.ModelBuilder, wf.Body]:
-    """A solid bar from x = 0 on, built in at its side x-, with the probe "tip" at x+; `size` in m."""
+    """A solid bar from x = 0 on, clamped at its side x-, with the probe "tip" at x+; `size` in m."""
     b = wf.ModelBuilder(gravity=tuple(gravity))
     mesh = wf.mesh.box(tuple(size), cells=tuple(cells), element=element)
     body = b.add_solid(mesh, material=law, element=element, name="bar")
@@ -61,7 +61,7 @@ def bar(
 def beam(
     elements: int, side: float, law: Any, length: float = 1.0, gravity: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[wf.ModelBuilder, wf.Body]:
-    """A 3243 beam along x with a square section, built in at its start, with the probe "tip" at its end; m."""
+    """A 3243 beam along x with a square section, clamped at its start, with the probe "tip" at its end; m."""
     b = wf.ModelBuilder(gravity=tuple(gravity))
     section = wf.Rectangle(side, side)
     line = [(0, 0, 0), (length, 0, 0)]
@@ -88,7 +88,7 @@ class Count(Output):
     seen: Any = field(default=None, repr=False)
 
     def add(self, report: Any, size: float) -> None:
-        """Take a step's report; `size` of the model, m."""
+        """Add a step's report; `size` of the model, m."""
         self.steps += 1
         self.newton += int(report.newton.max())
         self.pcg += int(report.pcg.max())
@@ -107,9 +107,9 @@ class Count(Output):
         """An answer with these counts.
 
         Args:
-            low: no step may have been accepted with J below it at a point; None: whatever J.
-            told: estimate of the relative error that the reports gave, which the error may exceed threefold; 0: none.
-                Only where the reference is of the same mesh: `last_floor` of a static solution, `sum_of_floors` of a
+            low: minimum J at a point of accepted steps; None: any J.
+            told: reported estimate of the relative error, which the error may exceed threefold; 0: none. Only for a
+                reference on the same mesh: `last_floor` of a static solution, `sum_of_floors` of a
                 motion.
         """
         limits = dict(more.pop("limits", {}))
@@ -123,19 +123,19 @@ class Count(Output):
         )  # fmt: skip
 
     def open(self, sim: Any) -> None:
-        """Nothing to prepare."""
+        """No preparation."""
 
     def write(self, sim: Any) -> None:
-        """Take the step that was done since the last call."""
+        """Add the step done since the last call."""
         if sim.last is not None and sim.last is not self.seen:
             self.seen = sim.last
             self.add(sim.last, sim.model.size)
 
     def close(self, sim: Any) -> None:
-        """Nothing to finish."""
+        """No action."""
 
     def abort(self) -> None:
-        """Nothing to drop."""
+        """No action."""
 
 
 @dataclass
@@ -152,7 +152,7 @@ class Solved:
 
 
 def solve(b: wf.ModelBuilder, setting: Setting, dtype: str | None = None, **options: Any) -> Solved:
-    """`solve_static` with these options, in the setting's precision or in another."""
+    """`solve_static` with these options, in the setting's or another precision."""
     count = Count()
     model = b.finalize(device=setting.device, dtype=dtype or setting.dtype)
     result = wf.solve_static(model, outputs=[count], **options)

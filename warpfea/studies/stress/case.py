@@ -1,4 +1,4 @@
-"""What a case of the stress suite is told, and what it answers."""
+"""Case of the stress suite: setting, answer, registration."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ DTYPES = ("float64", "float32")
 
 
 class Skipped(Exception):
-    """A row that can't be tried here; it counts neither way. The text, a few words, is its outcome."""
+    """Row that can't be tried here, counted neither way. The text, a few words, is its outcome."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a case runs on.
+    """Setting of a case.
 
     Attributes:
         device: Warp device.
         dtype: "float64" or "float32".
-        meshes: folder of mesh files that the package does not hold, or None.
+        meshes: folder of mesh files outside the package, or None.
     """
 
     device: str
@@ -33,25 +33,25 @@ class Setting:
     meshes: pathlib.Path | None = None
 
     def mesh(self, name: str) -> pathlib.Path:
-        """A file of the folder --meshes. Skipped where it is not there."""
+        """A file of the folder --meshes. Skipped if missing."""
         if self.meshes is None or not (self.meshes / name).is_file():
             raise Skipped("no mesh")
         return self.meshes / name
 
     @property
     def single(self) -> bool:
-        """In float32."""
+        """True in float32."""
         return self.dtype == "float32"
 
 
 @dataclass
 class Answer:
-    """What a case found. It passes where every `error` is within its `bound`.
+    """Answer of a case. It passes if every `error` is within its `bound`.
 
     Attributes:
-        error: what is judged, usually a relative error against `reference`; NaN fails.
+        error: usually a relative error against `reference`; NaN fails.
         bound: largest error that passes.
-        reference: where the right answer comes from.
+        reference: source of the right answer.
         newton, pcg, halvings: of the whole case, the worst world's.
         limits: further numbers that must not exceed a bound, {name: (value, bound)}, such as Newton iterations.
         largest_step: largest stable step found, s.
@@ -77,25 +77,25 @@ class Answer:
 
     @property
     def passed(self) -> bool:
-        """Whether everything is within its bound."""
+        """True if everything is within its bound."""
         return self.error <= self.bound and all(value <= bound for value, bound in self.limits.values())
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case: a function of the setting, or of the setting and one of `values`, that returns an Answer.
+    """A case: a function of the setting, or of the setting and one of `values`, returning an Answer.
 
     Attributes:
-        name: as users type it; rows are called NAME or NAME/VALUE.
+        name: of the case; rows are named NAME or NAME/VALUE.
         group: heading of the table.
         run: the function.
         values: one row each; (None,): a single row.
-        quick: which rows belong to the quick suite, "none", "float64" or "both" precisions.
-        refusal: {dtype: texts}: there the case may end with an error of warpfea whose text holds one of `texts` instead
-            of an answer; with `must`, has to.
-        must: an answer fails: the case is to be refused.
-        about: what is tried, a line.
-        dtypes: precisions that the case is for.
+        quick: rows of the quick suite, "none", "float64" or "both" precisions.
+        refusal: {dtype: texts}: precisions in which the case may end with an error of warpfea containing one of
+            `texts` instead of an answer; with `must`, has to.
+        must: an answer fails, the case must be refused.
+        about: description, one line.
+        dtypes: precisions of the case.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Case:
 
 
 def label(name: str, value: Any) -> str:
-    """What a row is called: NAME, or NAME/VALUE."""
+    """Name of a row: NAME, or NAME/VALUE."""
     if value is None:
         return name
     parts = value if isinstance(value, tuple) else (value,)
@@ -118,14 +118,14 @@ def label(name: str, value: Any) -> str:
 
 
 CASES: dict[str, Case] = {}
-"""By name, in the order of their definition."""
+"""Cases by name, in the order of their definition."""
 
 
 def case(
     name: str, group: str, *, values: Sequence[Any] = (None,), quick: str = "none",
     refusal: Mapping[str, Sequence[str]] | None = None, must: bool = False, dtypes: Sequence[str] = DTYPES,
 ) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:  # fmt: skip
-    """Add a function to `CASES`; see Case. The first line of its docstring says what is tried."""
+    """Add a function to `CASES`; see Case. The first line of its docstring is the description."""
 
     def add(run: Callable[..., Answer]) -> Callable[..., Answer]:
         texts = {dtype: tuple(t) for dtype, t in (refusal or {}).items()}

@@ -1,6 +1,6 @@
-"""Rows of the stress suite that are known not to meet their criterion, and why. A miss is told as such.
+"""Rows of the stress suite known to fail their criterion, with reasons; reported as known misses.
 
-A row that is listed and meets its criterion passes: some depend on rounding.
+A listed row that meets its criterion passes: some depend on round-off.
 """
 
 from __future__ import annotations
@@ -24,6 +24,6 @@ MISSES: dict[tuple[str, str, str], str] = {
 
 
 def reason_for(label: str, dtype: str, device: str) -> str | None:
-    """Why a row is known to miss its criterion on a device, or None."""
+    """Reason for a known miss of a row on a device, or None."""
     kind = "cuda" if device.startswith("cuda") else "cpu"
     return MISSES.get((label, dtype, kind)) or MISSES.get((label, dtype, ""))

@@ -1,4 +1,4 @@
-"""`warpfea stress`: chooses rows, runs them, judges what comes of each, prints and writes them."""
+"""`warpfea stress`: selects, runs and evaluates rows, prints and writes results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SCHEMA = 1
 DONE, REFUSED, FAILED, MISSED = "done", "refused", "FAILED", "missed"
 STDOUT = "-"
 NOTE = 120
-"""Characters of a note in the table; the file has it whole."""
+"""Characters of a note in the table; the file has the full text."""
 HEAD = (
     "case", "precision", "outcome", "error", "bound", "Newton", "PCG", "largest step", "drift", "violation", "s",
     "note",
@@ -52,7 +52,7 @@ class Row:
 
 
 def load_cases() -> dict[str, Case]:
-    """All cases by name, after every module of `cases` was imported."""
+    """All cases by name, after import of every module of `cases`."""
     from . import cases
 
     for module in sorted(found.name for found in pkgutil.iter_modules(cases.__path__)):
@@ -61,7 +61,7 @@ def load_cases() -> dict[str, Case]:
 
 
 def choose(cases: Mapping[str, Case], names: Sequence[str], quick: bool, dtypes: Sequence[str]) -> list[Row]:
-    """The rows that `names` (cases, rows or groups; none: all) mean. UsageError for a name that is not there."""
+    """Rows of `names` (cases, rows or groups; none: all). UsageError for an unknown name."""
     known = dict.fromkeys(
         [*cases, *(c.group for c in cases.values()), *(label(c.name, v) for c in cases.values() for v in c.values)]
     )
@@ -83,7 +83,7 @@ def choose(cases: Mapping[str, Case], names: Sequence[str], quick: bool, dtypes:
 
 
 def list_cases(cases: Mapping[str, Case]) -> str:
-    """The cases by group, with their values and what is tried."""
+    """Cases by group, with their values and descriptions."""
     out: list[list[str]] = []
     for group in dict.fromkeys(case.group for case in cases.values()):
         out.append([group])
@@ -95,9 +95,9 @@ def list_cases(cases: Mapping[str, Case]) -> str:
 
 
 def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
-    """Run a row and judge it: a dict that JSON can hold, `passed` True, False, or None where it was skipped.
+    """Run and evaluate a row: a JSON-compatible dict, `passed` True, False, or None if skipped.
 
-    With `debug` an error that is none of warpfea's is raised.
+    With `debug` errors other than warpfea's are raised.
     """
     case = row.case
     began = clock.perf_counter()
@@ -137,7 +137,7 @@ def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
 
 
 def _judge(case: Case, answer: Answer) -> tuple[str, bool, str]:
-    """Outcome, whether it passes, and a note."""
+    """Outcome, passed or not, and a note."""
     if case.must:
         return FAILED, False, f"accepted what is to be refused; {answer.note}".rstrip("; ")
     if answer.passed:
@@ -150,7 +150,7 @@ def _judge(case: Case, answer: Answer) -> tuple[str, bool, str]:
 
 
 def _judge_error(case: Case, error: Error, dtype: str) -> tuple[str, bool, str]:
-    """The same of a named error: it passes where it says what the case is to be refused for."""
+    """Outcome for a named error: it passes if the refusal is expected with this text."""
     text = " ".join(str(error).split())
     expected = case.refusal.get(dtype, ())
     if any(part in text for part in expected):
@@ -162,7 +162,7 @@ def _judge_error(case: Case, error: Error, dtype: str) -> tuple[str, bool, str]:
 def run_rows(
     rows: Sequence[Row], device: str, meshes: pathlib.Path | None, content: dict[str, Any], options: argparse.Namespace
 ) -> None:
-    """Run rows that `content["rows"]` does not hold yet; print each, and write the file after each."""
+    """Run the rows missing in `content["rows"]`; print each, and write the file after each."""
     have = {(row["case"], row["precision"]): row for row in content["rows"]}
     width = max(len(row.label) for row in rows)
     live = sys.stderr.isatty() and not (options.quiet or options.no_progress)
@@ -207,7 +207,7 @@ def _show(options: argparse.Namespace, cells: Mapping[str, str], width: int) -> 
 
 
 def _started(options: argparse.Namespace, settings: Mapping[str, Any], device: str) -> dict[str, Any]:
-    """What --json is to hold before the first row: the rows of the file to go on from, or none. UsageError."""
+    """Contents of --json before the first row: the rows of the file to resume, or none. UsageError."""
     content = {"schema": SCHEMA, **origin(options.words, device), "settings": dict(settings), "rows": []}
     path = pathlib.Path(options.json) if options.json and options.json != STDOUT else None
     if not options.resume:
@@ -230,7 +230,7 @@ def _started(options: argparse.Namespace, settings: Mapping[str, Any], device: s
 
 
 def stress(options: argparse.Namespace) -> bool:
-    """Do `warpfea stress`; whether every row met its criterion. UsageError, OutputError."""
+    """Run `warpfea stress`; True if every row met its criterion. UsageError, OutputError."""
     cases = load_cases()
     if options.list:
         print(list_cases(cases))
@@ -255,7 +255,7 @@ def stress(options: argparse.Namespace) -> bool:
 
 
 def _conclude(options: argparse.Namespace, results: Sequence[Mapping[str, Any]]) -> bool:
-    """Print how many rows met their criterion, and which did not."""
+    """Print the number of passed rows, and the failed ones."""
     wrong = [f"{row['case']} {row['precision']}" for row in results if row["passed"] is False]
     counted = sum(row["passed"] is not None for row in results)
     seconds = math.fsum(row["wall_s"] for row in results)

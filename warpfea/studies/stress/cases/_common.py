@@ -1,4 +1,4 @@
-"""What cases share: models on a setting's device, the effort of their steps, what errors are measured with."""
+"""Common parts of cases: models on a setting's device, effort of steps, error measures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 class Effort:
-    """Counts what steps take; an output of `run` and `solve_static`, or fed by `step`.
+    """Effort of steps; an output of `run` and `solve_static`, or fed by `step`.
 
     Attributes:
         newton, pcg, halvings: sums, of the worst world.
-        min_J, floor: the worst, of worlds that have not failed; None where no step told it.
+        min_J, floor: the worst of worlds that have not failed; None if no step reported it.
         violation: the largest of constraints over the model's size; None without constraints.
     """
 
@@ -59,7 +59,7 @@ class Effort:
     # as an output
 
     def open(self, sim: Any) -> None:
-        """Nothing to prepare."""
+        """No preparation."""
 
     def write(self, sim: Any) -> None:
         """Count a step; the call before the first has none."""
@@ -67,10 +67,10 @@ class Effort:
             self.add(sim)
 
     def close(self, sim: Any) -> None:
-        """Nothing to close."""
+        """No action."""
 
     def abort(self) -> None:
-        """Nothing to take back."""
+        """No action."""
 
     @property
     def told(self) -> dict[str, Any]:

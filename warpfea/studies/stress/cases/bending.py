@@ -1,4 +1,4 @@
-"""Large bending in few load steps: Newton's iterations are counted."""
+"""Large bending in few load steps, with bounds on Newton iterations."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ ELASTICA = np.array([-0.056432, -0.301721])
 ELASTICA_STEPS, ELASTICA_NEWTON = 5, 10
 SLENDER = (1e1, 1e2, 1e3, 1e4, 1e5)
 SHEARS = 2e-2
-"""Bound where shear, which the elastica has not, counts: at L/h = 10."""
+"""Bound including shear, absent in the elastica, at L/h = 10."""
 INNER, OUTER, THICKNESS = 6.0, 10.0, 0.03
 ANNULAR = {"inner": 13.891, "outer": 17.528}
 """Deflection of the ends of the slit (Sze, Liu and Lo 2004, Finite Elem. Anal. Des. 40:1551), m."""
 SLIT = 1e-6
-"""Of the whole turn, what the slit leaves out."""
+"""Fraction of the full turn omitted at the slit."""
 SOFT = wf.NeoHookean.from_E_nu(E=1e6, nu=0.4, density=1000.0)
 SOFT_NEWTON = 80
 HELD = 0.03
-"""Of the length, from the low end, that is clamped."""
+"""Clamped fraction of the length, from the low end."""
 
 
 @case("elastica", "bending", values=SLENDER, quick="both", refusal={"float32": ["float32"]})
@@ -49,7 +49,7 @@ def annulus(X: np.ndarray) -> np.ndarray:
 
 @case("annular", "bending", values=(3, "auto"), quick="float64", refusal={"float32": ["float32"]})
 def annular(setting: Setting, load_steps: int | str) -> Answer:
-    """The slit annular plate of Sze: one side of the slit is lifted by 0.8 N/m while the other is held."""
+    """The slit annular plate of Sze: one side of the slit is lifted by 0.8 N/m, the other clamped."""
     if load_steps == "auto" and "auto" not in (wf.solve_static.__doc__ or ""):
         raise Skipped("no option")
     b = wf.ModelBuilder(gravity=(0, 0, 0))
@@ -69,7 +69,7 @@ def annular(setting: Setting, load_steps: int | str) -> Answer:
 
 
 def soft_solid(path: pathlib.Path) -> tuple[wf.ModelBuilder, wf.NodeSet, np.ndarray]:
-    """A soft solid held at the low end of its longest axis, the held nodes, and its weight (3,), N."""
+    """A soft solid clamped at the low end of its longest axis, the clamped nodes, and its weight (3,), N."""
     mesh = wf.mesh.read(path)
     low, high = mesh.bounding_box()
     axis = int(np.argmax(high - low))
@@ -84,7 +84,7 @@ def soft_solid(path: pathlib.Path) -> tuple[wf.ModelBuilder, wf.NodeSet, np.ndar
 
 
 def soft(setting: Setting, name: str) -> Answer:
-    """The answer of a soft solid under its weight: the wall carries it."""
+    """Answer of a soft solid under its weight: the reaction equals the weight."""
     b, held, weight = soft_solid(setting.mesh(f"{name}.msh"))
     found = solve(b, setting, load_steps=2)
     reaction = found.result.reaction(held)[0]
@@ -101,11 +101,11 @@ def soft_mat(setting: Setting) -> Answer:
 
 @case("soft-dolphin", "soft solids")
 def soft_dolphin(setting: Setting) -> Answer:
-    """The same of a dolphin."""
+    """A neo-Hookean dolphin of unstructured T4 bends by most of its length in two load steps."""
     return soft(setting, "dolphin")
 
 
 @case("soft-thin-limbs", "soft solids")
 def soft_thin_limbs(setting: Setting) -> Answer:
-    """The same of a body with thin limbs."""
+    """A neo-Hookean body with thin limbs of unstructured T4 bends by most of its length in two load steps."""
     return soft(setting, "thin_limbs")

@@ -1,4 +1,4 @@
-"""Buckling loads: statics tells a stable equilibrium from an unstable one, which a perfect structure does not leave."""
+"""Buckling loads: stability detection in statics for perfect structures, which stay on the primary path."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ._common import Effort, Z, finalize
 GROUP = "Stability"
 MODULUS, LENGTH, SIDE, THICKNESS = 2e11, 1.0, 0.02, 0.01
 PUSH = 1e-5
-"""Of the load, across a column."""
+"""Transverse load on a column, as a fraction."""
 
 
 def _judged(b: wf.ModelBuilder, setting: Setting, stable: bool, reference: str) -> Answer:
-    """Error 0 where statics says so, 1 where it says the other and 0.5 where it does not know."""
+    """Error 0 for the correct stability, 1 for the opposite and 0.5 for unknown."""
     effort = Effort()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", wf.StabilityWarning)
@@ -32,7 +32,7 @@ def _judged(b: wf.ModelBuilder, setting: Setting, stable: bool, reference: str) 
 
 @case("buckling-column", GROUP, values=(0.9, 1.1, 10.0), quick="both")
 def column(setting: Setting, factor: float) -> Answer:
-    """A perfect cantilever of 16 beam elements under so many times Euler's load is said to be stable or not."""
+    """A perfect cantilever of 16 beam elements under multiples of Euler's load is reported stable or unstable."""
     load = factor * np.pi**2 * MODULUS * SIDE**4 / 12.0 / (4.0 * LENGTH**2)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_beam([(0, 0, 0), (LENGTH, 0, 0)], elements=16, section=wf.Rectangle(SIDE, SIDE), normal=Z,
@@ -45,7 +45,9 @@ def column(setting: Setting, factor: float) -> Answer:
 @case("buckling-pushed", GROUP, values=(1.01, 1.1, 10.0), quick="both",
       refusal={"float64": ("was not accepted",), "float32": ("float32",)})  # fmt: skip
 def pushed(setting: Setting, factor: float) -> Answer:
-    """The same with 1e-5 of the load across it does not stay straight in silence: told, refused, or bent by 0.1 L."""
+    """The cantilever with 1e-5 of the load across it: reported unstable, refused, or bent by 0.1 L, never silently
+    straight.
+    """
     load = factor * np.pi**2 * MODULUS * SIDE**4 / 12.0 / (4.0 * LENGTH**2)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_beam([(0, 0, 0), (LENGTH, 0, 0)], elements=16, section=wf.Rectangle(SIDE, SIDE), normal=Z,
@@ -65,9 +67,9 @@ def pushed(setting: Setting, factor: float) -> Answer:
 
 @case("buckling-plate", GROUP, values=(0.9, 1.1, 1.5), quick="both")
 def plate(setting: Setting, factor: float) -> Answer:
-    """A square plate of 8 x 8 shells, simply supported, under so many times its load in one direction.
+    """A square plate of 8 x 8 shells, simply supported, under multiples of its uniaxial buckling load.
 
-    N = 4 pi^2 D / a^2 (Bryan 1891); of the mesh it is 0.976 of that.
+    N = 4 pi^2 D / a^2 (Bryan 1891); the mesh has 0.976 of that.
     """
     nu = 0.3
     critical = 4.0 * np.pi**2 * MODULUS * THICKNESS**3 / 12.0 / (1.0 - nu**2) / LENGTH**2

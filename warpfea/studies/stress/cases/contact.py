@@ -1,7 +1,7 @@
 """Contact with obstacles: fast impacts, stiff bodies, exact touch, edges and vertices, extremes of each parameter.
 
-Criteria hold for a deformable body: what it weighs is what its contacts carry at rest; the change of its momentum is
-the impulse of the records and of its weight, in every step; friction is at most mu N; no energy comes from nowhere.
+Criteria for a deformable body: at rest the contacts carry its weight; in every step its change of momentum equals
+the impulse of the recorded forces and its weight; friction is at most mu N; no energy is gained.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ SINGLE = {"float32": ["float32"]}
 FAST = 100.0
 """Speed of impacts, m/s."""
 NEWTON = 60
-"""Most iterations of a step that touches by a hair."""
+"""Maximum iterations of a step with grazing contact."""
 
 
 def exact(setting: Setting, double: float = 1e-7, single: float = 2e-3) -> float:
-    """A bound by precision."""
+    """Bound by precision."""
     return single if setting.single else double
 
 
 @dataclass
 class Scene:
-    """A cube and what it touches.
+    """A cube and its obstacles.
 
     Attributes:
-        builder: what it is in.
+        builder: its builder.
         body: the cube.
         pads: its contacts.
     """
@@ -50,7 +50,7 @@ class Scene:
     mass: float
 
     def model(self, setting: Setting) -> wf.Model:
-        """For the setting's device and precision."""
+        """Model for the setting's device and precision."""
         return self.builder.finalize(device=setting.device, dtype=setting.dtype)
 
 
@@ -58,7 +58,7 @@ def scene(
     *shapes: Any, E: float = 1e6, side: float = SIDE, gravity: Any = DOWN, turn: np.ndarray | None = None,
     place: Any = (0.0, 0.0, 0.0), cells: int = 2, path: Any = None, density: float = DENSITY, **options: Any,
 ) -> Scene:  # fmt: skip
-    """A T10 cube with a corner at the origin, turned about it and moved by `place`, and contacts with the shapes."""
+    """A T10 cube with a corner at the origin, rotated about it and moved by `place`, and contacts with the shapes."""
     b = wf.ModelBuilder(gravity=gravity)
     mesh = wf.mesh.box((side,) * 3, cells=(cells,) * 3)
     law = wf.SVK(E=E, nu=0.3, density=density)
@@ -89,14 +89,14 @@ def middle(sim: wf.Simulation, s: Scene) -> np.ndarray:
 
 @dataclass
 class Watched:
-    """What a motion with contact has shown.
+    """Results of a motion with contact.
 
     Attributes:
         count: iterations.
-        impulse: worst difference of a step's change of a body's momentum and its impulse, over the largest of all.
-        pulled: largest friction over mu N, less 1; normal forces that pull count as infinite.
-        gained: most energy beyond that at the start, over the most that was kinetic, or what a fall by a side gives.
-        through: deepest that the centre of mass came past a floor at z = 0, over the side.
+        impulse: largest difference of a step's change of momentum and its impulse, over the largest impulse.
+        pulled: largest friction over mu N, less 1; tensile normal forces count as infinite.
+        gained: largest energy above the initial one, over the largest kinetic energy, or that of a fall by a side.
+        through: largest depth of the centre of mass below a floor at z = 0, over the side.
     """
 
     count: Count
@@ -106,13 +106,13 @@ class Watched:
     through: float = -math.inf
 
     def answer(self, setting: Setting, error: float | None, bound: float, reference: str, **more: Any) -> Answer:
-        """An answer whose error is by default that of the impulse, and whose limits are those of any contact."""
+        """Answer with, by default, the error of the impulse, and the limits common to contacts."""
         limits = self.limits(setting) | more.pop("limits", {})
         worst = self.impulse if error is None else error
         return self.count.answer(worst, bound, reference, limits=limits, **more)
 
     def limits(self, setting: Setting) -> dict[str, tuple[float, float]]:
-        """Numbers of any contact, and what they may be."""
+        """Numbers common to contacts, and their bounds."""
         return {
             "impulse": (self.impulse, exact(setting, 1e-6, 1e-2)),
             "friction above mu N": (self.pulled, exact(setting, 1e-9, 1e-3)),
@@ -149,7 +149,7 @@ def watch(sim: wf.Simulation, s: Scene, steps: int, *, mu: float = 0.0, moves: b
 
 
 def total(sim: wf.Simulation) -> float:
-    """Energy that the model has: of motion, strain, place and contact, J."""
+    """Energy of the model: kinetic, strain, potential and contact, J."""
     e = sim.energies()
     return float(sum(e[name][0] for name in ("kinetic", "strain", "potential", "contact", "contact_pairs")))
 
@@ -171,7 +171,7 @@ OBSTACLES = {
     refusal=NAMED,
 )  # fmt: skip
 def impact(setting: Setting, value: tuple[str, float]) -> Answer:
-    """A cube at 100 m/s onto a half-space, a thin box, a sphere, ten of its sides a step: it does not get behind."""
+    """A cube at 100 m/s onto a half-space, a thin box, a sphere, ten of its sides a step: no penetration."""
     name, E = value
     s = scene(OBSTACLES[name], E=E, gravity=(0, 0, 0), place=(0, 0, 0.3), mu=0.3, restitution=0.5)
     s.builder.set_initial(s.body, velocity=(0, 0, -FAST))
@@ -220,7 +220,7 @@ def sliding(setting: Setting, value: tuple[float, float]) -> Answer:
     values=("half-space", "box", "sphere", "capsule", "cylinder", "same faces"),
 )  # fmt: skip
 def exact_touch(setting: Setting, name: str) -> Answer:
-    """A body that begins in exact touch, or face on face with a box of its own size, under its weight."""
+    """A body in initial exact touch, or face on face with a box of its own size, under its weight."""
     shapes = OBSTACLES | {
         "capsule": wf.Capsule((-1, SIDE / 2, -0.05), (1, SIDE / 2, -0.05), 0.05),
         "cylinder": wf.Cylinder((-1, SIDE / 2, -0.05), (1, SIDE / 2, -0.05), 0.05),
@@ -235,7 +235,7 @@ def exact_touch(setting: Setting, name: str) -> Answer:
 
 
 def corner_down() -> np.ndarray:
-    """Rotation that sets a cube on its vertex."""
+    """Rotation of a cube onto its vertex."""
     a = math.atan(math.sqrt(2.0))
     about_z = math.pi / 4
     Rz = np.array([[math.cos(about_z), -math.sin(about_z), 0], [math.sin(about_z), math.cos(about_z), 0], [0, 0, 1]])
@@ -244,14 +244,14 @@ def corner_down() -> np.ndarray:
 
 
 def edge_down() -> np.ndarray:
-    """Rotation that sets a cube on its edge along x."""
+    """Rotation of a cube onto its edge along x."""
     c = math.sqrt(0.5)
     return np.array([[1, 0, 0], [0, c, -c], [0, c, c]])
 
 
 @case("contact-graze", GROUP, values=(0.0, 1e-12, 1e-9, 1e-6), quick="float64")
 def graze(setting: Setting, depth: float) -> Answer:
-    """One vertex skims the floor at 100 m/s: one point that touches stalls nothing."""
+    """One vertex grazes the floor at 100 m/s: contact of a single point converges."""
     s = scene(
         FLOOR, gravity=(0, 0, 0), turn=corner_down(), place=(0, 0, -depth), mu=0.5, restitution=1.0, overlap="offset",
         overlap_time=1e-3,
@@ -266,7 +266,7 @@ def graze(setting: Setting, depth: float) -> Answer:
 
 @case("contact-wedge", GROUP, values=(0.0, 0.3), quick="both", refusal=SINGLE)
 def wedge(setting: Setting, mu: float) -> Answer:
-    """A cube in a trough of 90 degrees, statics: each side carries m g / sqrt(2) where they are smooth."""
+    """A cube in a trough of 90 degrees, statics: each side carries m g / sqrt(2) if smooth."""
     c = math.sqrt(0.5)
     sides = (wf.HalfSpace((0, c, c), 0.0), wf.HalfSpace((0, -c, c), 0.0))
     s = scene(*sides, turn=edge_down(), mu=mu)
@@ -282,7 +282,7 @@ def wedge(setting: Setting, mu: float) -> Answer:
 
 @case("contact-corner", GROUP, values=("edge", "vertex"), quick="float64")
 def corner(setting: Setting, which: str) -> Answer:
-    """A rigidly driven cube pressed on its edge or its vertex: the forces of a penalty per area in closed form."""
+    """A cube driven rigidly with its edge or vertex into an obstacle: closed-form forces of a penalty per area."""
     depth = SIDE / 4
     turn = edge_down() if which == "edge" else corner_down()
     s = scene(FLOOR, gravity=(0, 0, 0), turn=turn, cells=12 if which == "edge" else 16, mu=0.0)
@@ -315,8 +315,9 @@ def extreme_friction(setting: Setting, mu: float) -> Answer:
 
 @case("contact-restitution", GROUP, values=(1e-3, 1.0), quick="float64")
 def extreme_restitution(setting: Setting, e: float) -> Answer:
-    """A cube much stiffer than its contact lands flat at 1 m/s, 200 steps: e = 0.001 hardly throws it back, and e = 1
-    loses nothing by contact."""
+    """A cube much stiffer than its contact lands flat at 1 m/s, 200 steps: e = 0.001 gives almost no rebound, e = 1
+    no contact loss.
+    """
     s = scene(FLOOR, E=1e9, gravity=(0, 0, 0), place=(0, 0, 1e-3), mu=0.0, restitution=e, stiffness=1e-3)
     s.builder.set_initial(s.body, velocity=(0, 0, -1.0))
     sim = wf.Simulation(s.model(setting), dt=1e-4)

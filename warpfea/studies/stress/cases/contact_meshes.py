@@ -1,4 +1,4 @@
-"""Contact with rigid triangle meshes: thin sheets at speed, vertices and edges on vertices and edges, exact touch."""
+"""Contact with rigid triangle meshes: fast thin sheets, vertices and edges on vertices and edges, exact touch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SQUARE = np.array([(0, 1, 2), (0, 2, 3)])
 
 
 def sheet(cells: int = 4, half: float = 0.3, height: float = 0.0) -> wf.TriMesh:
-    """A square about the cube's middle, of cells x cells squares."""
+    """A square centred at the cube, of cells x cells squares."""
     g = np.linspace(-half, half, cells + 1) + SIDE / 2
     points = np.array([(x, y, height) for y in g for x in g])
     first = np.arange(cells * (cells + 1)).reshape(cells, cells + 1)[:, :-1].reshape(-1, 1, 1)
@@ -24,14 +24,14 @@ def sheet(cells: int = 4, half: float = 0.3, height: float = 0.0) -> wf.TriMesh:
 
 
 def pyramid(height: float = 0.2, half: float = 0.2) -> wf.TriMesh:
-    """A solid whose tip, of four triangles, is at the origin."""
+    """A solid with its tip, of four triangles, at the origin."""
     base = [(-half, -half, -height), (half, -half, -height), (half, half, -height), (-half, half, -height)]
     sides = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
     return wf.TriMesh(np.array([*base, (0, 0, 0)]), np.array([*SQUARE[:, ::-1].tolist(), *sides]))
 
 
 def roof(height: float = 0.1, half: float = 0.2, long: float = 0.4) -> wf.TriMesh:
-    """A solid with a ridge along y at x = z = 0, cut into four."""
+    """A solid with a ridge along y at x = z = 0, in four parts."""
     points, triangles = [], []
     for y in np.linspace(-long, long, 5):
         points += [(-half, y, -height), (half, y, -height), (0, y, 0)]
@@ -46,7 +46,7 @@ def roof(height: float = 0.1, half: float = 0.2, long: float = 0.4) -> wf.TriMes
     refusal=NAMED,
 )  # fmt: skip
 def impact(setting: Setting, value: tuple[str, float]) -> Answer:
-    """A cube at 100 m/s onto a sheet without thickness, ten of its sides a step: it does not get behind."""
+    """A cube at 100 m/s onto a sheet without thickness, ten of its sides a step: no penetration."""
     way, E = value
     shape = sheet()
     if way == "behind":
@@ -69,8 +69,8 @@ FEATURES: dict[str, tuple[Callable[[], wf.TriMesh], Callable[[], np.ndarray]]] =
 
 @case("contact-mesh", GROUP, values=tuple(FEATURES), quick="float64", refusal=SINGLE)
 def features(setting: Setting, which: str) -> Answer:
-    """A turned cube falls at 1 m/s with its vertex or edge on one of a mesh, 40 steps: it stays before the mesh, the
-    change of its momentum is the impulse, and no energy comes from nowhere."""
+    """A turned cube falls at 1 m/s with its vertex or edge on one of a mesh, 40 steps: no penetration, the
+    change of its momentum is the impulse, and no energy is gained."""
     shape, turn = FEATURES[which]
     s = scene(shape(), E=1e6, turn=turn(), place=(0, 0, 5e-4), mu=0.3, restitution=0.5, stiffness=10.0)
     s.builder.set_initial(s.body, velocity=(0, 0, -1.0))
@@ -98,6 +98,6 @@ def exact_touch(setting: Setting, which: str) -> Answer:
     sunk = float(sim.contact_record(s.pads[0]).penetration[0].max()) / SIDE
     shifted = float(np.abs(middle(sim, s)[:2] / SIDE - 0.5).max())
     limits = {"sunk": (sunk, 0.05)}
-    if which != "tip":  # which slides off, as four slopes of 45 degrees and mu = 0.5 let it
+    if which != "tip":  # it slides off, as four slopes of 45 degrees and mu = 0.5 allow
         limits["shifted"] = (shifted, exact(setting, 1e-3, 1e-2))
     return seen.answer(setting, None, exact(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)

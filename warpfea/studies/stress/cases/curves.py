@@ -1,4 +1,4 @@
-"""Beams given as functions: what the builder makes of curves with many turns."""
+"""Beams given as functions: geometry of curves with many turns."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from ..build import STEEL
 from ..case import Answer, Setting, case
 
 RADIUS, PITCH = 0.02, 0.005
-"""Of the helix, m."""
+"""Radius and pitch of the helix, m."""
 PER_TURN = 24
-"""Elements of a turn, 15 degrees each."""
+"""Elements per turn, 15 degrees each."""
 BOUND = 1e-6
-"""Of the angle of a tangent, rad, and of the length of dX/dxi, relative."""
+"""Bounds of the angle of a tangent, rad, and of the length of dX/dxi, relative."""
 
 
 @case("curves", "geometry", values=(10, 100, 160, 1000), quick="float64", dtypes=("float64",))

@@ -1,4 +1,4 @@
-"""Drives that jump, beams twisted past their critical torque."""
+"""Discontinuous drives, beams twisted past their critical torque."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from ..case import Answer, Setting, case
 
 NAMED = ["'crank'", "drive", "inside out"]
 JUMP_STEP = 1e-3
-"""s."""
+"""Step size, s."""
 WITHIN = {"ramp": (2.0, 3.0), "jump": (2.5, 2.500001)}
-"""When the drive turns, in steps: over a whole one, which halving resolves, or at once."""
+"""Duration of the drive's rotation in steps: a whole one, resolved by halving, or at once."""
 SIDE, ELEMENTS = 0.01, 32
-"""Of the twisted beam of 1 m, m."""
+"""Side of the twisted beam of 1 m, m."""
 LAW = wf.SVK(E=1e9, nu=0.3, density=1000.0)
 EI = LAW.E * SIDE**4 / 12.0
 GJ = LAW.lame[1] * wf.Rectangle(SIDE, SIDE).torsion_ratio * wf.Rectangle(SIDE, SIDE).polar
 GREENHILL = 8.98682
-"""Critical torque of a beam with both ends built in, times L / (E I): the first root of 2 (1 - cos m) = m sin m.
+"""Critical torque of a beam with both ends clamped, times L / (E I): the first root of 2 (1 - cos m) = m sin m.
 
-The turned end is free along the axis: where it is held, twisting tightens the beam, by E I_p (theta / L)^2 / 2, so much
-that it never buckles.
+The rotated end is free along the axis: fixed ends would give a tension of E I_p (theta / L)^2 / 2, which prevents
+buckling.
 """
 
 
@@ -34,7 +34,7 @@ that it never buckles.
     values=tuple((body, angle, how) for body in ("beam", "solid") for angle in (0.5, 4.0) for how in WITHIN),
 )  # fmt: skip
 def drive_jump(setting: Setting, value: tuple[str, float, str]) -> Answer:
-    """The drive of a joint turns by 0.5 or 4 rad in a step, evenly or at once: it arrives, or is refused by name."""
+    """The drive of a joint rotates by 0.5 or 4 rad in a step, evenly or at once: solved, or refused by name."""
     kind, angle, how = value
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     law = wf.SVK(E=2e7, nu=0.3, density=1100.0)
@@ -56,11 +56,11 @@ def drive_jump(setting: Setting, value: tuple[str, float, str]) -> Answer:
 
 
 def twisted(setting: Setting, part: float) -> Answer:
-    """A beam with both ends built in, one turned to `part` of the critical torque; any stable equilibrium is right.
+    """A beam with both ends clamped, one rotated to `part` of the critical torque; any stable equilibrium is right.
 
-    Force balance and stability are judged by the same model in float64.
+    Force balance and stability are evaluated with the same model in float64.
     """
-    critical = GREENHILL * EI / GJ  # rad, with the torque G J theta / L
+    critical = GREENHILL * EI / GJ  # rad, for the torque G J theta / L
     b, body = beam(ELEMENTS, SIDE, LAW)
     turn = wf.Rotation(anchor=(1, 0, 0), axis=(1, 0, 0), angle=([0, 1], [0, part * critical]))
     b.drive(body.end, rotation=turn, slots="section")
@@ -90,7 +90,7 @@ def twisted(setting: Setting, part: float) -> Answer:
 
 @case("twist-below", "drives", values=(0.5, 0.9), quick="float64")
 def twist_below(setting: Setting, part: float) -> Answer:
-    """A slender beam twisted to a part of Greenhill's critical torque stays straight."""
+    """A slender beam twisted to a fraction of Greenhill's critical torque stays straight."""
     return twisted(setting, part)
 
 
@@ -99,7 +99,7 @@ def twist_below(setting: Setting, part: float) -> Answer:
     refusal={"float64": ["unstable"], "float32": ["unstable", "float32"]},
 )  # fmt: skip
 def greenhill(setting: Setting, part: float) -> Answer:
-    """The same past the critical torque: refused as unstable, told as such, or found on a stable branch."""
+    """A slender beam past the critical torque: refused as unstable, reported as such, or on a stable branch."""
     return twisted(setting, part)
 
 
@@ -126,7 +126,7 @@ def steel_km(setting: Setting, cells: int) -> Answer:
     "work", "limits", quick="float64", refusal={"float64": ["max_work"], "float32": ["max_work"]}, must=True,
 )  # fmt: skip
 def work(setting: Setting) -> Answer:
-    """A plate of slivers under its weight with little work allowed: refused when that is spent."""
+    """A plate of slivers under its weight with a small work limit: refused once it is spent."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     mesh = wf.mesh.box((1.0, 1.0, 1e-3), cells=(12, 12, 1), element="T4")
     body = b.add_solid(mesh, material=wf.SVK(E=2e11, nu=0.3, density=7800.0), name="slivers")

@@ -18,9 +18,9 @@ SOFT = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
 
 @case("rest-1e6", "Endurance", values=("T4", "3243"))
 def rest(setting: Setting, element: str) -> Answer:
-    """A body that hangs at rest stays where it is over 1e6 steps, 1e5 on a GPU, where a small world is slow.
+    """A hanging body at rest keeps its position over 1e6 steps, 1e5 on a GPU, where a small world is slow.
 
-    In float32 the first 1000 steps settle what the tolerance of statics, 1e-4, has left.
+    In float32 the first 1000 steps damp the residual of statics, tolerance 1e-4.
     """
     steps = 100_000 if "cuda" in setting.device else 1_000_000
     b = wf.ModelBuilder()
@@ -56,7 +56,7 @@ def rest(setting: Setting, element: str) -> Answer:
 
 @case("one-of-4096", "Endurance", values=("nan", "inside-out"), quick="both")
 def one_of_many(setting: Setting, value: str) -> Answer:
-    """One of 4096 worlds (64 on a CPU) cannot step; it is told and frozen, and the others have the bits they had."""
+    """One of 4096 worlds (64 on a CPU) fails: it is reported and frozen, and the others are bitwise unchanged."""
     worlds = 4096 if "cuda" in setting.device else 64
     bad, steps = 7, 5
     b = wf.ModelBuilder()
@@ -106,7 +106,7 @@ NAMED = ("step from t = 0.02 s",)
 @case("nan-load", "Endurance", values=("field", "law"), quick="both", must=True,
       refusal={"float64": NAMED, "float32": NAMED})  # fmt: skip
 def nan_load(setting: Setting, value: str) -> Answer:
-    """A load that is NaN from 25 ms on is refused there, by the time, and the state is that before the step."""
+    """A load that is NaN from 25 ms on is refused then, with the time, and the state is that before the step."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=LAW)
     b.clamp(body.nodes("x-"))

@@ -1,4 +1,4 @@
-"""Bars pressed, pulled and twisted until elements are about to turn inside out."""
+"""Bars compressed, stretched and twisted close to element inversion."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from ..case import Answer, Setting, Skipped, case
 SIZE = (1.0, 0.1, 0.1)
 CELLS = {"T4": (20, 2, 2), "T10": (20, 2, 2), "FN18": (20, 2, 2), "H3843": (20, 1, 1)}
 PULLED = CELLS | {"T10": (10, 1, 1), "FN18": (10, 1, 1)}
-"""Of the neo-Hookean bar pulled to tenfold, which takes minutes with finer ones."""
+"""Cells of the neo-Hookean bar stretched tenfold, which takes minutes with finer ones."""
 SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 NEO_HOOKEAN = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
 REASONS = ["inside out", "unstable there"]
-"""A limit point, past which a bar snaps into a state that is inside out, may be told instead of that state."""
+"""Accepted refusal: a limit point past which a bar snaps into an inverted state."""
 INSIDE_OUT = {"float64": REASONS, "float32": [*REASONS, "float32"]}
 COARSE = {"float32": ["float32"]}
 MOVED = {"squeezed": -0.95, "stretched": 9.0}
 """Travel of the far end along the bar, m."""
 TURNS = 4.0
 BALANCE = {"float64": 1e-6, "float32": 1e-3}
-"""Of the sum of the forces at both ends, over the larger."""
+"""Bound of the sum of the forces at both ends, over the larger."""
 LOWEST_J = 0.35
-"""Of the neo-Hookean bar pulled to tenfold, at integration points."""
+"""Minimum J of the neo-Hookean bar stretched tenfold, at integration points."""
 
 
 def pressed(element: str) -> tuple[wf.ModelBuilder, wf.Body]:
-    """An SVK bar pressed by ten times its modulus, guided along its axis so that it can't buckle or turn over."""
+    """An SVK bar under a pressure of ten times its modulus, guided along its axis to prevent buckling."""
     b, body = bar(element, CELLS[element], SIZE, SVK)
     b.clamp(body.nodes(lambda X: X[:, 0] > -1.0), slots="all", components="yz")
     b.add_traction(body.surface("x+"), (-1e7, 0, 0))
@@ -39,7 +39,7 @@ def pressed(element: str) -> tuple[wf.ModelBuilder, wf.Body]:
 
 
 def forced(element: str, law: wf.SVK | wf.NeoHookean, how: str) -> tuple[wf.ModelBuilder, wf.Body]:
-    """A bar whose ends are held whole, one of them squeezed, stretched or twisted."""
+    """A bar with fully clamped ends, one of them driven: compressed, stretched or twisted."""
     cells = PULLED if law is NEO_HOOKEAN and how == "stretched" else CELLS
     b, body = bar(element, cells[element], SIZE, law)
     slots = BUILT_IN[element]
@@ -53,7 +53,7 @@ def forced(element: str, law: wf.SVK | wf.NeoHookean, how: str) -> tuple[wf.Mode
 
 
 def balance(setting: Setting, element: str, law: wf.SVK | wf.NeoHookean, how: str, low: float = SOUND) -> Answer:
-    """The answer of such a bar: the forces at its ends are opposite, and J >= `low` everywhere."""
+    """Answer of such a bar: the forces at its ends are opposite, and J >= `low` everywhere."""
     b, body = forced(element, law, how)
     found = solve(b, setting, load_steps=40)
     ends = [found.result.reaction(body.nodes(side))[0] for side in ("x-", "x+")]
@@ -66,14 +66,14 @@ def balance(setting: Setting, element: str, law: wf.SVK | wf.NeoHookean, how: st
 
 @case("inverted-traction", "inside out", values=tuple(CELLS), quick="float64", refusal=INSIDE_OUT, must=True)
 def inverted_traction(setting: Setting, element: str) -> Answer:
-    """A guided SVK bar under a pressing traction ten times its modulus, which no admissible state carries."""
+    """A guided SVK bar under a pressing traction ten times its modulus, without an admissible equilibrium."""
     found = solve(pressed(element)[0], setting)
     return found.count.answer(0.0, 0.0, "SVK softens: no state with J > 0", note=f"min J {found.count.min_J:.3g}")
 
 
 @case("inverted-report", "inside out")
 def inverted_report(setting: Setting) -> Answer:
-    """The same with inversion="report": the state is given, and the report says that it is inside out."""
+    """The guided bar with inversion="report": the state is returned, reported as inverted."""
     if "inversion" not in inspect.signature(wf.solve_static).parameters:
         raise Skipped("no option")
     b, body = pressed("T10")
@@ -88,35 +88,35 @@ def inverted_report(setting: Setting) -> Answer:
 
 @case("inverted-squeezed", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
 def inverted_squeezed(setting: Setting, element: str) -> Answer:
-    """An SVK bar squeezed to a twentieth: right with J > 0, or refused."""
+    """An SVK bar compressed to a twentieth: correct with J > 0, or refused."""
     return balance(setting, element, SVK, "squeezed")
 
 
 @case("inverted-stretched", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
 def inverted_stretched(setting: Setting, element: str) -> Answer:
-    """An SVK bar stretched to tenfold: right with J > 0, or refused."""
+    """An SVK bar stretched tenfold: correct with J > 0, or refused."""
     return balance(setting, element, SVK, "stretched")
 
 
 @case("inverted-twisted", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
 def inverted_twisted(setting: Setting, element: str) -> Answer:
-    """An SVK bar twisted by four turns: right with J > 0, or refused."""
+    """An SVK bar twisted by four turns: correct with J > 0, or refused."""
     return balance(setting, element, SVK, "twisted")
 
 
 @case("neo-squeezed", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_squeezed(setting: Setting, element: str) -> Answer:
-    """A neo-Hookean bar squeezed to a twentieth has to be found."""
+    """A neo-Hookean bar compressed to a twentieth: a solution is required."""
     return balance(setting, element, NEO_HOOKEAN, "squeezed")
 
 
 @case("neo-stretched", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_stretched(setting: Setting, element: str) -> Answer:
-    """A neo-Hookean bar stretched to tenfold has to be found, with J >= 0.35 at its points."""
+    """A neo-Hookean bar stretched tenfold: a solution is required, with J >= 0.35 at its points."""
     return balance(setting, element, NEO_HOOKEAN, "stretched", LOWEST_J)
 
 
 @case("neo-twisted", "inside out", values=tuple(CELLS), refusal=COARSE)
 def neo_twisted(setting: Setting, element: str) -> Answer:
-    """A neo-Hookean bar twisted by four turns has to be found."""
+    """A neo-Hookean bar twisted by four turns: a solution is required."""
     return balance(setting, element, NEO_HOOKEAN, "twisted")

@@ -1,4 +1,4 @@
-"""What must not matter: where a body lies, how it is turned, and the unit of its lengths and stresses."""
+"""Invariance to position, orientation, and the units of length and stress."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from ._common import Effort, finalize, off, solve
 TURNS = ((0.3, 0.0, 0.0), (1.2, -2.1, 0.7), (0.0, np.pi, 0.0))
 """Rotation vectors, rad."""
 SIZE = (1.0, 0.1, 0.1)
-"""Of the cantilevers, in the unit of the row."""
+"""Length of the cantilevers, in the unit of the row."""
 
 
 def _cantilever(
     element: str, law: wf.SVK, load: float, turn: Turn, shift: np.ndarray, unit: float = 1.0
 ) -> tuple[wf.ModelBuilder, wf.Body]:
-    """A cantilever of length `unit`, turned about the origin and moved, `load` N across at its end; probe "tip"."""
+    """A cantilever of length `unit`, rotated about the origin and moved, with a transverse tip load `load` N; probe
+    "tip".
+    """
     R = turn.as_matrix()
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     size = unit * np.array(SIZE)
@@ -49,9 +51,9 @@ def _cantilever(
 @case("frame", "Invariance", values=("T10-1e4", "T10-1e6", "H3843-1e6", "3243-1e4", "3243-1e6", "3443-1e6"),
       quick="both")  # fmt: skip
 def frame(setting: Setting, value: str) -> Answer:
-    """A cantilever bent by a third of its length, turned and carried 10 or 1000 km away, deflects as at the origin.
+    """A cantilever bent by a third of its length, rotated and moved by 10 or 1000 km, deflects as at the origin.
 
-    In float32 up to what rounding leaves by the report of either solution.
+    In float32 up to the round-off estimates of both reports.
     """
     element, away = value.split("-")
     law = wf.SVK(E=1e9, nu=0.3)
@@ -72,7 +74,7 @@ def frame(setting: Setting, value: str) -> Answer:
 
 @case("units", "Invariance", values=("mm", "km"), quick="both")
 def units(setting: Setting, value: str) -> Answer:
-    """A cantilever measured in mm and N, and in km and N, deflects by the same part of its length as in m."""
+    """A cantilever measured in mm and N, and in km and N, has the same relative deflection as in m."""
     unit = {"mm": 1e3, "km": 1e-3}[value]
     effort = Effort()
     worst = 0.0
@@ -94,7 +96,7 @@ MODULI = ("1e3", "1e6", "1e9", "1e12")
 
 @case("stiffness-static", "Invariance", values=MODULI, quick="both")
 def stiffness_static(setting: Setting, value: str) -> Answer:
-    """A fixed small load: deflection times E is the same for E from 1 kPa to 1 TPa."""
+    """A fixed small load: deflection times E is equal for E from 1 kPa to 1 TPa."""
     load = 1e-6 * 1e3 * SIZE[1] ** 4 / 12.0
     effort = Effort()
     worst = 0.0
@@ -117,7 +119,7 @@ def stiffness_dynamic(setting: Setting, value: str) -> Answer:
     for element in ("T10", "3243"):
         law = wf.SVK(E=E, nu=0.3, density=1000.0)
         exact = _linear_steps(*_cantilever(element, law, 1.0, Turn.identity(), np.zeros(3)), h, steps)
-        load = 1e-7 / float(np.abs(exact).max())  # second order: strains of 1e-7 or so
+        load = 1e-7 / float(np.abs(exact).max())  # second-order terms: strains of about 1e-7
         b, _ = _cantilever(element, law, load, Turn.identity(), np.zeros(3))
         tol = None if setting.single else 1e-10
         sim = wf.Simulation(finalize(b, setting), dt=h, solver=wf.NewtonPCG(tol=tol))
@@ -127,7 +129,7 @@ def stiffness_dynamic(setting: Setting, value: str) -> Answer:
 
 
 def _linear_steps(b: wf.ModelBuilder, body: wf.Body, h: float, steps: int) -> np.ndarray:
-    """Slots' displacements (slots, 3) after steps of backward Euler with the matrices at rest, in float64."""
+    """Slots' displacements (slots, 3) after steps of backward Euler with constant matrices, in float64."""
     model = b.finalize(device="cpu")
     free = np.flatnonzero(model.free_slots.ravel())
     M, K = (A[free][:, free].toarray() for A in (model.mass_matrix(), model.tangent_matrix(model.state())))

@@ -14,9 +14,9 @@ from ._common import Effort, X, Y, Z, finalize
 
 G = 9.81
 SIDE, LINK = 0.05, 0.5
-"""Of a link, m."""
+"""Length of a link, m."""
 LIGHT, RATIO = 10.0, 1e6
-"""Density of the light links, kg/m^3, and how many times as heavy the others are."""
+"""Density of the light links, kg/m^3, and the mass ratio of the others."""
 
 
 def _tol(setting: Setting) -> float:
@@ -61,7 +61,7 @@ def _pendulum(masses: Any, angle: float, times: np.ndarray) -> np.ndarray:
 @case("mass-ratio", "Joints", values=("light-heavy", "heavy-light"), quick="both",
       refusal={"float32": ("float32 can't hold this case",)})  # fmt: skip
 def mass_ratio(setting: Setting, value: str) -> Answer:
-    """Double pendulum whose links' masses are as 1 to 1e6, from 45 degrees for 1 s, against rigid links."""
+    """Double pendulum with link masses 1 : 1e6, from 45 degrees for 1 s, against rigid links."""
     densities = [LIGHT * (RATIO if word == "heavy" else 1.0) for word in value.split("-")]
     angle, h = np.pi / 4, 1e-3
     along = np.array([np.sin(angle), 0.0, -np.cos(angle)])
@@ -85,21 +85,21 @@ def mass_ratio(setting: Setting, value: str) -> Answer:
 
 @case("mass-ratio-chain", "Joints", values=("fixed", "revolute"), quick="both")
 def mass_ratio_chain(setting: Setting, kind: str) -> Answer:
-    """Six links that hang at rest, light and 1e6 times as heavy in turn: force of every joint against the weight."""
+    """Six hanging links at rest, alternately light and 1e6 times as heavy: force of every joint against the weight."""
     densities = [LIGHT, RATIO * LIGHT] * 3
     return _hanging(setting, kind, densities, 0.0)
 
 
 @case("chain-1e3", "Joints", values=("fixed", "revolute"), quick="both")
 def chain(setting: Setting, kind: str) -> Answer:
-    """Ten links that hang at rest with a load of 1000 times a link's weight at their end."""
+    """Ten hanging links at rest with a load of 1000 times a link's weight at their end."""
     return _hanging(setting, kind, [1000.0] * 10, 1000.0)
 
 
 def _hanging(setting: Setting, kind: str, densities: list[float], load: float) -> Answer:
     """Joint forces of a chain at rest over the weight below, `load` in weights of the first link hung from its end.
 
-    Statics where the joints leave nothing free, else 100 steps of 10 ms of backward Euler, which settle it.
+    Statics if the joints leave no free mode, else 100 damping steps of 10 ms of backward Euler.
     """
     b = wf.ModelBuilder(gravity=(0, 0, -G))
     bodies, joints = _links(b, kind, densities, -np.array(Z), X, 2e11)
@@ -122,12 +122,12 @@ def _hanging(setting: Setting, kind: str, densities: list[float], load: float) -
 
 @case("joints", "Joints", values=("redundant", "dead-point"), quick="both")
 def joints(setting: Setting, value: str) -> Answer:
-    """A door on two hinges in one place; a parallelogram driven through its dead points."""
+    """A door on two coincident hinges; a parallelogram driven through its dead points."""
     return _redundant(setting) if value == "redundant" else _dead_point(setting)
 
 
 def _redundant(setting: Setting) -> Answer:
-    """The sum of the hinges' forces on a door that hangs down at rest, against its weight."""
+    """Sum of the hinges' forces on a hanging door at rest, against its weight."""
     b = wf.ModelBuilder(gravity=(0, 0, -G))
     mesh = wf.mesh.box((0.4, 0.04, 0.8), cells=(2, 1, 4), origin=(-0.2, -0.02, -0.8))
     door = b.add_solid(mesh, material=wf.SVK(E=1e9, nu=0.3, density=600.0))
@@ -144,8 +144,9 @@ def _redundant(setting: Setting) -> Answer:
 
 
 def _dead_point(setting: Setting) -> Answer:
-    """A full turn of the crank, at 1 turn/s: at 0 and 180 degrees all pins lie on a line, and the follower may go on
-    either way. Judged is that cranks and coupler keep their lengths, and that the crank is where it is driven to."""
+    """A full turn of the crank, at 1 turn/s: at 0 and 180 degrees all pins are collinear, and the follower may go
+    either way. Criteria: lengths of cranks and coupler, and prescribed angle of the crank.
+    """
     crank, coupler, h = 0.2, 0.5, 2e-3
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     law = wf.SVK(E=2e11, nu=0.3, density=7800.0)
@@ -190,7 +191,7 @@ REFUSED = ("constraints could not be satisfied",)
 
 @case("joints-conflicting", "Joints", quick="both", must=True, refusal={"float64": REFUSED, "float32": REFUSED})
 def joints_conflicting(setting: Setting) -> Answer:
-    """One point pinned to two places is refused by the names of the pins."""
+    """One point pinned to two positions is refused with the names of the pins."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(1, 1, 1)), material=wf.SVK(E=1e7, nu=0.3, density=1000.0))
     b.clamp(body.nodes("x-"))

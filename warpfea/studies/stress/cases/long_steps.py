@@ -1,4 +1,4 @@
-"""Steps from 1e-8 to 1e6 s: a long step of backward Euler is a static solution, and no harder than one."""
+"""Steps from 1e-8 to 1e6 s: a long step of backward Euler is a static solution, at the same effort."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from ..case import Answer, Setting, case
 
 SIZE, CELLS = (1.0, 0.1, 0.1), (10, 1, 1)
 STEPS = tuple(10.0**k for k in range(-8, 7))
-"""h, s."""
+"""Step sizes h, s."""
 SOFT = wf.SVK(E=5.74e7, nu=0.3, density=7800.0)
-"""Sags by 20 % of its length."""
+"""Loads with a sag of 20 % of the length."""
 NEWTON = 15
-"""Most iterations of a step of a body that sags by less than a hundredth of its length."""
+"""Maximum iterations of a step with a sag below a hundredth of the length."""
 LONG = 1e3
-"""Steps from here on, s, are static solutions: inertia is 1e-12 of the stiffness."""
+"""Step size, s, above which a step is a static solution: inertia is 1e-12 of the stiffness."""
 BOUNDS = {"float64": 1e-6, "float32": 6e-3}
 LINEAR = 2e-4
-"""What a linear solution may leave out at a sag of 6e-5 of the length."""
+"""Tolerance for nonlinear terms at a sag of 6e-5 of the length."""
 EDGE = 10.0
 FALLING = {"rubber": wf.SVK(E=1e6, nu=0.3, density=1000.0), "steel": STEEL}
 
@@ -60,7 +60,7 @@ def linear_tip(h: float, device: str) -> np.ndarray:
 
 
 def moved(law: wf.SVK, h: float, setting: Setting, tol: float | None = None) -> tuple[np.ndarray, Count]:
-    """Displacement of the tip (3,), m, after three steps of h from the straight state at rest."""
+    """Displacement of the tip (3,), m, after three steps h from the straight state at rest."""
     sim = wf.Simulation(
         clamped(law)[0].finalize(device=setting.device, dtype=setting.dtype), dt=h,
         solver=wf.NewtonPCG(tol=tol, max_pcg=20000),
@@ -71,7 +71,7 @@ def moved(law: wf.SVK, h: float, setting: Setting, tol: float | None = None) -> 
 
 @case("long-steps", "long steps", values=STEPS, quick="float64")
 def long_steps(setting: Setting, h: float) -> Answer:
-    """A clamped steel bar under its weight from rest, three steps: a linear problem, whatever the step."""
+    """A clamped steel bar under its weight from rest, three steps: a linear problem for any step size."""
     tip, count = moved(STEEL, h, setting)
     reference, source, bound = linear_tip(h, setting.device), "linear backward Euler, factorised", LINEAR
     if h >= LONG:
@@ -83,7 +83,7 @@ def long_steps(setting: Setting, h: float) -> Answer:
 
 @case("long-stay", "long steps", values=STEPS, quick="float64")
 def long_stay(setting: Setting, h: float) -> Answer:
-    """The same from its static equilibrium, where it stays."""
+    """The bar from its static equilibrium, which it keeps."""
     b, _ = clamped(STEEL)
     model = b.finalize(device=setting.device, dtype=setting.dtype)
     state = wf.solve_static(model, load_steps=1).state
@@ -103,7 +103,7 @@ def tip_of(model: wf.Model, state: wf.State) -> np.ndarray:
 
 @case("long-soft", "long steps", values=STEPS, quick="float64")
 def long_soft(setting: Setting, h: float) -> Answer:
-    """A bar that sags by a fifth of its length from rest: no step is harder than the static solution at once."""
+    """A bar that sags by a fifth of its length from rest: no step is harder than a single static solution."""
     tip, count = moved(SOFT, h, setting)
     at_once = solve(clamped(SOFT)[0], setting, load_steps=1).count.newton
     if h >= LONG:

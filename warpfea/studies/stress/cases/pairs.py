@@ -1,7 +1,7 @@
 """Contact between bodies: fast impacts, stiff on soft, vertices, edges and faces, exact touch, thin bodies, extremes.
 
-Criteria hold for both bodies: the change of the momentum of each is the impulse of the records and of its weight, in
-every step; friction is at most mu N; no energy comes from nowhere; no centre of mass gets past the other body.
+Criteria for both bodies: in every step the change of momentum equals the impulse of the recorded forces and the
+weight; friction is at most mu N; no energy is gained; no centre of mass passes the other body.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Pair:
     """A body on another one.
 
     Attributes:
-        builder: what they are in.
+        builder: their builder.
         upper, lower: the first and the second body of the contact.
         pad: the contact.
         held: the lower one is clamped.
@@ -44,7 +44,7 @@ class Pair:
     held: bool
 
     def model(self, setting: Setting) -> wf.Model:
-        """For the setting's device and precision."""
+        """Model for the setting's device and precision."""
         return self.builder.finalize(device=setting.device, dtype=setting.dtype)
 
 
@@ -78,11 +78,12 @@ def pair(
 
 
 class WatchedPair(Watched):
-    """What a motion of two bodies has shown: pulled where contact is level; through is how far the centre of the upper
-    body came below that of the lower one, over the side."""
+    """Results of a motion of two bodies: pulled for level contact; through: depth of the upper centre of mass below
+    that of the lower one, over the side.
+    """
 
     def limits(self, setting: Setting) -> dict[str, tuple[float, float]]:
-        """Numbers of any contact, and what they may be."""
+        """Numbers common to contacts, and their bounds."""
         return super().limits(setting) | {
             "friction above mu N": (self.pulled, 1e-2),
             "centre past the other body": (self.through, 0.0),
@@ -97,7 +98,7 @@ def center(sim: wf.Simulation, body: wf.Body) -> np.ndarray:
 
 
 def watch(sim: wf.Simulation, s: Pair, steps: int, *, mu: float | None = None) -> WatchedPair:
-    """Do steps; `mu`: friction is in the plane z = 0, and compared."""
+    """Do steps; `mu`: friction in the plane z = 0 is compared."""
     out = WatchedPair(Count())
     bodies = [(s.upper, 1.0)] + ([] if s.held else [(s.lower, -1.0)])
     gravity = np.asarray(s.builder.gravity, dtype=float)
@@ -126,7 +127,7 @@ def watch(sim: wf.Simulation, s: Pair, steps: int, *, mu: float | None = None) -
 @case("pairs-impact", GROUP, values=tuple((E, h) for E in (1e6, 1e8, 1e10) for h in (1e-3, 1e-2)), quick="none",
       refusal=NAMED)  # fmt: skip
 def impact(setting: Setting, value: tuple[float, float]) -> Answer:
-    """A cube at 100 m/s onto a free plate a tenth as thick, up to ten sides a step: it does not get behind."""
+    """A cube at 100 m/s onto a free plate a tenth as thick, up to ten sides a step: no penetration."""
     E, h = value
     s = pair(E=(E, E), gravity=(0, 0, 0), place=(0, 0, 0.3), thickness=0.01, held=False, mu=0.3, restitution=0.5)
     s.builder.set_initial(s.upper, velocity=(0, 0, -FAST))
@@ -136,7 +137,7 @@ def impact(setting: Setting, value: tuple[float, float]) -> Answer:
 
 @case("pairs-shell", GROUP, values=(1.0, 20.0, 100.0), quick="none", refusal=NAMED)
 def thin_shell(setting: Setting, speed: float) -> Answer:
-    """A cube hits a shell of a hundredth of its side at 1 to 100 m/s, h = 1 ms: it does not get behind."""
+    """A cube hits a shell of a hundredth of its side at 1 to 100 m/s, h = 1 ms: no penetration."""
     s = pair(
         E=(1e6, 1e8),
         gravity=(0, 0, 0),
@@ -169,7 +170,7 @@ TURNS: dict[str, Any] = {"face": None, "edge": edge_down(), "vertex": corner_dow
 
 @case("pairs-meet", GROUP, values=tuple((name, at) for name in TURNS for at in ("middle", "border")), quick="both")
 def meet(setting: Setting, value: tuple[str, str]) -> Answer:
-    """A face, an edge or a vertex lands at 1 m/s on a facet's middle, or where facets meet; 40 steps of 1 ms."""
+    """A face, an edge or a vertex lands at 1 m/s on a facet's centre, or on a facet border; 40 steps of 1 ms."""
     name, at = value
     spot = 0.02 if at == "middle" else 0.05
     s = pair(turn=TURNS[name], place=(spot, spot, 0.005), mu=0.3, restitution=0.5, across=3)
@@ -180,7 +181,7 @@ def meet(setting: Setting, value: tuple[str, str]) -> Answer:
 
 @case("pairs-touch", GROUP, values=("plate", "same faces"), quick="both", refusal=SINGLE)
 def exact_touch(setting: Setting, name: str) -> Answer:
-    """A cube that begins in exact touch with a plate, or face on face with a cube of its own, under its weight."""
+    """A cube in initial exact touch with a plate, or face on face with a cube of its own, under its weight."""
     same: dict[str, Any] = {"width": SIDE, "across": 2} if name == "same faces" else {}
     s = pair(mu=0.5, restitution=0.5, **same)
     seen = watch(wf.Simulation(s.model(setting), dt=1e-3), s, 50, mu=0.5)
@@ -189,7 +190,7 @@ def exact_touch(setting: Setting, name: str) -> Answer:
 
 @case("pairs-rest", GROUP, values=(1e-3, 1.0, 1e3), quick="float64", refusal=SINGLE)
 def mass_ratio(setting: Setting, ratio: float) -> Answer:
-    """Statics: a cube a thousand times lighter or heavier than its plate rests on it, and weighs what it weighs."""
+    """Statics: a cube 1e3 times lighter or heavier than its plate rests on it; the force is its weight."""
     E = max(1e7, 1e4 * ratio * DENSITY)
     s = pair(E=(E, E), density=(ratio * DENSITY, DENSITY), mu=0.5)
     count = Count()

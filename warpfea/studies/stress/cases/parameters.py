@@ -1,4 +1,4 @@
-"""Parameters that are set in a model of one world, each against a closed form of its value."""
+"""Parameters set in a model of one world, each against a closed form."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ..case import Answer, Setting, case
 from ._common import Effort, finalize
 
 SIZE = (0.5, 0.1, 0.1)
-"""Of the bar, m."""
+"""Size of the bar, m."""
 BUILT: dict[str, float] = {"E": 1e6, "nu": 0.3, "eta": 10.0, "density": 1000.0}
-"""What the model is built with, and in `SET` what it is set to."""
+"""Values as built, and in `SET` as set."""
 SET: dict[str, float] = {"E": 3e6, "nu": 0.1, "eta": 250.0, "density": 7000.0, "mu": 0.05}
 G = 9.81
 
@@ -77,7 +77,7 @@ def _pushed(setting: Setting, integrator: str, effort: Effort) -> float:
 
 
 def _slid(setting: Setting, effort: Effort) -> float:
-    """Speed v - mu g t of a block that slides."""
+    """Speed v - mu g t of a sliding block."""
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -G))
     law = wf.SVK(E=1e6, nu=0.3, density=1000.0, damping=wf.KelvinVoigt(eta=1e3))
     block = b.add_solid(wf.mesh.box((0.1, 0.1, 0.05), cells=(1, 1, 1)), material=law, name="body")
@@ -102,7 +102,7 @@ SCHEMES = ("backward_euler", "bdf2", "energy_momentum", "generalized_alpha")
 @case("one-world-parameter", "Parameters", values=("E", "nu", "eta", "mu", *(f"density-{s}" for s in SCHEMES)),
       quick="both")  # fmt: skip
 def one_world_parameter(setting: Setting, value: str) -> Answer:
-    """A parameter set in a model of one world: elongation, contraction, damping, sliding, momentum and mass have it."""
+    """A parameter set in a model of one world: elongation, contraction, damping, sliding, momentum and mass follow."""
     effort = Effort()
     name, _, scheme = value.partition("-")
     if name == "density":

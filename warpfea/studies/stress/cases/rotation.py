@@ -1,4 +1,4 @@
-"""Free bodies that spin: against Euler's equations, and against what the scheme does to a rigid rotor."""
+"""Free spinning bodies, against Euler's equations and the scheme's action on a rigid rotor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BOX = np.array([0.3, 0.2, 0.1])
 
 
 def _box(setting: Setting, spin: Any, E: float) -> tuple[wf.Model, wf.Body]:
-    """A stiff free box about the origin that turns at `spin`, rad/s; probes "y+" and "y-"."""
+    """A stiff free box about the origin with angular velocity `spin`, rad/s; probes "y+" and "y-"."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     law = wf.SVK(E=E, nu=0.3, density=1000.0)
     body = b.add_solid(wf.mesh.box(tuple(BOX), cells=(1, 1, 1), origin=-BOX / 2), material=law)
@@ -29,9 +29,9 @@ def _box(setting: Setting, spin: Any, E: float) -> tuple[wf.Model, wf.Body]:
 
 @case("dzhanibekov", "Rotation", quick="float64")
 def dzhanibekov(setting: Setting) -> Answer:
-    """A box thrown about its intermediate axis turns over; 3 s of BDF2 with steps of 1 ms, 3 turns of the box.
+    """A box spinning about its intermediate axis turns over; 3 s of BDF2 with steps of 1 ms, 3 turns of the box.
 
-    Judged is the direction of that axis, which begins 1 % off.
+    Criterion: direction of that axis, initially 1 % off.
     """
     spin = 2.0 * np.pi * np.array([0.01, 1.0, 0.01])
     seconds, h = 3.0, 1e-3
@@ -59,9 +59,10 @@ def dzhanibekov(setting: Setting) -> Answer:
 
 @case("spin", "Rotation", values=("backward_euler", "bdf2"), quick="both")
 def spin(setting: Setting, integrator: str) -> Answer:
-    """A stiff box spins 100 steps at omega h = 0.05: angular momentum and energy as the scheme leaves a rigid rotor.
+    """A stiff box spins 100 steps at omega h = 0.05: angular momentum and energy as for a rigid rotor under the
+    scheme.
 
-    The scheme moves a point of a rigid rotor to where it would go freely, drawn back onto its circle.
+    The scheme moves a point of a rigid rotor to its free position, projected radially onto its circle.
     """
     omega, h, steps = 10.0, 5e-3, 100
     model, body = _box(setting, (0.0, 0.0, omega), 1e8 if setting.single else 1e10)
@@ -79,7 +80,7 @@ def spin(setting: Setting, integrator: str) -> Answer:
     effort.step(sim, steps)
     linear, angular = momenta()
     L, T = _rotor(omega, h, steps, integrator == "bdf2")
-    # judged by what is lost, of which the box's own stretch, rho (omega L)^2 / E, is a part
+    # criterion: the loss, of which the box's own stretch, rho (omega L)^2 / E, is a part
     lost = abs((start - angular[2]) - start * (1.0 - L)) / (start * (1.0 - L))
     e = {name: float(value[0]) for name, value in sim.energies().items()}
     energy = abs(e["kinetic"] / kinetic - T) / (1.0 - T)
@@ -95,7 +96,7 @@ def spin(setting: Setting, integrator: str) -> Answer:
 
 
 def _rotor(omega: float, h: float, steps: int, second: bool) -> tuple[float, float]:
-    """Angular momentum and energy of a point on the unit circle after steps of the scheme, over those at the start."""
+    """Angular momentum and energy of a point on the unit circle after steps of the scheme, over the initial ones."""
     x, v = [np.array([1.0, 0.0])], [np.array([0.0, omega])]
     for n in range(steps):
         beta, x_free, v_free = 1.0, x[-1], v[-1]
@@ -114,11 +115,11 @@ SCHEMES = (
     "energy_momentum(rho_inf=0.8)",
 )  # fmt: skip
 GROWN = {dtype: ("has added",) for dtype in ("float64", "float32")}
-"""How a scheme that adds energy is refused."""
+"""Error texts for a scheme that adds energy."""
 GROWTH = 0.1
-"""Part of its energy that a rotating body may gain before it has to be refused."""
+"""Relative energy gain of a rotating body above which the scheme must be refused."""
 SPIN = np.array([1.0, 2.0, 10.0])
-"""rad/s."""
+"""Angular velocity, rad/s."""
 
 
 def _turning(setting: Setting, body: str, E: float) -> wf.Model:
@@ -137,7 +138,7 @@ def _turning(setting: Setting, body: str, E: float) -> wf.Model:
 
 
 def _energy(setting: Setting, body: str, scheme: str, turn: float, E: float, steps: int) -> Answer:
-    """Largest growth of the energy in so many steps of `turn` radians; energy_momentum's own bounds are tight."""
+    """Largest energy growth over steps of `turn` radians; energy_momentum has its own tighter bounds."""
     model = _turning(setting, body, E)
     sim = wf.Simulation(model, dt=turn / float(np.linalg.norm(SPIN)), integrator=scheme)
     M = model.mass_matrix()[::3, ::3]
@@ -175,7 +176,7 @@ def _energy(setting: Setting, body: str, scheme: str, turn: float, E: float, ste
     ("generalized_alpha", 0.2, 1e9), ("energy_momentum", 0.2, 1e9), ("energy_momentum(rho_inf=0.8)", 0.2, 1e7),
     ("energy_momentum(rho_inf=0.8)", 0.2, 1e9)))  # fmt: skip
 def turning(setting: Setting, value: tuple[str, float, float]) -> Answer:
-    """A free bar spins 300 steps of so many radians with E in Pa: energy does not grow, or the scheme is refused."""
+    """A free bar spins 300 steps of `turn` radians with E in Pa: energy does not grow, or the scheme is refused."""
     return _energy(setting, "free", *value, steps=300)
 
 
@@ -183,5 +184,7 @@ def turning(setting: Setting, value: tuple[str, float, float]) -> Answer:
     (body, scheme, turn, E) for body in ("free", "rotor") for scheme in SCHEMES for turn in (0.1, 0.3, 0.6)
     for E in (1e7, 1e9, 2e11)])  # fmt: skip
 def turning_all(setting: Setting, value: tuple[str, str, float, float]) -> Answer:
-    """The same of a free bar and a rotor on a joint, with every scheme, 100 steps."""
+    """A free bar and a rotor on a joint, with every scheme, 100 steps: energy does not grow, or the scheme is
+    refused.
+    """
     return _energy(setting, *value, steps=100)

@@ -1,4 +1,4 @@
-"""Patch tests on tetrahedra ten thousand times as long as they are high."""
+"""Patch tests on tetrahedra of aspect ratio 1e4."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _mesh(element: str) -> Any:
 def slivers(setting: Setting, element: str) -> Answer:
     """The boundary of a cube with a layer of slivers, aspect 1e4, is moved affinely; inner nodes start off their place.
 
-    They are off by a third of a sliver's height, gradients by 0.03. Stress is judged as a part of the exact one.
+    The offset is a third of a sliver's height, 0.03 for gradients. Criterion: relative stress error.
     """
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(_mesh(element), element=element, material=LAW)

@@ -13,12 +13,12 @@ from ..case import Answer, Setting, case
 from ._common import Effort, Y, Z, finalize
 
 SPAN, RISE, SIDE, E = 1.0, 0.1, 0.1, 1e7
-"""Of a truss of two bars: half its span, rise and side of the bars, m; modulus, Pa."""
+"""Half span, rise and side of the bars of the two-bar truss, m; modulus, Pa."""
 LENGTH = float(np.hypot(SPAN, RISE))
 
 
 def _load(height: float) -> float:
-    """The downward load, N, that holds the apex at a height, bars of SVK without Poisson's effect."""
+    """Downward load, N, in equilibrium with the apex at a height; SVK bars without Poisson's effect."""
     strain = (height**2 - RISE**2) / (2.0 * LENGTH**2)
     return -2.0 * E * SIDE**2 * strain * height / LENGTH
 
@@ -56,7 +56,7 @@ def _truss(setting: Setting, element: str, load: float) -> wf.Model:
 @case("snap-through", "Stability", values=("3243-dynamic", "T10-dynamic", "3243-static", "T10-static"), quick="both",
       refusal={"float64": ("was not accepted",), "float32": ("was not accepted",)})  # fmt: skip
 def snap_through(setting: Setting, value: str) -> Answer:
-    """A shallow truss of two bars under 1.2 times its snap load comes to rest hanging, where the closed form has it.
+    """A shallow truss of two bars under 1.2 times its snap load comes to rest hanging, at the closed-form position.
 
     Statics under the load may refuse, or find the same state.
     """
@@ -78,10 +78,10 @@ def snap_through(setting: Setting, value: str) -> Answer:
 
 @case("lateral-buckling", "Stability", values=("0.97", "1.03"), quick="float64", refusal={"float32": ("float32",)})
 def lateral_buckling(setting: Setting, value: str) -> Answer:
-    """A strip on edge, 1 x 0.04 x 0.004 m, under 0.97 and 1.03 of the load that buckles it sideways.
+    """A strip on edge, 1 x 0.04 x 0.004 m, under 0.97 and 1.03 of its lateral buckling load.
 
-    4.013 sqrt(E I G J) / L^2, and 1.3 % more because the strip bends before it buckles. With a ten-thousandth of the
-    load across it, the end is to move less than 0.01 L below, and more than 0.1 L above.
+    4.013 sqrt(E I G J) / L^2, plus 1.3 % for bending before buckling. With a transverse load of 1e-4 of it the end
+    must move less than 0.01 L below, more than 0.1 L above.
     """
     L, t, h, modulus, nu = 1.0, 0.004, 0.04, 1e9, 0.3
     EI, EI_strong = modulus * h * t**3 / 12.0, modulus * t * h**3 / 12.0

@@ -1,4 +1,4 @@
-"""Starts that no motion leads to: inside out, flat, in one point, scrambled."""
+"""Inadmissible initial states: inverted, flat, collapsed to a point, scrambled."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ SOLIDS = ("T4", "T10", "ENMC", "FN18", "H3843")
 ROWS = [f"{e}-{law}" for e in SOLIDS for law in ("svk", "neo")] + ["3243-svk", "3443-svk"]
 
 NAMED = ("worst element", "J <= 0")
-"""A refusal names the element."""
+"""Texts of refusals, which name the element."""
 
 
 def _body(b: wf.ModelBuilder, element: str, law: str) -> wf.Body:
-    """A body 1 m long along x, held at x = 0."""
+    """A body 1 m long along x, clamped at x = 0."""
     material = (wf.SVK if law == "svk" else wf.NeoHookean).from_E_nu(E=MODULUS, nu=0.3, density=1000.0)
     if element == "3243":
         body = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=4, section=wf.Rectangle(0.1, 0.1), normal=Z,
@@ -37,7 +37,7 @@ def _body(b: wf.ModelBuilder, element: str, law: str) -> wf.Body:
 
 
 def _starts(kind: str, body: wf.Body) -> np.ndarray:
-    """Slot values (slots, 3) of a start, positions from the body's middle."""
+    """Slot values (slots, 3) of an initial state, positions relative to the body's centre."""
     E = body.reference
     if kind == "inverted":
         return E * (-1.0, 1.0, 1.0)
@@ -46,13 +46,13 @@ def _starts(kind: str, body: wf.Body) -> np.ndarray:
     if kind == "collapsed":
         return 0.0 * E
     size = np.where(body.slot_kind == 0, 0.05, 0.3)[:, None]
-    if body.materials[0][1].law != "svk":  # no point inside out
+    if body.materials[0][1].law != "svk":  # no inverted point
         size = 0.06 * size
     return E + size * np.random.default_rng(0).standard_normal(E.shape)
 
 
 def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
-    """Let a start go without load; how far the end is from rest, over the length."""
+    """Release an initial state without load; distance of the end from rest, over the length."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = _body(b, *value.split("-"))
     model = finalize(b, setting)
@@ -61,10 +61,10 @@ def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
     state.displacement.assign(u[None].astype(state.displacement.numpy().dtype))
     effort = Effort()
     bound = 1e-4 if setting.single else 1e-6
-    # rest is stress-free: its forces have no scale but rounding in those of a strain of 1
+    # the rest state is stress-free: the force scale is round-off of the forces at a strain of 1
     area = {"3243": 0.01, "3443": 0.025}.get(body.family.name, 0.16)
     solver = wf.NewtonPCG(max_newton=200, max_pcg=20000, force_tol=(2e-7 if setting.single else 1e-12) * MODULUS * area)
-    if damped:  # omega h > 6 for the slowest mode: a step of backward Euler leaves less than a sixth of anything
+    if damped:  # omega h > 6 for the slowest mode: a step of backward Euler leaves less than a sixth of any mode
         h = 4.0 if body.family.name in ("3243", "3443") else 0.5
         sim = wf.Simulation(model, state, dt=h, solver=solver)
         effort.step(sim, 30)
@@ -80,7 +80,7 @@ def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
 
 
 def _add(kind: str, what: str) -> None:
-    """The cases of a kind of start: by statics, and by steps of backward Euler that are longer than its periods."""
+    """Cases of a kind of initial state: by statics, and by steps of backward Euler longer than its periods."""
     refusal: dict[str, Sequence[str]] = {"float64": NAMED, "float32": NAMED}
     for damped, way in ((False, "statics"), (True, "damped steps")):
 

@@ -1,4 +1,4 @@
-"""A soft arm on a steel block under 1e9 Pa: forces that must not hide behind 1e7 times larger ones."""
+"""A soft arm on a steel block under 1e9 Pa: small forces beside 1e7 times larger ones."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ..case import Answer, Setting, case
 
 SOFT, HARD = wf.SVK(E=2e5, nu=0.3, density=1000.0), wf.SVK(E=2.1e11, nu=0.3, density=7850.0)
 STRESS = 1e9
-"""Tension of the block across the arm, Pa; nothing of it reaches the arm but the block's contraction."""
+"""Tension of the block across the arm, Pa; it reaches the arm only by the block's contraction."""
 LENGTH, SIDE, G = 0.4, 0.04, 0.25
-"""Of the arm, m, and what it sags under, m/s^2."""
+"""Size of the arm, m, and its gravity, m/s^2."""
 STEPS, H = 300, 0.05
-"""Of backward Euler, which settles the arm: 0.8 % of its first swing is left."""
+"""Step of backward Euler, which damps the arm: 0.8 % of its first swing remains."""
 BOUNDS = {"float64": 1e-6, "float32": 1e-2}
 KINDS = ("joint", "weld", "materials", "slender")
 SAME = "the same in float64, tol 1e-10"
@@ -55,13 +55,13 @@ def pair(kind: str) -> wf.ModelBuilder:
 
 
 def sag() -> float:
-    """Of the soft arm's tip by Timoshenko's theory, m."""
+    """Deflection of the soft arm's tip by Timoshenko's theory, m."""
     weight = SOFT.density * G  # N/m^3
     return weight * (1.5 * LENGTH**4 / SIDE**2 + 1.2 * (1.0 + SOFT.nu) * LENGTH**2) / SOFT.E
 
 
 def bends(kind: str, motion: bool, device: str, dtype: str, tol: float | None) -> tuple[np.ndarray, Count]:
-    """Displacement of the tip over that of the root, (steps, 3), m."""
+    """Displacement of the tip relative to the root, (steps, 3), m."""
     model, count = pair(kind).finalize(device=device, dtype=dtype), Count()
     if motion:
         sim = wf.Simulation(model, dt=H, solver=wf.NewtonPCG(tol=tol))
@@ -74,16 +74,16 @@ def bends(kind: str, motion: bool, device: str, dtype: str, tol: float | None) -
 
 @functools.cache
 def refined(kind: str, motion: bool, device: str) -> np.ndarray:
-    """The same by a refined solution in float64."""
+    """The displacement by a refined solution in float64."""
     return bends(kind, motion, device, "float64", REFINED)[0]
 
 
 def judged(setting: Setting, kind: str, motion: bool) -> Answer:
-    """The bend against float64, and the settled one against theory."""
+    """Answer: bend against float64, and the final one against theory."""
     way, count = bends(kind, motion, setting.device, setting.dtype, None)
     error = off(way, refined(kind, motion, setting.device))
     limits = {}
-    if kind != "slender":  # a strip of steel bends by less than what its uneven root turns
+    if kind != "slender":  # a strip of steel bends by less than the rotation of its uneven root
         limits = {"off Timoshenko": (abs(way[-1, 2] / -sag() - 1.0), 0.05)}
     return count.answer(error, BOUNDS[setting.dtype], SAME, limits=limits)
 
@@ -96,5 +96,5 @@ def statics(setting: Setting, value: str) -> Answer:
 
 @case("stiff-beside-soft-motion", "Stiff beside soft", values=KINDS, quick="none", refusal={"float32": ["float32"]})
 def motion(setting: Setting, value: str) -> Answer:
-    """The same let go, 300 steps of backward Euler of 50 ms."""
+    """The arm released, 300 steps of backward Euler of 50 ms."""
     return judged(setting, value, True)

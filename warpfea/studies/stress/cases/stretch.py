@@ -1,4 +1,4 @@
-"""Homogeneous stretch far beyond what linear theory knows."""
+"""Homogeneous stretch far beyond linear theory."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def _free_sides(stretch: float) -> np.ndarray:
 @case("stretch", "Large strain", values=[f"{e}-{s}" for e in ("T4", "T10", "H3843") for s in ("10", "0.05")],
       quick="both")  # fmt: skip
 def stretch(setting: Setting, value: str) -> Answer:
-    """A neo-Hookean cube drawn to 10 times its length, or pressed to a twentieth between walls.
+    """A neo-Hookean cube stretched to 10 times its length, or compressed to a twentieth between walls.
 
-    Pressed without walls its free sides would wrinkle: uniaxial compression is unstable below a stretch of 0.444.
+    Without walls its free sides would wrinkle: uniaxial compression is unstable below a stretch of 0.444.
     """
     element, factor = value.split("-")
     walls = float(factor) < 1.0

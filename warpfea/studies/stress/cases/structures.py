@@ -1,4 +1,4 @@
-"""Beams and shells against the literature's values, and at the end of slenderness."""
+"""Beams and shells against the literature, and at extreme slenderness."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ HARD = ("float32 can't hold this case",)
 
 @case("bend45", "Beams and shells", values=(16, 32), quick="both")
 def bend45(setting: Setting, elements: int) -> Answer:
-    """Bend of 45 degrees, radius 100, section 1 x 1, pushed out of its plane by 600 at its end.
+    """Bend of 45 degrees, radius 100, section 1 x 1, with an out-of-plane tip load of 600.
 
-    The reference is the geometrically exact beam with shear and the torsion constant 0.1406 of the square; with the
-    polar moment 1/6, as often published, the end is elsewhere.
+    The reference is the geometrically exact beam with shear and the torsion constant 0.1406 of the square; the polar
+    moment 1/6, as often published, gives another position.
     """
     R, angle = 100.0, np.pi / 4
     b = wf.ModelBuilder(gravity=(0, 0, 0))
@@ -57,7 +57,7 @@ def sze_cantilever(setting: Setting) -> Answer:
 def scordelis_lo(setting: Setting, cells: int) -> Answer:
     """Barrel roof, radius 25, length 50, thickness 0.25, under its weight; `cells` along each side of a quarter."""
     R, length, half, part = 25.0, 50.0, np.radians(40.0), 1e-4
-    b = wf.ModelBuilder(gravity=(0, 0, -10.0 * part))  # 90 per area of the mid-surface: on a face the load is off it
+    b = wf.ModelBuilder(gravity=(0, 0, -10.0 * part))  # 90 per area of the mid-surface
     grid = wf.mesh.grid((length, 2.0 * half), cells=(2 * cells, 2 * cells), origin=(0.0, -half, 0.0), map=lambda X:
                         np.column_stack([X[:, 0], R * np.sin(X[:, 1]), R * np.cos(X[:, 1])]))  # fmt: skip
     normals = grid.points * (0.0, 1.0 / R, 1.0 / R)
@@ -94,7 +94,7 @@ def hemisphere(setting: Setting) -> Answer:
         place = ball(np.array([[k * np.pi / 2, 0.0, 0.0]]))[0]
         node = shell.nodes(lambda X, place=place: np.linalg.norm(X - place, axis=1) < 1e-6)
         b.add_point_load(node, tuple(2.0 * part * direction))
-        if k % 2 == 0:  # holds the rigid motions, where symmetry leaves none
+        if k % 2 == 0:  # fixes the rigid modes that symmetry leaves free
             b.clamp(node, slots="position", components="y")
             rim = shell.nodes(lambda X, x=place[0]: np.linalg.norm(X - ball(
                 np.array([[0.0 if x > 0 else np.pi, top, 0.0]]))[0], axis=1) < 1e-6)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Thin bodies: statics and motion in both precisions, where rounding is felt first."""
+"""Thin bodies: statics and motion in both precisions, most sensitive to round-off."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from ..build import BUILT_IN, DOWN, REFINED, STEEL, Count, bar, beam, off, solve
 from ..case import Answer, Setting, case
 
 SAG = 0.05
-"""Deflection of the tip by Euler and Bernoulli's theory, of the length of 1 m."""
+"""Tip deflection by Euler-Bernoulli theory, for the length of 1 m."""
 BOUNDS = {"float64": 3e-4, "float32": 6e-3}
-"""Of the difference from a refined solution in float64: three times the floors that steps are accepted with."""
+"""Bound of the difference from a refined float64 solution: three times the accepted round-off estimates."""
 SOLIDS = ("T10-50", "T10-500", "H3843-50", "H3843-500", "T10-incompressible-50")
 STRUCTURES = ("3243-500", "3443-5000")
 LOAD_STEPS = 3
 STEPS = 60
-"""Of a motion."""
+"""Bound for a motion."""
 SAME = "the same in float64, tol 1e-10"
 
 
 def thin(value: str) -> wf.ModelBuilder:
-    """A bar, beam or strip of 1 m and L/t as in `value`, with the tip load that Euler's theory bends it by SAG with."""
+    """A bar, beam or strip of 1 m and L/t as in `value`, with the tip load for a deflection SAG by Euler's theory."""
     element, slenderness = value.split("-")[0], float(value.split("-")[-1])
     t = 1.0 / slenderness
     E, nu = 2e11, 0.4999 if "incompressible" in value else 0.0 if element == "3443" else 0.3
@@ -68,9 +68,9 @@ def thin_static(setting: Setting, value: str) -> Answer:
 
 
 def falling(value: str, device: str, dtype: str, tol: float | None) -> tuple[np.ndarray, Count]:
-    """Way of the tip of a bar that is let go under its weight, for steps of 5 ms (STEPS, 3), m.
+    """Motion of the tip of a bar released under its weight, for steps of 5 ms (STEPS, 3), m.
 
-    No step may be halved: a motion of shorter steps is another one, by a sixth of the sag.
+    No step may be halved: shorter steps change the motion by a sixth of the sag.
     """
     t = 1.0 / float(value.split("-")[1])
     b, _ = bar("T10", (20, 1, 1), (1.0, t, t), STEEL, DOWN)
@@ -84,13 +84,13 @@ def falling(value: str, device: str, dtype: str, tol: float | None) -> tuple[np.
 
 @functools.cache
 def refined_way(value: str, device: str) -> np.ndarray:
-    """The same by a refined solution in float64."""
+    """Motion of the tip by a refined solution in float64."""
     return falling(value, device, "float64", REFINED)[0]
 
 
 @case("thin-dynamic", "thin", values=("T10-50", "T10-500"), quick="both", refusal={"float32": ["float32"]})
 def thin_dynamic(setting: Setting, value: str) -> Answer:
-    """A clamped steel bar is let go under its weight, 0.3 s."""
+    """A clamped steel bar released under its weight, 0.3 s."""
     way, count = falling(value, setting.device, setting.dtype, None)
     error = off(way, refined_way(value, setting.device))
     return count.answer(error, BOUNDS[setting.dtype], SAME, told=count.sum_of_floors)
