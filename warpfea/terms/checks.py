@@ -109,7 +109,7 @@ def check_stored(terms: Sequence[Term]) -> None:
     for name in (name for term in terms for name in stored_columns(term)):
         owners = [owner for other, owner in every if other == name]
         if len(owners) > 1:
-            raise ModelError(f"energy column {name!r} is written by two terms: {owners[0]!r}, {owners[1]!r}")
+            raise ModelError(f"energy column {name!r} is written twice: by {owners[0]!r} and {owners[1]!r}")
 
 
 def stored_columns(term: Term) -> list[str]:
