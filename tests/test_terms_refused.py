@@ -68,8 +68,8 @@ ODD = {
     "column without a name": (kind(columns=(Column("", STORED),)), "STORED needs a name"),
     "column of the ledger": (kind(columns=(Column("kinetic", LOSS),)), "the ledger has a column"),
     "work by another name": (kind(columns=(Column("pushing", WORK),)), "name columns of work work_"),
-    "column twice": (kind(columns=(Column("a", STORED), Column("a", LOSS))), "'a' of stored energy is booked twice"),
-    "no measure": (kind(measure=Term.measure), "override measure"),
+    "column twice": (kind(columns=(Column("a", STORED), Column("a", LOSS))), "energy column 'a' is written twice"),
+    "no measure": (kind(measure=Term.measure), "override stored_energy"),
     "no book": (kind(book=Term.book), "does not override book"),
     "no name": (kind(name=None), "Odd: `name` must be a text"),
     "field of every model": (kind(fields={"von_mises": FieldSpec("x", "m")}), "a field 'von_mises' is taken"),
@@ -113,7 +113,7 @@ def test_a_term_that_does_not_fit_is_refused_by_the_simulation(case):
 def test_two_terms_keep_out_of_each_others_way():
     with pytest.raises(wf.ModelError, match="two terms have the name 'floor'"):
         model_with(Floor, Floor)
-    with pytest.raises(wf.ModelError, match="'floor_stored' of stored energy is booked twice"):
+    with pytest.raises(wf.ModelError, match="energy column 'floor_stored' is written twice"):
         model_with(Floor, kind(name="second"))
     other = dict(name="second", columns=(Column("more", STORED), Column("lost", LOSS)), fields={}, parts={})
     other["measure"] = lambda self, at: {"more": Floor.measure(self, at)["floor_stored"]}

@@ -1,1 +1,1 @@
-"""The step loop, its results, checkpoints and statics."""
+"""Step loop, results, checkpoints and statics."""

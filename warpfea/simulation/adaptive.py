@@ -1,4 +1,4 @@
-"""Adaptive steps, `dt="auto"`: the launches of kernels/step/adaptive.py, and the checks of what users ask for."""
+"""Adaptive time steps (dt="auto"): launches of kernels/step/adaptive.py and option checks."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ if TYPE_CHECKING:
 __all__ = ["Adapt", "Adaptive", "adapt_of"]
 
 LEAST = {"float64": 1e-9, "float32": 1e-5}
-"""Smallest error that may be asked for, over the model's size: below it rounding is not small beside it."""
+"""Smallest admissible error over the model's size; below it round-off is significant."""
 FIRST = 0.125
-"""The first substep over horizon error^(1/order)."""
+"""First substep over horizon error^(1/order)."""
 
 
 @dataclass(frozen=True)
 class Adapt:
-    """What dt = "auto" asks for.
+    """Options of adaptive time stepping.
 
     Attributes:
-        error: over the model's size.
-        interval: s between common instants at most; None: a 64th of the longest run yet, 1/60 s of steps without one.
-        horizon: s, over which the error may build up; None: the longest run yet, 64 intervals of steps without one.
+        error: tolerance, over the model's size.
+        interval: largest time between synchronisation points, s; None: a 64th of the longest run so far, 1/60 s without
+            a run.
+        horizon: time over which the error accumulates, s; None: the longest run so far, 64 intervals without a run.
     """
 
     error: float
@@ -46,10 +47,10 @@ class Adapt:
 def adapt_of(
     dt: Any, error: Any, interval: Any, horizon: Any, *, model: Model, scheme: Integrator, solver: Any
 ) -> Adapt | None:
-    """What dt = "auto" asks for; None with a number.
+    """Options of dt = "auto"; None for a number.
 
     Raises:
-        ModelError: a value out of range, one without dt = "auto", or what steps can't be adapted with.
+        ModelError: a value out of range, one without dt = "auto", or a scheme or solver without adaptive steps.
     """
     given = {"error": error, "interval": interval, "horizon": horizon}
     if not isinstance(dt, str):
@@ -73,35 +74,35 @@ def adapt_of(
             f"dt = 'auto': integrator {scheme.name!r} has no estimate of its error; there are {', '.join(able)}"
         )
     if not isinstance(solver, NewtonPCG):
-        raise ModelError("dt = 'auto' needs the solver 'newton-pcg': what Jacobi's iterations leave is no error of dt")
+        raise ModelError(
+            "dt = 'auto' needs solver 'newton-pcg': with Jacobi the algebraic error hides the time discretisation error"
+        )
     least = LEAST[model.dtype]
     if error < least:
         finer = "; take float64" if model.dtype == "float32" else ""
-        raise ModelError(
-            f"error = {error!r} is below what {model.dtype} resolves, {least:g} of the model's size{finer}"
-        )
+        raise ModelError(f"error = {error!r} is below {model.dtype} round-off ({least:g} of the model size){finer}")
     return Adapt(float(error), interval, horizon)
 
 
 def _arms(model: Model) -> np.ndarray:
-    """(slots,) what an unknown moves by 1, m: 1 of positions, half the section of gradients across beams and shells, 0
-    of those whose motion the positions beside show."""
+    """Lever arm (slots,), m, that converts an unknown to displacement: 1 for positions, half the section for gradients
+    across beams and shells, 0 for gradients whose motion the adjacent positions represent."""
     out = model.is_position_host.astype(float)
     mass = model.mass_host.diagonal()
     for body in model.bodies:
         sets = body.family.slot_sets
         for kind in sets.get("section", sets.get("director", ())):
             slot = body.slots[model.slot_kind[body.slots] == kind]
-            out[slot] = np.sqrt(3.0 * mass[slot] / mass[slot - kind])  # a uniform section's
+            out[slot] = np.sqrt(3.0 * mass[slot] / mass[slot - kind])  # for a uniform section
     return out
 
 
 class Adaptive:
-    """Control of step sizes, each world its own; the host chooses common instants, at which all worlds meet.
+    """Step size control per world with common synchronisation times set by the host.
 
     Attributes:
-        error: asked for, over the model's size.
-        instants: when worlds meet.
+        error: tolerance, over the model's size.
+        instants: synchronisation times.
     """
 
     def __init__(self, at: At, v_before: wp.array, scheme: Integrator, asked: Adapt, *, max_tries: int) -> None:
@@ -121,7 +122,7 @@ class Adaptive:
         self.control.max_tries = max_tries
 
     def aim(self, time: np.ndarray) -> None:
-        """Before a step from times (B,), s: all worlds go to their next instant."""
+        """Set the interval to the next synchronisation point before a step from times (B,), s."""
         instants = self.instants
         if not instants.settled:
             instants.settle(float(time.min()))
@@ -130,7 +131,7 @@ class Adaptive:
         self.work.step.dt.assign(instants.spans(time))
 
     def steps_to(self, now: float, end: float, outputs: Iterable[Any]) -> int:
-        """Steps of a run from `now` to `end`, both s, with outputs; -1: it ends before it begins."""
+        """Number of steps of a run from `now` to `end`, both s, with outputs; -1 for an empty run."""
         if end < now:
             return -1
         self.instants.follow(outputs)
@@ -139,11 +140,12 @@ class Adaptive:
         return self.instants.count(now, end) if end > now else 0
 
     def open(self) -> None:
-        """After the kernel `begin_step`: substeps of the size that the state asks for."""
+        """Set the substep size from the state, after the kernel `begin_step`."""
         self.launch(self.kernels.open_step, self.model.worlds, [self.work.step, self.control])
 
     def judge(self) -> None:
-        """Before the kernel `end_attempt`: estimate the error of what has converged, and refuse what is too far off."""
+        """Estimate the local error of converged attempts; reject those above tolerance (before the kernel
+        `end_attempt`)."""
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
         args = [w.step, ctl, self.arm, m.topology.free, w.u, w.v, self.velocity, self.v_before, self.means]
@@ -151,16 +153,16 @@ class Adaptive:
         launch(k.judge, m.worlds, [w.step, w.newton, w.pcg, ctl])
 
     def settle(self) -> None:
-        """After the kernel `end_attempt` and before the commit: means of rates, the size of the next substep."""
+        """Compute mean rates and the size of the next substep, after the kernel `end_attempt` and before acceptance."""
         w, launch = self.work, self.launch
         launch(self.kernels.keep_mean, self.dim, [w.step, self.control, w.v, self.velocity, self.v_before, self.means])
         launch(self.kernels.settle, self.model.worlds, [w.step, self.control])
 
     def close(self) -> None:
-        """Before the report."""
+        """Finish the interval before the report."""
         self.launch(self.kernels.close_step, self.model.worlds, [self.work.pcg, self.control])
 
     def counts(self) -> dict[str, np.ndarray]:
-        """Of the last step, each (B,), see COUNTS."""
+        """Counts of the last step, each (B,), see COUNTS."""
         rows = self.control.counts.numpy()
         return {name: rows[:, k].astype(int if k < 2 else float) for k, name in enumerate(COUNTS)}

@@ -1,7 +1,6 @@
-"""Whether a device has room for a simulation of so many worlds, before anything of it is allocated.
+"""Memory check of a simulation before allocation.
 
-What a world takes is measured with simulations of one and of two worlds. Where memory is plentiful, by a rough bound,
-nothing is measured.
+Bytes per world are measured with simulations of one and of two worlds, unless a rough bound fits in memory.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ if TYPE_CHECKING:
 __all__ = ["check_capacity", "free_bytes"]
 
 PLENTY = 3000
-"""Vectors per slot that no simulation takes (pendulums 200 to 600, solids of T10 300, piles of bodies 2000)."""
+"""Upper bound of scratch vectors per slot (pendulums 200 to 600, solids of T10 300, piles of bodies 2000)."""
 KEPT = 0.02
-"""Share of the memory that is left to what is not counted: code, recorded graphs, pools."""
+"""Memory fraction reserved for uncounted allocations (code, graphs, pools)."""
 
 
 def free_bytes(device: Any) -> int | None:
-    """Memory that is available on a device, bytes; None where that is not known."""
+    """Available device memory, bytes; None if unknown."""
     if device.is_cuda:
         pool = 0
-        if wp.is_mempool_enabled(device):  # what it has been given back is free, too
+        if wp.is_mempool_enabled(device):  # includes memory returned to the pool
             pool = wp.get_mempool_used_mem_high(device) - wp.get_mempool_used_mem_current(device)
         return min(int(device.free_memory + pool), int(device.total_memory))
     try:
@@ -47,7 +46,7 @@ def free_bytes(device: Any) -> int | None:
 
 
 def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> None:
-    """Raise CapacityError where a simulation of a model would not fit; `make` makes its stepper.
+    """Raise CapacityError if a simulation of a model does not fit; `make` constructs its stepper.
 
     Raises:
         CapacityError: with the bytes per world, and the largest number of worlds that fits.
@@ -65,20 +64,20 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
     per_world = need // model.worlds
     raise CapacityError(
         f"a simulation of {model.worlds} worlds takes {size(need)}, {per_world} bytes per world, and {model.device} "
-        f"has {size(free)} free: at most {fit} worlds fit{REMEDY}",
+        f"has {size(free)} free; maximum: {fit} worlds{REMEDY}",
         bytes=need, per_world=per_world, worlds=fit,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Bytes of arrays by name with one and with two worlds, and for how many worlds an array is."""
+    """Bytes of arrays by name with one and two worlds, and chunk sizes of chunked arrays."""
 
     one: tuple[dict[str, int], dict[str, Callable[[int], int]]]
     two: tuple[dict[str, int], dict[str, Callable[[int], int]]]
 
     def of(self, worlds: int) -> int:
-        """Bytes of so many worlds."""
+        """Bytes for a number of worlds."""
         out = 0
         for name, count in self.one[0].items():
             chunk = self.one[1].get(name, int)
@@ -89,7 +88,7 @@ class Sizes:
 def _arrays(
     model: Model, worlds: int, make: Callable[[Model, State], Stepper]
 ) -> tuple[dict[str, int], dict[str, Callable[[int], int]]]:
-    """Arrays of the state and of the scratch of a simulation of so many worlds."""
+    """Arrays of the state and scratch of a simulation of a number of worlds."""
     small = model.resized(worlds)
     state = small.state()
     stepper = make(small, state)

@@ -1,7 +1,7 @@
-"""Checkpoints: all arrays of a state and what a simulation has recorded, in one .npz file.
+"""Checkpoints: the arrays and records of a simulation in one .npz file.
 
-The file is written to a temporary name and renamed, so a checkpoint on disk is always whole. Continued from it, a run
-goes on bit for bit as it would have gone on undisturbed.
+A temporary file is renamed to the target, so a checkpoint on disk is always complete. A resumed run is bitwise equal to
+an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SUFFIXES = (".npz",)
 
 
 class Checkpoint(Output):
-    """Writes the present state to `path` (.npz) during a run, each time replacing the one before.
+    """Output that writes the present state to `path` (.npz) during a run, replacing the previous checkpoint.
 
     Args:
         path: the target.
@@ -61,7 +61,7 @@ class Checkpoint(Output):
         self._open = False
 
     def abort(self) -> None:
-        """Nothing is left behind at any time."""
+        """No-op: no partial file exists."""
         self._open = False
 
     def _save(self, sim: Any) -> None:
@@ -70,7 +70,7 @@ class Checkpoint(Output):
 
 
 def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
-    """Write the simulation's state to `path` (.npz). OutputError if that can't be done."""
+    """Write the simulation's state to `path` (.npz). OutputError on failure."""
     target = check_target(path, SUFFIXES)
     sim.stepper.take_parameters()
     meta = {
@@ -111,23 +111,23 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
 
 
 def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a checkpoint says of itself: dtype, worlds, integrator, dt (s), steps, ... CheckpointError if unreadable."""
+    """Checkpoint metadata: dtype, worlds, integrator, dt (s), steps, ... CheckpointError if unreadable."""
     return _read(pathlib.Path(path))[0]
 
 
 def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
-    """Continue from a checkpoint: state, probes' records and totals. The step dt stays the simulation's own,
-    and so does the error of dt = "auto"; interval and horizon are the checkpoint's.
+    """Continue from a checkpoint: state, records and totals. The step dt remains the simulation's own, and so does the
+        error of dt = "auto"; interval and horizon are the checkpoint's.
 
     Raises:
         CheckpointError: unreadable or truncated, or of another model, precision, number of worlds or integrator. The
-            simulation is then as before.
+            simulation is unchanged then.
     """
     file = pathlib.Path(path)
     meta, arrays = _read(file)
     _compare(file, meta, sim)
     state = {name.removeprefix("state."): a for name, a in arrays.items() if name.startswith("state.")}
-    for name in ("rough", "floored"):  # of files before they were counted
+    for name in ("rough", "floored"):  # files older than these counts
         arrays.setdefault(f"total.{name}", np.zeros(sim.model.worlds, int))
     totals = {name: arrays.get(f"total.{name}") for name in sim.totals}
     parameters = {name.removeprefix("parameter."): a for name, a in arrays.items() if name.startswith("parameter.")}
@@ -144,7 +144,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         sim.state.load(state)
         sim.model.parameters.load(parameters)
         for name, array in set_arrays.items():
-            if f"set.{name}" in arrays:  # not in files of before
+            if f"set.{name}" in arrays:  # absent in older files
                 array.assign(arrays[f"set.{name}"])
         for term in sim.model.terms:
             term.parameters_taken()
@@ -165,7 +165,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
 
 
 def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
-    """CheckpointError naming the first thing in which checkpoint and simulation differ."""
+    """Raise CheckpointError naming the first difference between checkpoint and simulation."""
     expected = {
         "dtype": ("precision", sim.model.dtype),
         "worlds": ("number of worlds", sim.model.worlds),
@@ -204,8 +204,6 @@ def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise CheckpointError(f"{file}: not a readable checkpoint, such as wf.Checkpoint writes") from error
     if schema != SCHEMA:
-        older = (
-            "is of an earlier version of warpfea and can't be continued by this one" if schema == 1 else "is unknown"
-        )
-        raise CheckpointError(f"{file}: schema {schema!r} of the checkpoint {older}; this version reads {SCHEMA}")
+        older = "was written by an older version of warpfea" if schema == 1 else "is unknown"
+        raise CheckpointError(f"{file}: the checkpoint {older} (schema {schema!r}; this version reads {SCHEMA})")
     return meta, arrays

@@ -1,4 +1,4 @@
-"""Checks of what users pass to a simulation."""
+"""Validation of user input to a simulation."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ __all__ = ["check_choice", "check_constraint_tol", "check_mask", "check_model", 
 
 
 def check_model(model: Any) -> None:
-    """Raise ModelError for what is not a Model, such as a builder."""
+    """Raise ModelError unless `model` is a Model (not a builder)."""
     if not isinstance(model, Model):
         raise ModelError(f"expected a Model, got {type(model).__name__}; builder.finalize() makes one")
 
 
 def check_time(name: str, value: Any) -> None:
-    """Raise ModelError for what is not a time, s."""
+    """Raise ModelError unless `value` is a finite time, s."""
     if not is_number(value):
         raise ModelError(f"{name} = {value!r} must be a finite time (s){number_hint(value)}")
 
 
 def check_times(name: str, value: Any, model: Model, *, positive: bool = False) -> None:
-    """Raise ModelError for what is neither a time, s, nor one of each world; device arrays are looked at by shape."""
+    """Raise ModelError unless `value` is a time, s, or one per world; device arrays are checked by shape only."""
     what = "positive finite time (s)" if positive else "finite time (s)"
     if isinstance(value, wp.array):
         if value.shape != (model.worlds,) or value.dtype != wp.float64 or value.device != model.device:
@@ -55,7 +55,7 @@ def check_times(name: str, value: Any, model: Model, *, positive: bool = False) 
 
 
 def write_times(target: wp.array, value: Any) -> None:
-    """Write a time, s, or one of each world to an array [world]."""
+    """Write a time, s, or one per world to an array [world]."""
     if isinstance(value, wp.array):
         wp.copy(target, value)
     elif isinstance(value, (int, float, np.floating)):
@@ -65,7 +65,7 @@ def write_times(target: wp.array, value: Any) -> None:
 
 
 def check_mask(mask: wp.array, model: Model) -> None:
-    """Raise ModelError for what is not a mask of worlds on the device."""
+    """Raise ModelError unless `mask` is a mask of worlds on the device."""
     known = mask.dtype in (wp.int32, wp.bool)
     if mask.shape != (model.worlds,) or not known or mask.device != model.device:
         raise ModelError(
@@ -75,7 +75,7 @@ def check_mask(mask: wp.array, model: Model) -> None:
 
 
 def check_choice(name: str, value: Any, *known: str) -> None:
-    """Raise ModelError for what is none of the known words."""
+    """Raise ModelError unless `value` is one of the known words."""
     if value not in known:
         if len(known) == 2:
             raise ModelError(f"{name} = {value!r} is neither {known[0]!r} nor {known[1]!r}")
@@ -83,19 +83,19 @@ def check_choice(name: str, value: Any, *known: str) -> None:
 
 
 def check_constraint_tol(value: Any) -> None:
-    """Raise ModelError for what is not a tolerance of constraints, over the model's size."""
+    """Raise ModelError unless `value` is a constraint tolerance, over the model's size."""
     if not (isinstance(value, (int, float, np.floating)) and 0.0 < value < 1.0):
         raise ModelError(f"constraint_tol = {value!r} must lie between 0 and 1")
 
 
 def check_steps(count: Any) -> None:
-    """Raise ModelError for what is not a number of steps."""
+    """Raise ModelError unless `count` is a number of steps."""
     if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
         raise ModelError(f"step({count!r}): the number of steps must be a whole number, at least 1")
 
 
 def check_state(model: Model, state: State) -> None:
-    """Raise ModelError for what is not a state, or one of another model."""
+    """Raise ModelError unless `state` is a state of this model."""
     if not isinstance(state, State):
         raise ModelError(f"expected a State, got {type(state).__name__}; model.state() makes one")
     got, expected = state.displacement, (model.worlds, model.slots)

@@ -18,10 +18,11 @@ OnCompile = Callable[[int, int, str], None]
 
 
 def load_modules(modules: dict[str, wp.Module], device: Any, on_compile: OnCompile | None) -> None:
-    """Compile modules by name on several threads; loaded ones cost nothing. `on_compile` hears of each.
+    """Compile modules by name on several threads; loaded ones are free. `on_compile(done, total, name)` is called for
+    each.
 
     Raises:
-        ModelError: Warp can't compile a user's function.
+        ModelError: a user's function that Warp can't compile.
     """
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
         load = partial(wp.force_load, device, max_workers=0)
@@ -33,7 +34,7 @@ def load_modules(modules: dict[str, wp.Module], device: Any, on_compile: OnCompi
 
 
 def _raise_of(future: Future[Any], name: str) -> None:
-    """Errors of compilation; those of a user's function as such."""
+    """Re-raise compilation errors; those of a user's function as ModelError."""
     try:
         future.result()
     except Exception as error:

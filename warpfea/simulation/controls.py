@@ -1,4 +1,4 @@
-"""Controls of a simulation: the values that a caller writes between steps."""
+"""Controls of a simulation: values written by the caller between steps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["ControlValue", "Controls"]
 
 
 class Controls(Mapping[str, "ControlValue"]):
-    """The controls that drive something in a model, by name: `sim.controls["jaw"][:] = 0.1`."""
+    """Controls in use in a model, by name: `sim.controls["jaw"][:] = 0.1`."""
 
     def __init__(self, model: Model, state: State) -> None:
         self._values = {
@@ -33,11 +33,11 @@ class Controls(Mapping[str, "ControlValue"]):
     def __getitem__(self, name: str) -> ControlValue:
         if name not in self._values:
             known = f"it has: {listing(self._values)}{did_you_mean(name, self._values)}"
-            raise ModelError(f"control {name!r} drives nothing in this model; {known}")
+            raise ModelError(f"no load or drive uses control {name!r}; {known}")
         return self._values[name]
 
     def __setitem__(self, name: str, values: Any) -> None:
-        """As `controls[name][:] = values`."""
+        """Equivalent of `controls[name][:] = values`."""
         self[name].assign(values)
 
     def __contains__(self, name: object) -> bool:
@@ -54,15 +54,16 @@ class Controls(Mapping[str, "ControlValue"]):
 
 
 class ControlValue:
-    """Values [world, size] of one control, in the unit of what it drives; what is written acts from the next step on.
+    """Values [world, size] of one control, in the unit of the driven quantity; written values act from the next step
+    on.
 
     `value[:] = x`, `value[mask] = x` and `value[2, 0] = x` write with numpy's rules, one number per world also as
     (worlds,); `assign` also takes a Warp array. `array` is the memory of the state: kernels may write to it, and
-    `wp.to_torch(value.array)` or `torch.from_dlpack(value)` share it without a copy. What is written there is not
-    checked.
+    `wp.to_torch(value.array)` or `torch.from_dlpack(value)` share it without a copy. Values written through it are not
+    validated.
 
     Attributes:
-        control: what was declared.
+        control: the declared control.
         array: Warp array [world, size], float64.
     """
 
@@ -83,11 +84,11 @@ class ControlValue:
         """Write the values of all worlds.
 
         Args:
-            values: what broadcasts to (worlds, size), (worlds,) of a scalar control; or a Warp array (worlds, size) of
-                float64, which is copied on the device and not checked for values that are not finite.
+                values: broadcastable to (worlds, size), or (worlds,) for a scalar control; or a Warp array (worlds,
+                    size) of float64, copied on the device without a check for non-finite values.
 
-        Raises:
-            ModelError: another shape or type, or a value that is not finite; nothing is written then.
+            Raises:
+                ModelError: another shape or type, or a non-finite value; nothing is written then.
         """
         if not isinstance(values, wp.array):
             self[:] = values
@@ -108,7 +109,7 @@ class ControlValue:
             target[key] = given
         except (TypeError, ValueError, IndexError) as error:
             raise ModelError(f"{self._what} has values {self.shape}: {error}") from error
-        # what is not written may be what it is: a world that went wrong can be mended alone
+        # unwritten values may stay non-finite: a failed world can be repaired alone
         if not np.all(np.isfinite(given)) and not np.all(np.isfinite(target)):
             world, component = map(int, np.argwhere(~np.isfinite(target))[0])
             where = f"world {world}" + (f", component {component}" if self.shape[1] > 1 else "")
@@ -116,7 +117,7 @@ class ControlValue:
         self.array.assign(target)
 
     def __getitem__(self, key: Any) -> Any:
-        """A copy that can't be written to, so that `value[0][1] = x` is no silent loss."""
+        """Read-only copy, so that `value[0][1] = x` raises instead of being lost."""
         values = self.numpy()
         values.flags.writeable = False
         out = values[key]

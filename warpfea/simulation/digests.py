@@ -1,4 +1,4 @@
-"""What steps add up to, and what the last one tells; read when asked for where steps do not wait for the device."""
+"""Run statistics and last step report, read lazily in asynchronous runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COUNTS = ("newton", "pcg", "rough", "floored")
 
 
 class Fresh:
-    """An attribute that is brought up to the last step before it is read."""
+    """Descriptor that synchronises device statistics before reading."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.key = f"_kept_{name.lstrip('_')}"
@@ -37,15 +37,15 @@ class Fresh:
 
 
 class Digests(Records):
-    """Totals over steps, the last report, and what is recorded.
+    """Totals over steps, the last report, and records.
 
     Attributes:
-        steps: steps done.
+        steps: number of steps taken.
         last: report of the last step, None before the first.
-        totals: iterations by world; "rough" and "floored" are steps.
-        max_residual, max_floor, max_violation, min_J: of all steps and worlds.
-        quiet: steps read nothing back from the device: `record` is False, failed worlds are frozen, and neither the
-            size of steps nor accelerations at their start are found on the host.
+        totals: iterations by world; "rough" and "floored" count steps.
+        max_residual, max_floor, max_violation, min_J: extremes over all steps and worlds.
+        quiet: asynchronous steps without device reads: `record` is False, failed worlds are frozen, and neither step
+            sizes nor initial accelerations are computed on the host.
     """
 
     last: Any = Fresh()
@@ -75,7 +75,7 @@ class Digests(Records):
         self._history = []
 
     def _catch_up(self) -> None:
-        """Read what the steps since the last reading have left on the device."""
+        """Read the device statistics of the steps since the last reading."""
         if not self._unread:
             return
         self._unread = False
@@ -94,12 +94,12 @@ class Digests(Records):
             self._history = [self._row(rows)]
 
     def _unstep(self, mask: np.ndarray) -> None:
-        """Worlds that have not stepped since their state was set."""
+        """Mark worlds as not stepped since their state was set."""
         self._stepped[mask] = False
         self.stepper.loops.unstep(mask)
 
     def _report_of(self, rows: np.ndarray) -> StepReport:
-        """The report of a step from its numbers (worlds, columns)."""
+        """Report of a step from its columns (worlds, columns)."""
         column = {name: rows[:, k].copy() for k, name in enumerate(REPORT)}
         status = column["status"].astype(int)
         return StepReport(
@@ -121,7 +121,7 @@ class Digests(Records):
         )
 
     def _digest(self, rows: np.ndarray) -> None:
-        """Take in the numbers of a step (worlds, columns); raise where a world has failed and that is asked for."""
+        """Accumulate the statistics of a step (worlds, columns); raise for failed worlds if requested."""
         last = self.last = self._report_of(rows)
         failed = last.status == STATUS["failed"]
         fresh, self._failed = failed & ~self._failed, failed
@@ -157,18 +157,18 @@ class Digests(Records):
                 raise self._failure(int(np.flatnonzero(fresh)[0]))
 
     def _row(self, rows: np.ndarray) -> np.ndarray:
-        """What is kept of a report: time, probes, and what of terms a world that did not step does not tell."""
+        """Recorded columns of a report: time, probes, and term columns, NaN for worlds that did not step."""
         row = rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy()
         row[~self._stepped, 1 + 6 * len(self.model.probes) :] = np.nan
         return row
 
     @property
     def _recorded(self) -> bool:
-        """Whether there is anything to record of each step."""
+        """True if any quantity is recorded per step."""
         return self.model.terms.report_width > len(REPORT)
 
     def _failure(self, world: int) -> ConvergenceError | ConstraintError:
-        """The error for a failed world; its status is cleared so that a caller may try again with another dt."""
+        """Error of a failed world; its status is cleared so that a caller may retry with another dt."""
         error = step_error(self, world)
         status = self.state.status.numpy()
         status[status == STATUS["failed"]] = STATUS["running"]

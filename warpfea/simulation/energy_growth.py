@@ -1,13 +1,12 @@
-"""Energy that integrator and residuals add: watched on the device (kernels/step/ledger.py), told and refused here.
+"""Monitor of spurious energy growth: device counters (kernels/step/ledger.py), warnings, rejection.
 
-The measure is net: what the ledger's `integrator` and `viscous` have fallen by since the watch began and its
-`ledger_residual` has risen by, over the largest kinetic + strain + contact energy since plus the sum of |work| and of
-what viscosity took. Residuals of a loose tolerance, or at the rounding of float32, do work that adds up; not so where
-something is driven, which takes as much as they give: of a slider crank in float32 they give 15 J and take it again in
-each turn, and its drive has that much less and more. Schemes of order 2 exchange
-energy with the motion to and fro, by O(h^2) of it, and that does not add up; an instability does. Where damping is
-stiff, `viscous` has too much by what `integrator` has too little: their sum is what counts. The first steps of a motion
-that sets in from rest are left out.
+Net measure: decrease of the ledger's `integrator` + `viscous` and increase of its `ledger_residual` since the start of
+monitoring, over the largest kinetic + strain + contact energy since, plus the sum of |work| and of the viscous loss.
+Accepted residuals of a loose tolerance, or at the round-off of float32, do work that may accumulate; they are excluded
+in driven models, where the drive balances them: those of a slider crank in float32 give and take 15 J in each turn.
+Second-order schemes exchange energy with the motion, by O(h^2) of it, which does not accumulate; an instability does.
+With stiff damping errors of `viscous` and `integrator` cancel: only their sum counts. The first steps of a motion from
+rest are excluded.
 """
 
 from __future__ import annotations
@@ -31,23 +30,23 @@ __all__ = ["CHOICES", "REFUSED", "TOLD", "EnergyGrowth", "growth_error", "integr
 
 CHOICES = ("refuse", "warn", "ignore")
 TOLD, REFUSED = 0.01, 0.1
-"""Part of the energy that the integrator may add before it is told, and before steps are refused."""
+"""Energy gain of the integrator over the energy, for a warning and for rejection of steps."""
 CALMER = {
     "generalized_alpha": ("bdf2", "energy_momentum(rho_inf=0.8)", "backward_euler"),
     "energy_momentum": ("energy_momentum(rho_inf=0.8)", "bdf2", "backward_euler"),
     "bdf2": ("energy_momentum", "backward_euler"),
 }
-"""Schemes to take in place of one that adds energy."""
+"""Alternative schemes to one that gains energy."""
 ROUNDING = 100.0
-"""Strain, in units of rounding, whose energy is rounding."""
+"""Strain in units of round-off whose energy counts as round-off."""
 
 
 class EnergyGrowth:
-    """The watch of a simulation.
+    """Energy growth monitor of a simulation.
 
     Args:
         choice: one of CHOICES.
-        ledger: whether there is one: without, nothing is watched.
+        ledger: True with an energy ledger, which monitoring requires.
     """
 
     def __init__(self, choice: str, *, ledger: bool, static: bool) -> None:
@@ -63,7 +62,7 @@ class EnergyGrowth:
         return f"watched: warned of above {TOLD:.0%}{refused}"
 
     def bind(self, step: Any, model: Model, state: State) -> None:
-        """Let the kernels of a step watch; a state that another simulation has had begins again."""
+        """Bind monitor arrays to the step control; resets the history of a reused state."""
         if not self.watched:
             return
         rows = state.register("energy_growth", wp.float64, (len(GROWTH),))
@@ -79,7 +78,7 @@ class EnergyGrowth:
         step.least_energy = self._least
 
     def follow(self) -> None:
-        """Begin anew in the worlds whose parameters were set: what that does to energies is not the integrator's."""
+        """Restart in worlds whose parameters were set: the energy jump is not the integrator's."""
         if not self.watched or self._written == self._model.terms.written:
             return
         writes = self._model.terms.writes
@@ -91,7 +90,7 @@ class EnergyGrowth:
         self._least.assign(least_energy(self._model))
 
     def tell(self, sim: Any, shares: np.ndarray) -> None:
-        """Warn once where a world's part (worlds,) is above TOLD."""
+        """Warn once if a world's energy gain (worlds,) exceeds TOLD."""
         if self.told or not (worst := float(np.max(shares))) > TOLD:
             return
         self.told = True
@@ -100,15 +99,15 @@ class EnergyGrowth:
         refused = f"; steps are refused above {REFUSED:.0%}" if self.choice == "refuse" else ""
         where = f" in world {world}" if sim.model.worlds > 1 else ""
         warnings.warn(
-            f"{source(sim, world)} adds energy: from t = {since:.6g} s on more than {TOLD:.0%} of the largest, by "
-            f"now {worst:.1%}{where}{refused}; {remedy(sim, world)}",
+            f"{source(sim, world)} is gaining energy: {worst:.1%} of the peak energy{where} (above {TOLD:.0%} since "
+            f"t = {since:.6g} s){refused}; {remedy(sim, world)}",
             ModelWarning,
             stacklevel=4,
         )
 
 
 def least_energy(model: Model) -> np.ndarray:
-    """Energy below which all of it may be rounding, (worlds,) J: of a strain of some units of rounding everywhere."""
+    """Round-off level of the energy (worlds,), J: strain of ROUNDING eps everywhere."""
     unit, out = ROUNDING * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
     for body in model.bodies:
         volume = float(element_volumes(body).sum())
@@ -119,8 +118,8 @@ def least_energy(model: Model) -> np.ndarray:
 
 
 def by_residuals(sim: Any, world: int) -> bool:
-    """True where residuals that were accepted have added more than half of the energy; of a scheme that is unstable by
-    itself it is the scheme."""
+    """True if accepted residuals have added more than half of the energy; never for generalized-alpha, which is
+    unstable by itself."""
     if drives(sim.model) or sim.integrator.name == "generalized_alpha":
         return False
     share, largest, turnover = sim.state.energy_growth.numpy()[world, :3]
@@ -129,12 +128,12 @@ def by_residuals(sim: Any, world: int) -> bool:
 
 
 def source(sim: Any, world: int) -> str:
-    """Name of what adds the energy: the integrator, or residuals."""
+    """Source of the energy: the integrator, or accepted residuals."""
     return "the work of accepted residuals" if by_residuals(sim, world) else sim.integrator.label
 
 
 def remedy(sim: Any, world: int) -> str:
-    """Schemes to write in place of the integrator, or a tolerance."""
+    """Alternative integrators or tolerance, as text."""
     if by_residuals(sim, world):
         return "take a smaller tol" + (", or dtype='float64'" if sim.model.dtype == "float32" else "")
     others = [f"{other!r}" for other in CALMER.get(sim.integrator.name, ())]
@@ -142,9 +141,9 @@ def remedy(sim: Any, world: int) -> str:
 
 
 def integrator_share(sim: Any) -> float:
-    """Part of the energy turned over that the ledger's `integrator` took or gave, in the worst world.
+    """Integrator loss or gain of the ledger over the energy exchanged, in the worst world.
 
-    NaN where it is not watched; 0 where nothing was yet, as after a refused step.
+    NaN without monitoring; 0 before any exchange, as after a rejected step.
     """
     if not sim.energy_growth.watched:
         return float("nan")
@@ -155,13 +154,13 @@ def integrator_share(sim: Any) -> float:
 
 
 def growth_error(sim: Any, world: int) -> str:
-    """The message of a step that is refused since the integrator has added too much; the world's watch begins again."""
+    """Message of a step rejected for energy growth; restarts the monitor of the world."""
     rows = sim.state.energy_growth.numpy()
     share, since = (float(rows[world, GROWTH.index(name)]) for name in ("share", "since"))
     name, cure = source(sim, world), remedy(sim, world)
     rows[world] = 0.0
     sim.state.energy_growth.assign(rows)
     return (
-        f"{name} has added {share:.1%} to the largest energy, more than {TOLD:.0%} from t = "
-        f"{since:.6g} s on; {cure}; energy_growth='warn' lets it pass"
+        f"{name}: energy gain {share:.1%} of the peak energy (above {TOLD:.0%} since t = {since:.6g} s); {cure}; "
+        "energy_growth='warn' continues"
     )

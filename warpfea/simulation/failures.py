@@ -1,4 +1,4 @@
-"""What to tell of a step that was refused for good, and of joints that are open at the start."""
+"""Error messages of failed steps and initially violated joints."""
 
 from __future__ import annotations
 
@@ -42,24 +42,24 @@ REASONS = {
     FAIL_CURVATURE: "no descent direction was found",
     FAIL_LIMIT: "a term allowed no step along Newton's direction",
     FAIL_GROWTH: "the residual grew more than tenfold",
-    FAIL_INVERTED: "an element turned inside out (J <= 0)",
-    FAIL_ERROR: "no step is short enough for the error asked for, or 65536 substeps are too few,",
+    FAIL_INVERTED: "an element inverted (J <= 0)",
+    FAIL_ERROR: "the error tolerance was not met within 65536 substeps",
 }
 UNSTABLE = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
 """Failures that an indefinite tangent may explain."""
 UNKNOWN = 1e30
-"""Estimate of the error where there is none."""
+"""Value of an unavailable error estimate."""
 OPEN = 1e-4
-"""Violation at the start, over the model's size, that a dynamic run refuses to snap shut."""
+"""Largest initial constraint violation (over the model size) accepted by dynamics."""
 
 
 def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
-    """The error for a world whose step was refused after all halvings."""
+    """Error of a world whose step was rejected after all halvings."""
     assert sim.last is not None
     work = sim.stepper.work
     code = int(sim.last.failure[world])
     time = float(sim.last.time[world])
-    # the last refusal was not followed by a halving
+    # no halving follows the last rejection
     halvings = min(int(sim.last.halvings[world]) - 1, sim.solver.max_halvings)
     if code == FAIL_ENERGY:
         text = f"{_step_from(sim, time, world)} was not taken in world {world}: {growth_error(sim, world)}"
@@ -75,15 +75,15 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     reason, hint = _why(sim, code, world)
     if sim.integrator.stabilise and work.step.mass_factor.numpy()[world] == 0.0:
         hint += (
-            "; at full load the springs of stabilise= are gone: supports and contact alone do not hold the bodies there"
+            "; the stabilising springs vanish at full load, where supports and contact alone do not restrain the bodies"
         )
     hint += overload_text(sim.model)
     lumped = [c.name for c in sim.model.description.contacts if c.model == "sphere"] if sim.integrator.static else []
     if lumped and code != FAIL_FLOOR:
-        hint += f"; contact {lumped[0]!r} has one place, which jumps as the body rolls: in statics take model='patch'"
+        hint += f"; the single contact point of {lumped[0]!r} jumps as the body rolls: use model='patch' in statics"
     spent, most = int(sim.last.newton[world]), int(work.step.most_newton)
     if code != FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
-        hint += f"; its {spent} iterations of Newton's method are all that max_work = {sim.solver.max_work} allows"
+        hint += f"; {spent} Newton iterations used up max_work = {sim.solver.max_work}"
     jumps = "" if code == FAIL_FLOOR else jumping_drives(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
     for term in sim.model.terms:
@@ -101,45 +101,45 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
 
 
 def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
-    """Why Newton's method failed, and what may help."""
+    """Reason of a Newton failure, and a remedy."""
     work, dtype = sim.stepper.work, sim.model.dtype
     smaller = "; try more load steps" if sim.integrator.static else "; try a smaller dt"
     direct = sim.stepper.newton.direct
     if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
-        return "H is singular (a body or mechanism that nothing holds?)", ""
+        return "singular tangent matrix (unconstrained body or mechanism?)", ""
     near = float(work.newton.floor_excess.numpy()[world]) <= NEAR
-    finer = "; take float64" if dtype == "float32" else "; take fewer, stouter elements, or look at the units"
+    finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
     if code == FAIL_FLOOR:
         eta = float(work.newton.eta.numpy()[world])
-        left = "what is left of the residual is within rounding"
+        left = ""
         if eta < UNKNOWN:
-            left = f"rounding leaves an estimated error of {eta:.2g} of the solution"
-        return f"{dtype} can't hold this case: {left}", finer
+            left = f" (estimated error {eta:.2g})"
+        return f"{dtype} round-off limit reached{left}", finer
     if code == FAIL_WORK:
-        spent = f"the step has taken {int(work.pcg.total.numpy()[world])} iterations of the conjugate gradients"
+        spent = f"the step took {int(work.pcg.total.numpy()[world])} CG iterations"
         limit = f"max_work = {sim.solver.max_work}"
         if near and dtype == "float32":
-            return f"float32 can't hold this case: the residual is within rounding, and {spent} ({limit})", finer
+            return f"float32 round-off limit reached: {spent} ({limit})", finer
         slivers = f"; raise {limit} of NewtonPCG, or look for slivers and extreme contrasts of stiffness"
         return spent, "" if overload_text(sim.model) else slivers
     if code == FAIL_INVERTED:
         return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
     bent = sim.integrator.static and int(work.newton.bent.numpy()[world])
     if code in UNSTABLE and near and (dtype == "float32" or not bent):
-        return f"{dtype} can't hold this case: what is left of the residual is within rounding", finer
+        return f"{dtype} round-off limit reached", finer
     if code in UNSTABLE and bent and dtype == "float32":
         return f"{REASONS[code]}: forces in float32 have a direction without stiffness", (
             f"{finer}, which says whether the equilibrium is unstable, or more load steps"
         )
     if code in UNSTABLE and bent:
-        return f"{REASONS[code]}: the equilibrium is unstable there (it buckles or snaps through)", (
-            "; find what follows by a motion with damping, or prescribe displacements in place of loads"
+        return f"{REASONS[code]}: unstable equilibrium (buckling or snap-through)", (
+            "; follow the post-critical path by damped dynamics or displacement control"
         )
     return REASONS.get(code, "unknown reason"), smaller
 
 
 def _step_from(sim: Any, time: float, world: int) -> str:
-    """The refused step, by its time (s) or part of the load."""
+    """Rejected step, by its time (s) or load fraction."""
     if sim.integrator.static:
         return f"load step from {100.0 * time:.4g} % to {100.0 * (time + sim.dt):.4g} % of the load"
     own = np.broadcast_to(sim.dt, sim.model.worlds)[world]
@@ -148,7 +148,7 @@ def _step_from(sim: Any, time: float, world: int) -> str:
 
 
 def check_closed(sim: Any, mask: np.ndarray | None = None) -> None:
-    """Raise ConstraintError where a dynamic run would begin with open joints and snap them shut; in worlds (B,)."""
+    """Raise ConstraintError if dynamics starts with violated constraints, in the worlds of the mask (B,)."""
     if sim.model.constraints is None or sim.integrator.static:
         return
     for world, values in enumerate(sim.stepper.work.multipliers.value.numpy()):
@@ -158,29 +158,28 @@ def check_closed(sim: Any, mask: np.ndarray | None = None) -> None:
         if names:
             time = float(sim.time[world])
             raise ConstraintError(
-                f"joint or constraint {names[0]!r} is {worst[0]:.3g} m off at the start in world {world}, "
-                f"t = {time:.6g} s, and would snap shut in the first step; begin its drive at the present value, move "
-                "the bodies, or assemble them with solve_static",
+                f"joint or constraint {names[0]!r}: initial violation {worst[0]:.3g} m in world {world} at t = "
+                f"{time:.6g} s: start its drive at the present value, move the bodies, or assemble with solve_static",
                 joints=names, violations=worst, world=world, time=time, state=sim.state,
             )  # fmt: skip
 
 
 def _unsatisfied(sim: Any, world: int, time: float, halvings: int) -> ConstraintError:
-    """The error for constraints that stay violated although the forces balance."""
+    """Error of constraints that stay violated at equilibrium."""
     tol = sim.stepper.newton.constraint_tol
     names, values = _violated(sim.model, sim.stepper.work.multipliers.value.numpy()[world], tol)
     listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
     few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
     return ConstraintError(
         f"{_step_from(sim, time, world)}: constraints could not be satisfied in world {world} after "
-        f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; they conflict with each other or with "
-        f"supports, or ask for what the bodies can't reach (tolerance {tol:.3g} m){few}{jumping_drives(sim, world)}",
+        f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; conflicting with each other or with "
+        f"supports, or not reachable (tolerance {tol:.3g} m){few}{jumping_drives(sim, world)}",
         joints=names, violations=values, time=time, world=world, state=sim.state,
     )  # fmt: skip
 
 
 def _violated(model: Model, values: np.ndarray, tol: float) -> tuple[list[str], list[float]]:
-    """Names of the joints whose rows (rows,) exceed the tolerance (m), the worst first, and by how much, m."""
+    """Names of the joints whose rows (rows,) exceed the tolerance, worst first, and their violations, m."""
     constraints = model.constraints
     assert constraints is not None
     worst = np.array([np.abs(values[rows]).max() for rows in constraints.rows_of])
@@ -189,7 +188,7 @@ def _violated(model: Model, values: np.ndarray, tol: float) -> tuple[list[str], 
 
 
 def _worst_element(m: Model, residual: np.ndarray) -> tuple[int, str]:
-    """Model index and a description of the element whose slots carry the largest residual (slots, 3)."""
+    """Model index and description of the element with the largest residual (slots, 3) on its slots."""
     g = np.abs(residual * m.free_host).max(axis=1)
     g = np.where(np.isfinite(g), g, np.inf)
     best, index, text = -1.0, -1, "element unknown"

@@ -1,4 +1,4 @@
-"""Common instants of adaptive worlds: multiples of an interval, frames, kinks of time laws, the end of the run."""
+"""Synchronisation times of adaptive worlds: interval multiples, frames, kinks of time laws, end of run."""
 
 from __future__ import annotations
 
@@ -17,49 +17,48 @@ if TYPE_CHECKING:
 __all__ = ["Instants"]
 
 PARTS = 64
-"""Intervals of a run, if none is given."""
+"""Default number of intervals per run."""
 FRAME = 1.0 / 60.0
-"""Interval of steps without a run, s: a frame of animations."""
+"""Default interval of steps without a run, s: one animation frame."""
 SLACK = 1e-9
-"""Part of an interval within which two times are one; at least `ROUNDED` roundings of the time."""
+"""Relative tolerance of equal times, over an interval; at least `ROUNDED` roundings of the time."""
 ROUNDED = 64.0
 
 
 class Instants:
-    """When worlds meet. What is not given is settled by the first run or step, and by each run that is longer than the
-    horizon; it is part of checkpoints.
+    """Synchronisation schedule; defaults follow from the longest run and are checkpointed.
 
     Attributes:
-        interval: s between common instants, at most.
-        horizon: s, over which the error may build up.
-        origin: s; instants are whole numbers of intervals from it.
-        end: s, of the run; an instant.
-        fixed: (n,) s: kinks of time laws, and single times of outputs.
-        rates: 1/s, of outputs with frames at whole numbers over it.
+        interval: largest time between synchronisation points, s.
+        horizon: time over which the error accumulates, s.
+        origin: s; synchronisation points are whole numbers of intervals from it.
+        end: end of the run, s; a synchronisation point.
+        fixed: (n,) s: kinks of time laws, and single output times.
+        rates: 1/s, of outputs with frames at its multiples.
     """
 
     def __init__(self, laws: Iterable[TimeLaw], interval: float | None, horizon: float | None) -> None:
         self.given = interval, horizon
         self.interval = self.horizon = math.nan
         self.origin, self.end = 0.0, math.inf
-        found = [kinks(law, 0.0) for law in laws]  # both ends of what is a jump to a step
+        found = [kinks(law, 0.0) for law in laws]  # both ends of a jump
         self.kinks = self.fixed = np.unique(np.concatenate([*found, np.zeros(0)]))
         self.rates: list[float] = []
 
     @property
     def settled(self) -> bool:
-        """Whether interval and horizon are known."""
+        """True if interval and horizon are known."""
         return math.isfinite(self.interval)
 
     def begin_run(self, now: float, end: float) -> None:
-        """Before a run from `now` to `end`, both s: settle what is not given where the run is the longest yet."""
+        """Set the defaults before a run from `now` to `end`, both s, if it is the longest so far."""
         if not self.settled or end - now > (1.0 + SLACK) * self.horizon:
             self.settle(now, end)
 
     def settle(self, now: float, end: float | None = None) -> None:
-        """Take interval and horizon from a run from `now` to `end`, both s, or from steps without one.
+        """Set interval and horizon from a run from `now` to `end`, both s, or for steps without a run.
 
-        The interval is a whole part of that of the frames, which then need no instants of their own.
+        The interval divides that of the frames, which then coincide with synchronisation points.
         """
         interval, horizon = self.given
         if end is None:
@@ -75,18 +74,18 @@ class Instants:
         self.interval = interval
 
     def follow(self, outputs: Iterable[Any]) -> None:
-        """Take the times of a run's outputs."""
+        """Add the times of a run's outputs."""
         rates = [getattr(out, "rate", None) for out in outputs]
         self.rates = [rate for rate in rates if rate]
         moments = [time for out in outputs for time in getattr(out, "moments", ())]
         self.fixed = np.unique(np.concatenate([self.kinks, np.array(moments, dtype=float)]))
 
     def load(self, interval: float, horizon: float, origin: float) -> None:
-        """Take them from a checkpoint."""
+        """Restore the schedule of a checkpoint."""
         self.interval, self.horizon, self.origin = interval, horizon, origin
 
     def after(self, time: float) -> float:
-        """The first instant after a time, s."""
+        """Next synchronisation point after a time, s."""
         soon = time + self._slack(time)
         steps = [(self.origin, self.interval), *((0.0, 1.0 / rate) for rate in self.rates)]
         found = [origin + (math.floor((soon - origin) / step) + 1) * step for origin, step in steps]
@@ -96,28 +95,27 @@ class Instants:
         return float(min(found))
 
     def spans(self, times: np.ndarray) -> np.ndarray:
-        """How far it is to the next instant from times (B,), s; a whole interval has always the same bits."""
+        """Time to the next synchronisation point (B,), s; bitwise equal for full intervals."""
         known = {time: self.after(time) - time for time in set(times.tolist())}
         whole = self.interval
         return np.array([whole if 4.0 * abs(known[t] - whole) <= self._slack(t) else known[t] for t in times.tolist()])
 
     def _slack(self, time: float) -> float:
-        """s, within which another time is the same as `time`.
+        """Tolerance, s, of times equal to `time`.
 
         Raises:
-            ModelError: the interval is not above the rounding of the time.
+            ModelError: an interval below the round-off of the time.
         """
         rounded = ROUNDED * math.ulp(time)
         if 2.0 * rounded > self.interval:
             raise ModelError(
-                f"dt = 'auto': an interval of {self.interval:g} s at t = {time:g} s is within its rounding; "
-                "take a longer one"
+                f"dt = 'auto': interval {self.interval:g} s is below the round-off of t = {time:g} s: use a longer one"
             )
         return max(SLACK * self.interval, rounded)
 
     def count(self, now: float, end: float) -> int:
-        """Instants from `now` to `end`, both s, the end included."""
-        self._slack(end)  # refuses before it counts
+        """Number of synchronisation points from `now` to `end`, both s, the end included."""
+        self._slack(end)  # checks the interval
         self.end = end
         total = 0
         while now < end - self._slack(now):

@@ -1,4 +1,4 @@
-"""Drives that jump within a step that was refused."""
+"""Discontinuous drives within a rejected step."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 __all__ = ["drives", "jumping_drives"]
 
 RATIO = 10.0
-"""A drive that jumps moves so many times farther than in an equal time before."""
+"""Smallest ratio of a drive's jump to its motion in the preceding equal time."""
 ANGLE = 0.1
-"""Least angle that counts as a jump, rad."""
+"""Smallest jump of an angle, rad."""
 
 
 def jumping_drives(sim: Any, world: int) -> str:
-    """What to tell of the drives that jump within the last attempt of a world's refused step; "" without any.
+    """Description of the drives that jump within the last attempt of a world's rejected step; "" without any.
 
-    A travel counts from the size of an element on, m, an angle from `ANGLE` on.
+    Thresholds: an element size for displacements, m, `ANGLE` for angles.
     """
     driven = drives(sim.model)
     if not driven:
@@ -43,11 +43,11 @@ def jumping_drives(sim: Any, world: int) -> str:
     if not told:
         return ""
     span = f"{100.0 * h:.3g} % of the load" if sim.integrator.static else f"{h:.3g} s"
-    return f"; a drive jumps within {span}: {', '.join(told[:4])}{', ...' if len(told) > 4 else ''}; give it a ramp"
+    return f"; discontinuous drive within {span}: {', '.join(told[:4])}{', ...' if len(told) > 4 else ''}: use a ramp"
 
 
 def drives(model: Model) -> list[tuple[str, bool, list[tuple[int, np.ndarray]]]]:
-    """Name of each drive, whether it turns, and the numbers of its laws with the components that they prescribe."""
+    """Name of each drive, True if angular, and its law indices with their prescribed components."""
     number = {id(law): k for k, law in enumerate(model.terms.laws.laws)}
     out: list[tuple[str, bool, list[tuple[int, np.ndarray]]]] = []
 
@@ -69,7 +69,7 @@ def drives(model: Model) -> list[tuple[str, bool, list[tuple[int, np.ndarray]]]]
 
 
 def _element_size(model: Model) -> float:
-    """Median diagonal of the elements' boxes, m."""
+    """Median diagonal of the elements' bounding boxes, m."""
     sizes = []
     for block in model.blocks:
         for part in block.parts:

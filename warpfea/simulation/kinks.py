@@ -1,4 +1,4 @@
-"""Where time laws have kinks: jumps, and jumps of the slope."""
+"""Discontinuities of time laws: value and slope jumps."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
 __all__ = ["jumps", "kinks"]
 
 BEND = 0.25
-"""Change of the slope that counts as a kink, over the largest slope; samples of a smooth law bend less."""
+"""Slope change of a kink over the largest slope; samples of a smooth law change less."""
 BULGE = 0.03
-"""Change of the slope, times the shorter interval beside it and over the law's range, that counts as well, so that a
-jump elsewhere does not hide it: a sine with so few samples that `BEND` spares it has less."""
+"""Slope change of a kink times the shorter adjacent interval, over the law's range: detects kinks beside a large jump,
+above the value of a coarsely sampled sine that passes `BEND`."""
 STEEP = 1e-3
-"""A change within this part of a step is a jump."""
+"""Duration of a jump, over the step."""
 
 
 def jumps(law: TimeLaw, dt: float) -> np.ndarray:
-    """(n, 2) begin and end, s, of what is a jump to a step dt."""
+    """Start and end times (n, 2), s, of jumps relative to a step dt."""
     t = law.times
     if len(t) < 2:
         return np.zeros((0, 2))
@@ -30,7 +30,7 @@ def jumps(law: TimeLaw, dt: float) -> np.ndarray:
 
 
 def kinks(law: TimeLaw, dt: float) -> np.ndarray:
-    """(n,) times, s, at which the slope of a sampled law jumps; those of its jumps are in `jumps`."""
+    """Times (n,), s, of slope jumps of a sampled law; value jumps are in `jumps`."""
     t = law.times
     if len(t) < 2:
         return np.zeros(0)

@@ -1,4 +1,4 @@
-"""Warnings of time laws: those that end before a run, and drives that jump in the first step."""
+"""Warnings of time laws: ends before the end of a run, and drives that jump in the first step."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 __all__ = ["warn_of_ends", "warn_of_jumps"]
 
 JUMP = 1e-4
-"""Distance of driven nodes from where their law begins that counts, over the model's size; of joints one is refused."""
+"""Smallest reported distance of driven nodes from the start of their law, over the model's size; joints raise an
+error."""
 SMOOTH, PULSE = 0.05, 1e-9
-"""Slope at the end of a law that counts as none, over the largest; value there that counts as 0."""
+"""End slope treated as zero, over the largest slope; end value treated as 0."""
 SHOWN = 4
-"""Laws that a message names."""
+"""Maximum number of laws named in a message."""
 
 
 def warn_of_ends(sim: Any, t_end: float) -> None:
-    """Warn of sampled laws that still change where they end, before the run does (s); once of each."""
+    """Warn, once per law, of sampled laws with a nonzero end slope before t_end, s."""
     ended: dict[str, float] = {}
     for law in sim.model.terms.laws.laws:
         if len(law.times) < 2 or law.times[-1] >= t_end - 1e-9 * abs(t_end) or id(law) in sim.ended_laws:
@@ -36,15 +37,15 @@ def warn_of_ends(sim: Any, t_end: float) -> None:
         told = ", ".join(f"{name} (t = {end:g} s)" for name, end in list(ended.items())[:SHOWN])
         told += f" and {len(ended) - SHOWN} more" if len(ended) > SHOWN else ""
         warnings.warn(
-            f"time laws end before the run, at t = {t_end:g} s, and hold their last values: {told}; where that is "
-            "meant, end them with two equal samples, such as ([0, 1, 2], [0, v, v])",
+            f"time laws end before t_end = {t_end:g} s and hold their last values: {told}; to confirm, end with two "
+            "equal samples, such as ([0, 1, 2], [0, v, v])",
             ModelWarning,
             stacklevel=3,
         )
 
 
 def _changes(law: TimeLaw) -> bool:
-    """Whether a sampled law still changes where it ends: its slope there is not small, nor is it a pulse back at 0."""
+    """True if a sampled law has a nonzero end slope and is no pulse back to 0."""
     slopes = np.diff(law.values, axis=0) / np.diff(law.times)[:, None]
     if len(slopes) < 2:
         return bool(np.any(slopes))
@@ -59,9 +60,9 @@ def _changes(law: TimeLaw) -> bool:
 
 
 def warn_of_jumps(sim: Any) -> None:
-    """Warn of a drive that is not where its nodes are at the start of a motion, in the first world.
+    """Warn of a drive that differs from its nodes' positions at the start of a motion, in the first world.
 
-    What a control says is the caller's.
+    Controls are not checked.
     """
     laws = {id(law): law for s in sim.model.description.supports for law in [s.law, *(s.node_laws or [])]
             if law is not None and law.control is None}  # fmt: skip
@@ -78,8 +79,8 @@ def warn_of_jumps(sim: Any) -> None:
         if not worst > JUMP * sim.model.size:
             continue
         warnings.warn(
-            f"{law.name} moves nodes by {worst:.3g} m in the first step: at t = {time:g} s it is not where they are; "
-            "let it begin there, such as ([0, 0.1], [0, value]), or assemble the model with solve_static",
+            f"initial jump of {worst:.3g} m: {law.name} at t = {time:g} s differs from the nodes' positions: start it "
+            "there, such as ([0, 0.1], [0, value]), or assemble the model with solve_static",
             ModelWarning,
             stacklevel=3,
         )
@@ -87,7 +88,7 @@ def warn_of_jumps(sim: Any) -> None:
 
 
 def _values(sim: Any, laws: dict[int, TimeLaw], time: float) -> dict[int, np.ndarray]:
-    """(3,) of each law at a time, s, by `id`; of functions from the device."""
+    """Values (3,) of each law at a time, s, by `id`; functions are evaluated on the device."""
     if any(law.function is not None for law in laws.values()):
         found = sim.stepper.law_values(time)[0]
         return {id(law): found[k] for k, law in enumerate(sim.model.terms.laws.laws) if id(law) in laws}
@@ -95,7 +96,7 @@ def _values(sim: Any, laws: dict[int, TimeLaw], time: float) -> dict[int, np.nda
 
 
 def _away(support: Support, values: dict[int, np.ndarray], u: np.ndarray) -> np.ndarray:
-    """(slots, 3) m: how far the prescribed components of a support's positions are from where its laws want them."""
+    """Deviation (slots, 3), m, of driven positions from their time laws."""
     body = support.body
     chosen = np.flatnonzero(body.slot_kind[support.slots] == 0)
     slots = support.slots[chosen]

@@ -1,4 +1,4 @@
-"""What loops of learning keep on the device: where worlds end, what steps add up to, which worlds have stepped."""
+"""Episode bookkeeping for reinforcement learning: ends, statistics, stepped worlds."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ __all__ = ["Loops"]
 
 
 class Loops:
-    """Their arrays and launches; those that a simulation does not ask for are None and launch nothing.
+    """Arrays and launches of episodes; unused ones are None and launch nothing.
 
     Attributes:
-        ends: [world] s, where worlds are frozen.
-        tally: [world, TALLY] of the steps since it was last taken; stepped: [world] since their state was set.
+        ends: [world] end times, s, at which worlds are frozen.
+        tally: [world, TALLY] statistics since the last read; stepped: [world] flags since the state was set.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, *, quiet: bool, ends: bool) -> None:
@@ -41,28 +41,28 @@ class Loops:
             self._clear()
 
     def modules(self) -> set[wp.Module]:
-        """Modules that it launches."""
+        """Modules launched."""
         return set() if self.tally is None and self.ends is None else {loop_kernels().module}
 
     def stop_at(self, end: float = math.inf, steps: int = 0) -> None:
-        """A run of so many steps begins, whose last one is to meet its end, s; inf: it is over."""
-        # the steps add up to the end but for their roundings
+        """Set the end, s, and the number of steps of a run; inf: no run."""
+        # summed steps reach the end up to round-off
         self.work.step.stop.assign(np.array([end, steps * math.ulp(end) if steps else 0.0]))
 
     def end(self) -> None:
-        """A step begins, or has been reported: worlds that are at their end take no further part."""
+        """Freeze worlds that have reached their end time, at the start of a step or after its report."""
         step = self.work.step
         if self.ends is not None:
             self.launch(loop_kernels().end_episodes, self.worlds, [step.time, self.ends, step.dt, step.status])
 
     def close(self) -> None:
-        """A step has been reported."""
+        """Accumulate the statistics of a reported step."""
         if self.tally is not None:
             self.launch(loop_kernels().tally, self.worlds, [self.work.report, self.tally, self.stepped])
         self.end()
 
     def take(self) -> tuple[np.ndarray, np.ndarray]:
-        """What steps have added up to (worlds, TALLY), which begins anew, and which worlds have stepped (worlds,)."""
+        """Read and reset the statistics (worlds, TALLY); also the stepped worlds (worlds,)."""
         assert self.tally is not None
         assert self.stepped is not None
         sums = self.tally.numpy().copy()
@@ -74,7 +74,7 @@ class Loops:
         self.launch(loop_kernels().clear_tally, self.tally.shape, [self.tally])
 
     def flags(self, mask: wp.array) -> wp.array:
-        """A mask of int32 or bool as int32, always in the same array: what is reset may be the mask itself."""
+        """Copy a mask of int32 or bool to a persistent int32 array: the mask itself may be reset."""
         if self._flags is None:
             self._flags = wp.zeros(self.worlds, dtype=wp.int32, device=mask.device)
         if mask.dtype == wp.int32:
@@ -84,7 +84,7 @@ class Loops:
         return self._flags
 
     def unstep(self, worlds: np.ndarray | wp.array) -> None:
-        """The chosen worlds, a mask or flags on the device, have not stepped since their state was set."""
+        """Mark the chosen worlds (host mask or device flags) as not stepped since their state was set."""
         if self.stepped is None:
             return
         if isinstance(worlds, wp.array):
@@ -93,5 +93,5 @@ class Loops:
             self.stepped.assign(np.where(worlds, 0, self.stepped.numpy()))
 
     def take_numbers(self, flags: wp.array, source: Any, target: wp.array) -> None:
-        """Copy a number of the flagged worlds, on the device."""
+        """Copy one value of the flagged worlds on the device."""
         self.launch(loop_kernels().copy_chosen, self.worlds, [flags, source, target])

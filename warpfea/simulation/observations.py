@@ -1,4 +1,4 @@
-"""Numbers of each world in a table on the device, for loops that do not leave it."""
+"""Observation table [world, column] on the device."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ FORMS = "'time', 'body.NAME.position', 'probe.NAME.velocity', 'joint.NAME.angle'
 
 
 class Observations:
-    """A table [world, column] on the device that `update()` fills from the present state; made by `sim.observe(...)`.
+    """Table [world, column] on the device, filled by `update()` from the present state; made by `sim.observe(...)`.
 
-    Each name stands for columns side by side, in the order of the names:
+    Each name selects adjacent columns, in the order of the names:
 
         time                                              1: s
         body.NAME.position, .displacement, .velocity      3 per node of the mesh, in its order: m, m/s
         probe.NAME.position, .displacement, .velocity     3: m, m/s
         joint.NAME.angle, .travel, .length                1: rad, m; as `sim.joint_value`
         joint.NAME.force, .moment, .violation             3, 3, 1: N, N m, m; as `sim.joint_force`
-        contact.NAME.force, .moment, .normal_force, ...   3, 3, 1: what `ContactRecord` has, over the last step
+            contact.NAME.force, .moment, .normal_force, ...   3, 3, 1: as `ContactRecord`, over the last step
 
-    Forces are 0 in worlds that have not stepped since they were made or reset. Nothing is read back: `update()`
-    launches kernels, and `array` is always the same memory, which `wp.to_torch(obs.array)`, `torch.from_dlpack(obs)`
-    and, on the CPU, `obs.array.numpy()` share without a copy.
+        Forces are 0 in worlds without a step since construction or reset. Nothing is read back: `update()` launches
+        kernels, and `array` keeps its memory, which `wp.to_torch(obs.array)`, `torch.from_dlpack(obs)` and, on the CPU,
+        `obs.array.numpy()` share without a copy.
 
     Attributes:
         array: Warp array [world, column] in the model's precision.
@@ -179,7 +179,7 @@ class Observations:
             launch(k.joint_values, (B, len(self._values)), args)
         if self._report_columns:
             assert self._stepped is not None
-            if not sim.quiet:  # the host knows
+            if not sim.quiet:  # known on the host
                 self._stepped.assign(sim._stepped.astype(np.int32))
             args = [*self._report_columns, sim.stepper.work.report, self._stepped, self.array]
             launch(k.reports, (B, len(self._reports)), args)
@@ -188,7 +188,7 @@ class Observations:
         return self.array
 
     def __getitem__(self, name: str) -> wp.array:
-        """The columns of a name [world, column], a view of `array`."""
+        """Columns [world, column] of a name, a view of `array`."""
         if name not in self.columns:
             hint = did_you_mean(name, list(self.columns))
             raise ModelError(f"observations have no {name!r}; they have: {listing(self.columns)}{hint}")

@@ -1,12 +1,12 @@
-"""Consistent velocities and accelerations, from which schemes start that keep accelerations.
+"""Consistent initial velocities and accelerations of generalized-alpha schemes.
 
 At a state (q, v) at time t, with supports and constraints c(q, t) = 0, whose rates along the motion are c' and c'',
 
     M dv + J^T L = 0,    J (v + dv) + c_t = 0,        M w + J^T m = f - f_int,    J w = -(c'' without J w)
 
-are solved on the host, by factors of the mass matrix and a dense matrix of the constraints. In the directions that
-supports and constraints prescribe, a_0 = w(t + (am - af) h), and v_0 is off by h^2 (1/6 - beta - (am - af)/2) w', to
-which steps of one size lead (Arnold, Bruels and Cardona 2015): else the first reactions are of the first order.
+are solved on the host, by factors of the mass matrix and a dense matrix of the constraints. In prescribed directions
+a_0 = w(t + (am - af) h), and v_0 is offset by h^2 (1/6 - beta - (am - af)/2) w', the limit of constant steps (Arnold,
+Bruels and Cardona 2015): without it the first reactions are of first order.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ if TYPE_CHECKING:
 __all__ = ["Opening"]
 
 SAME = 1e-6
-"""Times closer than this part of a step are the same."""
+"""Tolerance of equal times, over a step."""
 FACTORED = 20_000
-"""Slots up to which the mass matrix is factorised; larger ones are solved iteratively."""
+"""Maximum slots of a factorised mass matrix; larger ones are solved iteratively."""
 FIRST = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
 SECOND = np.array([35.0, -104.0, 114.0, -56.0, 11.0]) / 12.0
 THIRD = np.array([-5.0, 18.0, -24.0, 14.0, -3.0]) / 2.0
-"""Derivatives at the first of five points."""
+"""Finite-difference weights of the third derivative at the first of five points."""
 REDUNDANT = 1e-11
-"""Singular values of the matrix of the constraints below this part of the largest are of redundant rows."""
+"""Relative singular value of the constraint matrix below which rows are redundant."""
 
 
 class Opening:
-    """Starts worlds whose state was set, or at whose time a law of a load or drive has a kink.
+    """Recompute consistent initial accelerations after a reset or a discontinuity.
 
     Attributes:
-        count: starts of a world so far.
+        count: number of restarts per world.
     """
 
     def __init__(self, at: At, residual: Residual, integrator: Integrator) -> None:
@@ -60,12 +60,12 @@ class Opening:
         self.count = 0
         self._breaks: tuple[float, np.ndarray, np.ndarray] = (0.0, np.zeros(0), np.zeros((2, 0)))
         self._mass: dict[int, list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]] = {}
-        self._version = -1  # of the parameters that the factors in _mass are of
-        self._world = 0  # that is started now
+        self._version = -1  # parameter version of the factors in _mass
+        self._world = 0  # the world being restarted
         refuse(at.model, integrator, self.driven)
 
     def prepare(self, dt: float) -> None:
-        """Before a step of size dt, s: start the worlds that need it."""
+        """Restart the worlds that need it, before a step of size dt, s."""
         state = self.at.state
         time, known = state.time.numpy(), state.acceleration_end.numpy()  # type: ignore[attr-defined]
         ahead, kinked = self._kinks(time, dt)
@@ -74,7 +74,7 @@ class Opening:
             self._start(flags, time, ahead, dt)
 
     def _kinks(self, time: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Times (B,) just after a jump that the state is at, else its own; whether a kink lies in the step before."""
+        """Times (B,) just after a jump at the state, else its own; and flags of a kink within the previous step."""
         if self._breaks[0] != dt:
             self._breaks = dt, *self._find_breaks(dt)
         near = SAME * dt
@@ -86,15 +86,15 @@ class Opening:
         return np.maximum(ahead, time), found
 
     def _find_breaks(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Times of all kinks, and begins and ends of jumps (2, n), to a step dt, s."""
+        """Times of all kinks, and starts and ends of jumps (2, n), for a step dt, s."""
         laws = self.model.terms.laws.laws
         steep = np.concatenate([np.zeros((0, 2)), *(jumps(law, dt) for law in laws)])
-        # forces with a kink leave accelerations continuous
+        # accelerations stay continuous across force kinks
         bent = [kinks(law, dt) for number, law in enumerate(laws) if number in self._drive_laws()]
         return np.concatenate([steep[:, 0], *bent]), steep.T
 
     def _drive_laws(self) -> set[int]:
-        """Numbers of the laws that prescribe places."""
+        """Indices of the laws that prescribe positions."""
         terms = self.model.terms
         out = set()
         if terms.supports.moved is not None:
@@ -120,7 +120,7 @@ class Opening:
         g = self._unbalanced(flags, ahead, dt)
         w, a = np.zeros_like(v), np.zeros_like(v)
         rho = self.integrator.parameter
-        early = (rho - 1.0) / (rho + 1.0)  # a_n is of the time t + early dt
+        early = (rho - 1.0) / (rho + 1.0)  # a_n belongs to the time t + early dt
         late = 1.0 / 6.0 - 1.0 / (rho + 1.0) ** 2 - 0.5 * early
         for world in np.flatnonzero(flags).tolist():
             self._world = world
@@ -128,7 +128,7 @@ class Opening:
             w[world] = self._acceleration(g[world], *motion)
             jerk = self._jerk(*motion, w[world], 0.25 * dt)
             a[world] = w[world] + early * dt * jerk
-            v[world] += late * dt**2 * jerk  # where prescribed places lead a scheme of constant steps to
+            v[world] += late * dt**2 * jerk  # prescribed: the limit of a scheme with constant steps
         self._set(state.velocity, flags, v)
         self._book(flags, self._kinetic(v) - before)
         self._set(state.acceleration, flags, w)
@@ -149,7 +149,7 @@ class Opening:
         return np.array([0.5 * np.sum(one * (masses.of_world(world) @ one)) for world, one in enumerate(v)])
 
     def _book(self, flags: np.ndarray, change: np.ndarray) -> None:
-        """What the impulse does is the integrator's."""
+        """Book the kinetic energy of the velocity correction as integrator work."""
         state: Any = self.at.state
         if "ledger" in state.specs:
             columns = list(self.model.terms.ledger)
@@ -159,9 +159,9 @@ class Opening:
             state.ledger.assign(ledger)
 
     def _law_motion(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
-        """(4, B, laws, 3): values of the time laws and their first three rates from the time (B,) on.
+        """Values of the time laws and their first three rates after the time (B,), (4, B, laws, 3).
 
-        Of samples the slope after the time alone; of a function differences over dt.
+        Samples have the slope after the time only; functions are differenced over dt.
         """
         laws = self.model.terms.laws.laws
         points = np.array([self._law_values(flags, time + 0.25 * dt * k) for k in range(len(FIRST))])
@@ -190,7 +190,7 @@ class Opening:
         """f_int + J^T lambda - f at the state in the flagged worlds, with the laws at times (B,); (B, slots, 3), N."""
         m, at, w = self.model, self.at, self.at.work
         every, active = np.ones(len(flags)), self._active(flags)
-        # rates of strain are those of the state: E~ = E - (dq/dv) dE/dt
+        # strain rates of the state: E~ = E - (dq/dv) dE/dt
         for array, value in (
             (w.step.ramp, 1.0),
             (w.step.h, dt),
@@ -215,13 +215,13 @@ class Opening:
     # supports and constraints
 
     def _rows(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
-        """J (rows, 3 slots), c' and c'' less J w (rows,)."""
+        """J (rows, 3 slots), c' and c'' without J w (rows,)."""
         tables = self.model.constraints
         gradients, first, second = constraint_rates(tables, u, v, laws)
         return tables.expand(gradients), first, second
 
     def _held(self, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities and accelerations of prescribed components, 0 of others, (slots, 3)."""
+        """Velocities and accelerations (slots, 3) of prescribed components, 0 for others."""
         rate, bend = np.zeros((2, self.model.slots, 3))
         supports = self.model.terms.supports
         if (d := supports.moved) is not None:
@@ -244,7 +244,7 @@ class Opening:
     # linear algebra
 
     def _impulse(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
-        """dv, m/s: nothing where velocities are consistent."""
+        """Velocity correction dv, m/s; zero if consistent."""
         jump = self._held(laws)[0] - np.where(self.model.free_host == 0.0, v, 0.0)
         if self.model.constraints is None:
             return self._saddle(np.zeros_like(v), jump) if jump.any() else jump
@@ -252,7 +252,7 @@ class Opening:
         return self._saddle(np.zeros_like(v), jump, J, -first)
 
     def _acceleration(self, g: np.ndarray, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
-        """w, m/s^2."""
+        """Acceleration w, m/s^2."""
         held = self._held(laws)[1]
         if self.model.constraints is None:
             return self._saddle(-g, held)
@@ -260,9 +260,9 @@ class Opening:
         return self._saddle(-g, held, J, -second)
 
     def _jerk(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray, w: np.ndarray, s: float) -> np.ndarray:
-        """The part of dw/dt, m/s^3, that supports and constraints prescribe, by differences over -s .. s.
+        """Jerk dw/dt, m/s^3, prescribed by supports and constraints, by differences over -s .. s.
 
-        The rest is left out: of stiff bodies it would be large, and their oscillations are none of a step's business.
+        Elastic jerk is omitted: it is unresolved for stiff bodies.
         """
         if self.model.constraints is None and not self.driven:
             return np.zeros_like(w)
@@ -281,7 +281,7 @@ class Opening:
         return self._saddle(np.zeros_like(w), held, rows, goal)
 
     def _saddle(self, force: np.ndarray, held: np.ndarray, J: Any = None, goal: Any = None) -> np.ndarray:
-        """x (slots, 3) with M x + J^T m = force on free components, x = held on others, and J x = goal."""
+        """Solve M x + J^T m = force on free components, x = held on others, and J x = goal for x (slots, 3)."""
         m = self.model
         x = self._solve(force - m.masses.of_world(self._world) @ held) + held
         if J is None:
@@ -306,7 +306,7 @@ class Opening:
 
 
 def mass_solver(model: Model, component: int, world: int = 0) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """The slots that are free in a component, and what solves with the mass matrix among them."""
+    """Free slots of a component, and a solver for their mass matrix."""
     free = np.flatnonzero(model.free_host[:, component])
     M = model.masses.of_world(world)[free][:, free].astype(float).tocsc()
     if len(free) <= FACTORED:
@@ -316,7 +316,7 @@ def mass_solver(model: Model, component: int, world: int = 0) -> tuple[np.ndarra
 
 
 def slope_after(law: TimeLaw, time: float) -> np.ndarray:
-    """(3,) slope of a sampled law in the interval that begins at a time or holds it; 0 beyond its samples."""
+    """Slope (3,) of a sampled law in the interval that contains a time or begins there; 0 outside its samples."""
     k = int(np.searchsorted(law.times, time, side="right")) - 1
     if k < 0 or k >= len(law.times) - 1:
         return np.zeros(3)
@@ -326,7 +326,8 @@ def slope_after(law: TimeLaw, time: float) -> np.ndarray:
 def constraint_rates(
     tables: Any, u: np.ndarray, v: np.ndarray, laws: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gradients (rows, 3, 3), first rates c' (rows,) m/s, and second rates without J w, m/s^2, of one world's rows.
+    """Gradients (rows, 3, 3), first rates c' (rows,) m/s, and second rates without J w, m/s^2, of the rows of one
+    world.
 
     u, v: (slots, 3); laws: (3 or 4, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
     """
@@ -366,12 +367,12 @@ def constraint_rates(
 
 
 def refuse(model: Model, integrator: Integrator, driven: bool) -> None:
-    """Raise ModelError where prescribed places would make the accelerations of an undamped scheme grow."""
+    """Raise ModelError if prescribed positions would make the accelerations of an undamped scheme grow."""
     if integrator.parameter < 1.0:
         return
     if model.constraints is not None or driven:
         what = f"joint {model.constraints.joints[0].name!r}" if model.constraints is not None else "a drive"
         raise ModelError(
-            f"{integrator!r}: with rho_inf = 1 the forces of joints and drives grow from step to step, and the model "
-            f"has {what}; take rho_inf below 1, such as 0.2"
+            f"{integrator!r}: rho_inf = 1 is unstable with constraints, and the model has {what}: use rho_inf "
+            "< 1, e.g. 0.2"
         )

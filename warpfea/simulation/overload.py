@@ -1,4 +1,4 @@
-"""Loads that a body's stiffness can't carry, told where a step is refused: mostly a wrong unit."""
+"""Hint for implausibly large loads (nominal stress over E) in error messages."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 __all__ = ["overload_text"]
 
 OVERLOAD = 0.3
-"""Of E: nominal stress from which a load is named."""
+"""Smallest reported nominal stress over E."""
 
 
 def overload_text(model: Model) -> str:
-    """The load with the largest nominal stress over E of its body, where that is large; else "".
+    """Load with the largest nominal stress over E of its body, if above OVERLOAD; else "".
 
-    The nominal stress of a traction or pressure is its value, that of a point load its force over the body's mean
-    section (volume over longest side), that of a weight density times g times the longest side.
+    Nominal stress: the value of a traction or pressure; force over the mean section (volume over longest side) for a
+    point load; density times g times the longest side for gravity.
     """
     found = [(0.0, "", 0.0, "", "")]
     d = model.description
@@ -46,8 +46,8 @@ def overload_text(model: Model) -> str:
     E = max(effective_modulus(body)[0] for body in model.bodies if body.name == name)
     nominal = "" if unit == "Pa" else ", as a stress,"
     return (
-        f"; the {what} of {value:.3g} {unit} on body {name!r}{nominal} is {ratio:.3g} times its E = {E:.3g} Pa, which "
-        "it can't carry: look at the units of both"
+        f"; the {what} of {value:.3g} {unit} on body {name!r}{nominal} is {ratio:.3g} times E = {E:.3g} Pa: check the "
+        "units of load and E"
     )
 
 
@@ -56,5 +56,5 @@ def _of(body: Any, what: str, value: float, stress: float, unit: str) -> tuple[f
 
 
 def _size(law: Any) -> float:
-    """Largest value of a time law, 0 of what is a function of time or a control."""
+    """Largest value of a time law, 0 for a function of time or a control."""
     return float(np.linalg.norm(law.values, axis=1).max()) if len(law.times) else 0.0

@@ -1,4 +1,4 @@
-"""The predictor of a step, its first iterate: see kernels/step/predictor.py."""
+"""Predictor: first iterate of a step, see kernels/step/predictor.py."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Predictor"]
 
 
 class Predictor:
-    """Extrapolates velocities in the order that fitted the last step best; the earlier ones are part of the state."""
+    """Velocity extrapolation in the order with the smallest error in the last step; the history is in the state."""
 
     def __init__(
         self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State, module: wp.Module,
@@ -34,21 +34,21 @@ class Predictor:
             setattr(self.control, name, work.array(f"predictor {name}", (model.worlds,), wp.int32))
         self.control.sums = work.array("predictor sums", (PREDICTOR_ROWS, model.worlds), wp.float64)
         self.control.kept = state.register("predictor", wp.float64, (4,))
-        # multistep schemes store v_{n-1} themselves
+        # multistep schemes store v_{n-1} already
         self.own = not scheme.multistep
         field = model.types.vec3, (model.slots,)
         before = state.register("predictor_before", *field) if self.own else state.previous_velocity
         self.past = before, state.register("predictor_first", *field)
 
     def begin(self) -> None:
-        """Put the first iterate into work.v, where the kernel `predict` has put v_n."""
+        """Write the first iterate to work.v, which holds v_n from the kernel `predict`."""
         m, w, step = self.model, self.work, self.work.step
         self.launch(self.kernels.begin, m.worlds, [self.control, step, w.newton])
         args = [self.control, step, m.topology.free, self.state.velocity, *self.past, w.v]
         self.launch(self.kernels.extrapolate, self.dim, args)
 
     def commit(self) -> None:
-        """After an accepted attempt, before it becomes the state: choose the next order, move the past on."""
+        """Update the velocity history and choose the next extrapolation order, after an accepted attempt."""
         m, w, step = self.model, self.work, self.work.step
         args = [self.control, step, m.topology.free, m.is_position, w.diagonal, w.v, self.state.velocity, *self.past]
         self.launch(self.kernels.compare, self.dim, [*args, w.rows])

@@ -1,4 +1,4 @@
-"""What a simulation has recorded of probes, joints and contacts."""
+"""Time histories of probes, joints and contacts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["Records"]
 
 
 class Records(Results):
-    """Results over time of probes, joints and contacts, and those of the last step."""
+    """Results of probes, joints and contacts over time and of the last step."""
 
     stepper: Stepper
     _history: Any
@@ -32,7 +32,7 @@ class Records(Results):
     _own_times: bool
 
     def probe(self, name: str) -> ProbeRecord:
-        """What the probe `name` has recorded, one entry per step. Raises ModelError listing the probes."""
+        """Record of the probe `name`, one entry per step. Raises ModelError listing the probes."""
         names = [p.name for p in self.model.probes]
         if name not in names:
             raise ModelError(f"probe {name!r} is unknown; there are: {listing(names)}{did_you_mean(name, names)}")
@@ -42,17 +42,17 @@ class Records(Results):
         return ProbeRecord(self._times(table), self.model.probes[k].X + d, d, v)
 
     def _table(self, columns: list[int]) -> np.ndarray:
-        """(B, steps, columns) of what was recorded: time, then the columns of the report from the probes on."""
+        """Recorded table (B, steps, columns): time, then the columns of the report from the probes on."""
         if self._history:
             return np.stack([rows[:, columns] for rows in self._history], axis=1)
         return np.zeros((self.model.worlds, 0, len(columns)))
 
     def _times(self, table: np.ndarray) -> np.ndarray:
-        """(steps,) s, or (B, steps) where worlds have times of their own."""
+        """Recorded times (steps,), s, or (B, steps) with times per world."""
         return table[:, :, 0] if self._own_times else table[:, :, 0].max(axis=0)
 
     def joint_record(self, joint: Joint | str) -> JointRecord:
-        """What has been recorded of a joint (handle or name), one entry per step."""
+        """Record of a joint (handle or name), one entry per step."""
         first = 1 + self._joint_column(joint) - len(REPORT)
         columns = [0, *range(first, first + JOINT_COLUMNS)]
         table = self._table(columns)
@@ -61,7 +61,7 @@ class Records(Results):
     def joint_force(self, joint: Joint | str) -> np.ndarray:
         """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
 
-        (B, 6) in world axes; `joint_record` has them over time. NaN as for `reaction`.
+        (B, 6) in world axes; over time see `joint_record`. NaN as for `reaction`.
         """
         first = self._joint_column(joint)
         out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
@@ -69,21 +69,21 @@ class Records(Results):
         return out
 
     def violation(self, joint: Joint | str) -> np.ndarray:
-        """Largest violation of a joint's rows in the present state, (B,), m; angles count times the model's size."""
+        """Largest violation of a joint's rows in the present state, (B,), m; angles are multiplied by the model's
+        size."""
         k = self._joint(joint).index
         constraints = self.model.constraints
         assert constraints is not None
         values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
-        # where the last step has brought it, the right sides are that step's: statics runs in a time of its own
+        # right-hand sides of the last step if it led to this state: statics has a time of its own
         column = self._joint_column(joint) + 6
         return np.where(self._stepped, self.stepper.work.report.numpy()[:, column], values)
 
     def joint_value(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
         """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
 
-        (B,), in the present state; a driven angle counts its full turns, another lies between -pi and pi. `what`:
-        "angle", "travel" or "length", where a joint has several. Travel is along the parent's axis, per unit of its
-        reference.
+        (B,), in the present state; a driven angle counts full turns, others lie between -pi and pi. `what`: "angle",
+        "travel" or "length" if a joint has several. Travel is along the parent's axis, per unit of its reference.
         """
         known = self._joint(joint)
         constraints = self.model.constraints
@@ -91,12 +91,12 @@ class Records(Results):
         return constraints.measure(known, what, self.state)
 
     def _joint_column(self, joint: Joint | str) -> int:
-        """First column of a joint in the report of a step."""
+        """First report column of a joint."""
         known = self._joint(joint)
         return self.model.terms.constraints.report_offset + JOINT_COLUMNS * known.index
 
     def _joint(self, joint: Joint | str) -> Joint:
-        """A joint of this model, by handle or name."""
+        """Joint of this model by handle or name."""
         known = self.model.constraints.joints if self.model.constraints else []
         for other in known:
             if other is joint or other.name == joint:
@@ -108,7 +108,7 @@ class Records(Results):
         )
 
     def contact_record(self, contact: Contact | PairContact | str) -> ContactRecord:
-        """What has been recorded of a contact (handle or name), one entry per step."""
+        """Record of a contact (handle or name), one entry per step."""
         first = 1 + self._contact_column(contact) - len(REPORT)
         table = self._table([0, *range(first, first + len(RECORD))])
         names = ("normal_force", "penetration", "slip", "area", "stick", "stored", "loss", "friction", "collider_work")
@@ -118,7 +118,7 @@ class Records(Results):
     def contact_force(self, contact: Contact | PairContact | str) -> np.ndarray:
         """Force (N) and moment about the origin (N m) of a contact on its body over the last accepted step.
 
-        (B, 6) in world axes; `contact_record` has them over time. NaN as for `reaction`.
+        (B, 6) in world axes; over time see `contact_record`. NaN as for `reaction`.
         """
         first = self._contact_column(contact)
         out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
@@ -126,7 +126,7 @@ class Records(Results):
         return out
 
     def _contact_column(self, contact: Contact | PairContact | str) -> int:
-        """First column of a contact in the report of a step."""
+        """First report column of a contact."""
         contacts, terms = self.model.description.all_contacts, self.model.terms
         for other in contacts:
             if other is contact or other.name == contact:

@@ -1,4 +1,4 @@
-"""What a simulation tells: of a step, and of probes, joints and contacts over time."""
+"""Report and record data classes: a step; probes, joints and contacts over time."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ __all__ = ["ContactRecord", "JointRecord", "PendingReport", "ProbeRecord", "Step
 
 @dataclass(frozen=True, eq=False)
 class StepReport:
-    """What a step took, each an array [world].
+    """Report of a step, each an array [world].
 
     Attributes:
-        converged: the step was accepted, and its residual is within the solver's tolerance, or rounding stops it above
-            and `floor` is the error that this leaves. With wf.Jacobi a world may go on without: False with status 0.
-        floor: estimated error of the step's increment where rounding stopped the residual, relative to the solution, in
-            the norm of energy and in float32 of displacements too; the true one is at most three times it. 0 where the
+        converged: the step was accepted with its residual within the solver's tolerance, or above it at the round-off
+            limit with the error `floor`. With wf.Jacobi a world may continue unconverged: False with status 0.
+        floor: estimated error of the step's increment if round-off stopped the residual, relative to the solution, in
+            the energy norm and in float32 also of displacements; the true one is at most three times it. 0 if the
             tolerance was reached.
-        newton, pcg: iterations, refused attempts included; Jacobi's count as newton.
+        newton, pcg: iterations, rejected attempts included; Jacobi's count as newton.
         residual: |g| over the largest force, of the last attempt.
-        halvings: refused attempts.
-        status: 0 running, 1 failed and frozen as it was before the failed step, 2 frozen by the user.
-        min_J: smallest det F at quadrature points, and of laws that need J > 0 at the vertices too. At a point a value
-            <= 0 means that an element is inside out, which a step must not bring about, see `inversion` of Simulation.
+        halvings: rejected attempts.
+        status: 0 running, 1 failed and frozen in the state before the failed step, 2 frozen by the user.
+        min_J: smallest det F at quadrature points, for laws that need J > 0 also at the vertices. A value <= 0 at a
+            quadrature point is an inverted element, see `inversion` of Simulation.
         time: s.
         residual_force: |g| over the free components, N, of the last attempt.
-        violation: largest of the constraints, m.
-        energy_growth: net energy that the integrator has added since the start, over the largest kinetic + strain +
-            contact energy plus the sum of |work|; 0 where it is not watched.
-        outer: updates of the multipliers; with multipliers="newton" one per Newton iteration.
-        stable: of statics at full load: objects True, False, or None where it can't be known (`StaticResult.stability`
-            has why). None in place of the array where it was not judged.
-        substeps, rejected: of dt="auto": accepted substeps, and those refused for their estimated error, which count
+        violation: largest constraint violation, m.
+        energy_growth: net energy gain of the integrator since the start, over the largest kinetic + strain + contact
+            energy plus the sum of |work|; 0 if not monitored.
+        outer: multiplier updates; with multipliers="newton" one per Newton iteration.
+        stable: statics at full load: objects True, False, or None if unknown (reason: `StaticResult.stability`). None
+            in place of the array without a stability analysis.
+        substeps, rejected: dt="auto": accepted substeps, and those rejected for their estimated error, which count
             among the halvings; least_h, largest_h: their sizes, s. None with a fixed dt.
     """
 
@@ -66,10 +66,10 @@ class StepReport:
 
 
 class PendingReport(StepReport):
-    """A report that is read from the device when one of its arrays is asked for.
+    """Report read from the device on first access to one of its arrays.
 
     Raises:
-        ModelError: the simulation has gone on since, and the report was not read before.
+        ModelError: the simulation has stepped since without a read.
     """
 
     def __init__(self, sim: Any, number: int) -> None:
@@ -80,7 +80,10 @@ class PendingReport(StepReport):
             raise AttributeError(name)
         sim, number = self._source
         if sim.steps != number:
-            raise ModelError(f"the report of step {number} was not read before the simulation went on to {sim.steps}")
+            raise ModelError(
+                f"report of step {number} is no longer available (simulation at step {sim.steps}): read it "
+                "before the next step"
+            )
         report = sim.last
         for entry in fields(StepReport):
             object.__setattr__(self, entry.name, getattr(report, entry.name))
@@ -92,9 +95,8 @@ class PendingReport(StepReport):
 
 @dataclass(frozen=True, eq=False)
 class JointRecord:
-    """A joint over time: time (steps,), or (worlds, steps) where worlds have times of their own; force
-    (worlds, steps, 3), N, and moment about its anchor, N m, on the child in
-    world axes; violation (worlds, steps), m, the largest of its rows."""
+    """Joint over time: time (steps,), or (worlds, steps) with times per world; force (worlds, steps, 3), N, and moment
+    about its anchor, N m, on the child in world axes; violation (worlds, steps), m, the largest of its rows."""
 
     time: np.ndarray
     force: np.ndarray
@@ -106,19 +108,18 @@ class JointRecord:
 
 @dataclass(frozen=True, eq=False)
 class ContactRecord:
-    """A contact over time, each (worlds, steps) but time (steps,), which is (worlds, steps) too where worlds have
-    times of their own.
+    """Contact over time, arrays (worlds, steps); time (steps,), or (worlds, steps) with times per world.
 
     Attributes:
         time: s.
         force, moment: on the body in world axes, moment about the world's origin; (worlds, steps, 3), N and N m.
-        normal_force: sum of the sizes of normal forces, N. It, force and moment are means over the step where the step
-            was halved, so that their impulse is that of the step.
+        normal_force: sum of normal force magnitudes, N. In a halved step this, force and moment are means over the
+            step, which conserves the impulse.
         penetration: largest depth in the step, m.
-        slip: length of slip in the step, m, and stick: share that sticks at its end; means over the area in contact.
-        area: reference area in contact at the end of the step, m^2; at an edge also points of the faces beside count.
+        slip: slip length in the step, m, and stick: sticking fraction at its end; means over the area in contact.
+        area: reference area in contact at the end of the step, m^2; at an edge it includes points of adjacent faces.
         stored: elastic energy of the contact at the end of the step, J.
-        loss, friction: energy lost in the step to restitution and to friction, J.
+        loss, friction: energy dissipated in the step by restitution and by friction, J.
         collider_work: work of the moving collider on the body in the step, J.
     """
 
@@ -140,8 +141,8 @@ class ContactRecord:
 
 @dataclass(frozen=True, eq=False)
 class ProbeRecord:
-    """A probe over time: time (steps,), or (worlds, steps) where worlds have times of their own, s; position,
-    displacement and velocity (worlds, steps, 3), in m and m/s."""
+    """Probe over time: time (steps,), or (worlds, steps) with times per world, s; position, displacement and velocity
+    (worlds, steps, 3), in m and m/s."""
 
     time: np.ndarray
     position: np.ndarray
@@ -152,7 +153,7 @@ class ProbeRecord:
 
 
 def idle_report(sim: Any) -> StepReport:
-    """The report of a simulation that has done no step since it was made or resumed."""
+    """Report of a simulation without a step since construction or resumption."""
     count = sim.model.worlds
     zero, none = np.zeros(count, int), np.zeros(count)
     counts = (zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero)
@@ -160,13 +161,13 @@ def idle_report(sim: Any) -> StepReport:
 
 
 def step_text(dt: Any) -> str:
-    """A step of all worlds, s, or the range of those of each."""
+    """Step of all worlds, s, or their range, as text."""
     low, high = float(np.min(dt)), float(np.max(dt))
     return f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
 
 
 def describe(sim: Any) -> str:
-    """A simulation in one line."""
+    """One-line description of a simulation."""
     m, steps = sim.model, sim.steps
     dt = step_text(sim.dt) if sim.error is None else f"auto, error = {sim.error:g}"
     at = f"t = {float(sim.time.max()):.6g} s, {steps} steps, dt = {dt}, {sim.integrator.name}"

@@ -1,4 +1,4 @@
-"""What a simulation knows of its present state: positions, velocities, fields, the drawn surface."""
+"""Results at the current state: positions, velocities, fields, drawn surface."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 __all__ = ["FIELDS", "Results"]
 
 SHOWN = 5
-"""Bodies that a message names."""
+"""Maximum number of bodies named in a message."""
 
 FIELDS = {"von_mises": FieldSpec("von Mises stress", "Pa"), "displacement": FieldSpec("displacement", "m")}
-"""Scalar fields of every model; terms have their own."""
+"""Scalar fields of every model; terms add their own."""
 
 
 class Results:
-    """Results of the present state of a model. Nodal ones are in the mesh file's order, worlds first."""
+    """Results of the present state of a model. Nodal results are in the mesh file's order, worlds first."""
 
     model: Model
     state: State
 
     def info(self) -> dict[str, Any]:
-        """`Model.info`, "integrator" with its options, "methods", and whether "energy_growth" is watched."""
+        """`Model.info`, "integrator" with its options, "methods", and the monitoring of "energy_growth"."""
         own: Any = self
         more = {"integrator": own.integrator.label, "methods": own.methods, "energy_growth": str(own.energy_growth)}
         return self.model.info() | more
@@ -52,43 +52,44 @@ class Results:
             raise ModelError(f"{what}: body {body.name!r} is not of this model")
 
     def _rows(self, body: Body, values: np.ndarray) -> np.ndarray:
-        """Slot values to mesh nodes, (B, nodes, 3); nodes that no element uses get 0."""
+        """Slot values at mesh nodes, (B, nodes, 3); 0 at nodes without an element."""
         out = np.zeros((self.model.worlds, len(body.mesh.points), 3))
         used = body.mesh.used_nodes
         out[:, used] = values[:, body.slot_offset + body.node_slot[used]]
         return out
 
     def displacements(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m, in the mesh file's node order. ModelError if the body is not of this model."""
+        """Nodal displacements (B, nodes, 3), m, in the mesh file's node order. ModelError for a body of another
+        model."""
         self.check_body(body, "displacements")
         return self._rows(body, self.state.displacement.numpy())
 
     def positions(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m. ModelError if the body is not of this model."""
+        """Nodal positions (B, nodes, 3), m. ModelError for a body of another model."""
         self.check_body(body, "positions")
         return body.mesh.points + self.displacements(body)
 
     def velocities(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3) m/s. ModelError if the body is not of this model."""
+        """Nodal velocities (B, nodes, 3), m/s. ModelError for a body of another model."""
         self.check_body(body, "velocities")
         return self._rows(body, self.state.velocity.numpy())
 
     def placed(self, body: Body, weights: Any) -> np.ndarray:
-        """(B, P, 3) m: present places of material points given by sparse weights (P, slots of the body)."""
+        """Current positions (B, P, 3), m, of material points given by sparse weights (P, slots of the body)."""
         u = self.state.displacement.numpy()[:, body.slots].astype(float)
         return reference_points(body, weights) + np.stack([weights @ row for row in u])
 
     def skin_points(self, body: Body) -> np.ndarray:
-        """(B, skin points, 3) m: the drawn surface."""
+        """Points (B, skin points, 3), m, of the drawn surface."""
         return self.placed(body, body.skin.slot_weights)
 
     def skin_field(self, name: str, body: Body) -> np.ndarray:
-        """(B, skin points) scalars of a field at the drawn surface."""
+        """Scalar field (B, skin points) at the drawn surface."""
         return self.field_on(name, body, body.skin)
 
     def collider_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Where the colliders are: places (B, K, 3), m, turns (B, K, 3, 3), whose columns are a shape's axes in the
-        world, and by how much surfaces lie further out (B, K), m; None of a model without contact."""
+        """Collider poses: positions (B, K, 3), m, rotations (B, K, 3, 3) with the shape's axes in the world as columns,
+        and surface offsets (B, K), m; None for a model without contact."""
         for term in self.model.terms.all:
             if isinstance(term, Contact):
                 return term.poses(self.state)
@@ -96,17 +97,17 @@ class Results:
 
     @property
     def fields(self) -> dict[str, FieldSpec]:
-        """Scalar fields there are, by name."""
+        """Available scalar fields, by name."""
         return FIELDS | self.model.terms.fields
 
     def check_field(self, name: str) -> None:
-        """Raise ModelError, with the names there are, unless `name` is a field."""
+        """Raise ModelError, listing the available names, unless `name` is a field."""
         known = self.fields
         if name not in known:
             raise ModelError(f"field {name!r} is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
 
     def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
-        """(B, P) scalars of a field at the points of a Skin or Drawing of the body."""
+        """Scalar field (B, P) at the points of a Skin or Drawing of the body."""
         self.check_field(name)
         if name == "displacement":
             moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
@@ -114,14 +115,15 @@ class Results:
         if name != "von_mises":
             values = self.model.terms.samples(name, body, self.state)
             return np.stack([drawn.node_weights @ row for row in values])
-        stress = self._stress(name, body)  # the tensor is interpolated: a bent section shows its neutral axis
+        stress = self._stress(name, body)  # interpolate the tensor: a bent section then shows its neutral axis
         return von_mises(np.stack([drawn.node_weights @ row for row in stress]))
 
     def field(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes) scalars: "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), or one of a term:
-        with contact "contact_pressure" (Pa, elastic, 0 away from contact) and "gap" (m, NaN off surfaces in contact).
+        """Scalar nodal field (B, nodes): "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), or one of
+        a term: with contact "contact_pressure" (Pa, elastic, 0 away from contact) and "gap" (m, NaN off surfaces in
+        contact).
 
-        The stress at a node of a beam is the largest of the corners of its section, of a shell that of its two faces.
+        The stress at a beam node is the maximum over the corners of its section, at a shell node over its two faces.
         """
         self.check_body(body, "field(name, body)")
         self.check_field(name)
@@ -133,18 +135,21 @@ class Results:
         return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
 
     def _stress(self, name: str, body: Body) -> np.ndarray:
-        """(B, nodes x samples, 6) Cauchy stress, Pa, behind a field."""
+        """Cauchy stress (B, nodes x samples, 6), Pa, of a stress field."""
         assert name == "von_mises"
         return self.model.evaluation.sample_stress(self.state, body)
 
     def node_gradients(self, body: Body) -> np.ndarray:
-        """(B, nodes, 3, 3) deformation gradient F at the nodes of a body with gradient slots; NaN at others.
+        """Deformation gradient F (B, nodes, 3, 3) at the nodes of a body with gradient slots; NaN at others.
 
-        Of a beam or shell, F turns the node's axes (body.node_axes) into the present ones.
+        For a beam or shell, F maps the node's reference axes (body.node_axes) to the present ones.
         """
         self.check_body(body, "node_gradients")
         if not body.family.has_gradients:
-            raise ModelError(f"body {body.name!r}: element {body.family.name} has no gradients at its nodes")
+            raise ModelError(
+                f"body {body.name!r}: element {body.family.name} has no nodal gradients (F at nodes exists for ANCF "
+                "elements only)"
+            )
         out = np.full((self.model.worlds, len(body.mesh.points), 3, 3), np.nan)
         u = self.state.displacement.numpy()[:, body.slots].astype(float)
         nodes = np.flatnonzero(body.node_slot_count == 4)

@@ -1,4 +1,4 @@
-"""The step loop of a run: outputs, Ctrl-C, the progress bar."""
+"""Step loop of a run: outputs, Ctrl-C, progress bar."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def run_steps(
     on_step: Callable[[Any], Any] | None,
     progress: bool | None,
 ) -> None:
-    """Do `total` steps with outputs; see Simulation.run.
+    """Take `total` steps with outputs; see Simulation.run.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C came while steps were left to do; outputs are closed.
+        KeyboardInterrupt: Ctrl-C with steps left; outputs are closed.
     """
     opened: list[Any] = []
     cut = False
@@ -48,7 +48,7 @@ def run_steps(
         try:
             each(open_one, outputs)
             each(lambda out: out.write(sim), opened)
-        except BaseException:  # nothing has been done yet: leave no half-empty files
+        except BaseException:  # interrupted before the first step: discard the files
             for out in opened:
                 out.abort()
             raise
@@ -72,9 +72,9 @@ def run_steps(
 
 
 def close_all(opened: list[Any], sim: Any, *, quiet: bool = True) -> None:
-    """Close all, also after one has failed or was interrupted; then raise what came first, unless `quiet`.
+    """Close all outputs, also after a failure or interruption; then raise the first error, unless `quiet`.
 
-    Ctrl-C, which gives up the output that is being closed, is raised in any case.
+    Ctrl-C, which abandons the output being closed, is always raised.
     """
     failed: BaseException | None = None
     for out in opened:
@@ -90,7 +90,7 @@ def close_all(opened: list[Any], sim: Any, *, quiet: bool = True) -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C sets a flag instead of breaking a step; a second one breaks at once."""
+    """Ctrl-C sets a flag instead of interrupting a step; a second one interrupts at once."""
     hit = [False]
 
     def handler(*_: Any) -> None:
@@ -113,7 +113,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 def step_bar(
     total: int, t_end: float, progress: bool | None, *, static: bool = False
 ) -> Iterator[Callable[[Any], None]]:
-    """A bar on stderr with time, or load, and iterations; None: when stderr is a terminal."""
+    """Progress bar on stderr with time or load, and iterations; None: if stderr is a terminal."""
     if progress is None:
         progress = sys.stderr.isatty()
     if not progress:

@@ -1,4 +1,4 @@
-"""Simulation: the step loop as users drive it."""
+"""Simulation: the user interface of the step loop."""
 
 from __future__ import annotations
 
@@ -52,46 +52,46 @@ __all__ = ["ContactRecord", "JointRecord", "ProbeRecord", "Simulation", "StepRep
 
 
 class Simulation(Digests):
-    """Steps a model through time.
+    """Time integration of a model.
 
     Args:
         model: from ModelBuilder.finalize.
-        state: where it starts; by default model.state(). It is advanced in place.
+        state: initial state; by default model.state(). It is advanced in place.
         dt: step, s, of all worlds or of each (worlds,), which may be set later; or "auto": each world takes the steps
-            that keep its error to `error`, and all meet at common instants, to which `step` goes.
+            that keep its error to `error`, and all meet at synchronisation points, to which `step` advances.
         t_end: s, of all worlds or of each (worlds,), which may be set later: the last step of a world is shortened to
-            meet it, and on the device the world is then frozen, until it is reset. None: no end.
+            meet it; the world is then frozen on the device until a reset. None: no end.
         error: of dt="auto": largest error of a position at the end, over the model's size (`model.size`).
-        interval: of dt="auto": s between common instants at most; they are multiples of it, times of outputs, kinks of
-            time laws and the ends of runs. None: a 64th of the longest run yet, 1/60 s of steps without one.
-        horizon: of dt="auto": s over which the error may build up. None: the longest run yet, or 64 intervals.
-        integrator: "backward_euler", "bdf2", "energy_momentum", or wf.GeneralizedAlpha(rho_inf=0.5), as a text
-            "generalized_alpha(rho_inf=0.5)", or wf.EnergyMomentum(rho_inf=0.8), likewise.
+        interval: of dt="auto": largest time between synchronisation points, s: its multiples, output times, kinks of
+            time laws and the ends of runs. None: a 64th of the longest run so far, 1/60 s without a run.
+        horizon: of dt="auto": time over which the error accumulates, s. None: the longest run so far, or 64 intervals.
+        integrator: "backward_euler", "bdf2", "energy_momentum", wf.GeneralizedAlpha(rho_inf=0.5) or
+            wf.EnergyMomentum(rho_inf=0.8); also as text: "generalized_alpha(rho_inf=0.5)".
         solver: "newton-pcg", "jacobi" or "direct", or options: wf.NewtonPCG(...), wf.Jacobi(...).
-        constraint_tol: largest violation of a constraint, over the model's size (`model.size`); by default 1e-8 in
-            float64, 1e-5 in float32.
-        ledger: keep the energy ledger.
-        record: keep what probes and joints tell of every step, else of the last alone.
-        capture: record a step as one graph, on the GPU and on the CPU; never done with linear="direct".
-        on_compile: called with (modules ready, modules in all, name) while kernels compile; by default a bar on stderr
-            where that is a terminal. Warp's own lines about modules are not shown, unless its log level was lowered.
+        constraint_tol: largest constraint violation, over the model's size (`model.size`); by default 1e-8 in float64,
+            1e-5 in float32.
+        ledger: compute the energy ledger.
+        record: store probe, joint and contact results of every step, else of the last only.
+        capture: capture a step as one graph, on the GPU and on the CPU; never with linear="direct".
+        on_compile: called with (modules ready, total modules, name) while kernels compile; by default a bar on stderr
+            if it is a terminal. Warp's own module messages are hidden, unless its log level was lowered.
         on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
             several only once all have failed.
-        inversion: a step that turns an element inside out, J <= 0 at a quadrature point where J was positive, is
-            refused ("refuse"), or passes where the law allows it ("report": StepReport.min_J tells).
-        energy_growth: energy that the integrator has added in a world, net, over the largest kinetic + strain + contact
-            energy plus the sum of |work|: above 1 % a warning, above 10 % steps are refused ("refuse"), or go on
-            ("warn"); "ignore" and ledger=False: not watched.
+        inversion: a step that inverts an element, J <= 0 at a quadrature point where J was positive, is rejected
+            ("refuse"), or accepted if the law allows it ("report", see StepReport.min_J).
+        energy_growth: net energy gain of the integrator in a world, over the largest kinetic + strain + contact energy
+            plus the sum of |work|: above 1 % a warning, above 10 % steps are rejected ("refuse") or continue ("warn");
+            "ignore" and ledger=False: not monitored.
 
     Attributes:
-        controls: what the caller writes between steps, see Controls.
-        compile_s, output_s: s that it took to make the simulation, kernels included, and that writers of runs took.
-        energy_growth: how the energy that the integrator adds is watched, as a text.
+        controls: values written by the caller between steps, see Controls.
+        compile_s, output_s: time to construct the simulation, kernels included, and of output writers in runs, s.
+        energy_growth: description of the energy growth monitor.
 
     Raises:
         ModelError: dt or an option out of range, or a material without a density.
-        ConstraintError: joints that are open at the start.
-        CapacityError: the device has too little memory.
+        ConstraintError: initially violated joints.
+        CapacityError: insufficient device memory.
     """
 
     def __init__(
@@ -130,9 +130,9 @@ class Simulation(Digests):
             check_times("dt", dt, model, positive=True)
         if t_end is not None:
             if adapt or scheme.static:
-                raise ModelError(f"t_end = {t_end!r}: only steps of a fixed size end there; otherwise run(t_end)")
+                raise ModelError(f"t_end = {t_end!r}: t_end per world needs a fixed dt; use run(t_end)")
             check_times("t_end", t_end, model)
-        # accelerations at the start are found on the host
+        # initial accelerations are computed on the host
         quiet = on_failure == "freeze" and not record and not (adapt or scheme.accelerated or scheme.static)
         if constraint_tol is None:
             constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
@@ -179,8 +179,8 @@ class Simulation(Digests):
 
     @property
     def dt(self) -> Any:
-        """Step, s, or (worlds,) where each has its own; of dt="auto" the interval between common instants, NaN before
-        the first run or step settles it; a longer run settles it again."""
+        """Step, s, or (worlds,) if set per world; for dt="auto" the synchronisation interval, NaN before the first run
+        or step sets it; a longer run sets it again."""
         if self.stepper.adaptive:
             return self.stepper.adaptive.instants.interval
         return self.stepper.work.step.dt.numpy().copy() if self._dt is None else self._dt
@@ -199,7 +199,7 @@ class Simulation(Digests):
 
     @property
     def t_end(self) -> np.ndarray | None:
-        """(worlds,), s: where worlds are frozen; None without."""
+        """End times (worlds,), s, at which worlds are frozen; None without."""
         ends = self.stepper.loops.ends
         return None if ends is None else ends.numpy().copy()
 
@@ -214,37 +214,37 @@ class Simulation(Digests):
 
     @property
     def time(self) -> np.ndarray:
-        """[world], s."""
+        """Time [world], s."""
         return self.state.time.numpy().copy()
 
     @property
     def load(self) -> np.ndarray | None:
-        """Part of the load that acts, 0 to 1, [world], of statics; None of a motion."""
+        """Load fraction [world], 0 to 1, in statics; None in dynamics."""
         if not self.integrator.static:
             return None
         return self.time if self._load is None else self._load
 
     @property
     def methods(self) -> dict[str, str]:
-        """What "auto" stands for here: "solver", and of NewtonPCG "linear", "operator" and "preconditioner"."""
+        """Methods chosen for "auto": "solver", and for NewtonPCG "linear", "operator" and "preconditioner"."""
         return dict(self.stepper.newton.methods)
 
     @property
     def status(self) -> np.ndarray:
-        """[world]: 0 running, 1 failed, 2 frozen."""
+        """Status [world]: 0 running, 1 failed, 2 frozen."""
         return self.state.status.numpy().copy()
 
     def step(self, count: int = 1) -> StepReport:
-        """Advance `count` steps of dt, or to the next common instants; the report is that of the last.
+        """Advance `count` steps of dt, or to the next synchronisation points; returns the report of the last.
 
         With record=False and on_failure="freeze" nothing is read back from the device (except with dt="auto",
-        generalized-alpha, linear="direct" and capture=False): the report reads when an array of it is asked for, until
-        the next call.
+            generalized-alpha, linear="direct" and capture=False): the report is read on first access to one of its
+            arrays, until the next call.
 
         Raises:
-            ConvergenceError: a step was not accepted after all halvings (see `on_failure`); the state is as before it.
-            ConstraintError: the same, and it is the constraints that can't be satisfied; it names them.
-            PenetrationError: a ConvergenceError where a body went through an obstacle; it names contact and point.
+            ConvergenceError: a step was rejected after all halvings (see `on_failure`); the state is restored.
+            ConstraintError: constraints could not be satisfied; names them.
+            PenetrationError: a ConvergenceError for a body that went through an obstacle; names contact and point.
             ModelError: `count` is not a positive whole number.
         """
         check_steps(count)
@@ -271,19 +271,19 @@ class Simulation(Digests):
         on_step: Callable[[Simulation], Any] | None = None,
         progress: bool | None = None,
     ) -> StepReport:
-        """Step until t_end (s), writing outputs. Ctrl-C ends after the step in hand, with valid files.
+        """Step until t_end (s), writing outputs. Ctrl-C ends after the current step, with valid files.
 
         Args:
-            t_end: end time, s, which is met: the last step is shortened, and what is below 1e-6 dt is no step of its
-                own. A world that is there earlier than others waits.
+            t_end: end time, s, met exactly: the last step is shortened, and a remainder below 1e-6 dt is skipped. A
+                world that arrives before others waits.
             outputs: writers (USDWriter, VTUWriter, Checkpoint, ...).
-            on_step: called after each step; ends the run when it returns False.
-            progress: show a bar on stderr; by default when stderr is a terminal.
+            on_step: called after each step; a return value of False ends the run.
+            progress: show a bar on stderr; by default if stderr is a terminal.
 
         Raises:
             ModelError: t_end lies in the past.
-            ConvergenceError, ConstraintError, OutputError: the outputs hold what came before.
-            KeyboardInterrupt: after Ctrl-C, once outputs are closed; not when no step was left to do.
+            ConvergenceError, ConstraintError, OutputError: outputs hold the preceding steps.
+            KeyboardInterrupt: after Ctrl-C with steps left, once outputs are closed.
         """
         check_time("t_end", t_end)
         if not isinstance(outputs, (list, tuple)) or not all(hasattr(out, "write") for out in outputs):
@@ -314,7 +314,7 @@ class Simulation(Digests):
         return self.last
 
     def freeze(self, worlds: Any) -> None:
-        """Leave worlds (indices or mask) as they are from now on."""
+        """Freeze worlds (indices or mask) in their present state."""
         status = self.state.status.numpy()
         try:
             status[worlds] = STATUS["frozen"]
@@ -326,18 +326,18 @@ class Simulation(Digests):
         self.state.status.assign(status)
 
     def reset(self, mask: Any = None, state: State | None = None) -> None:
-        """Set worlds back to a state, by default to the model's initial one.
+        """Reset worlds to a state, by default the model's initial one.
 
         Args:
-            mask: [world] of True and False, or the numbers of some worlds, by default all; or a Warp array of int32 or
-                bool [world] on the model's device: nothing is read back then, joints and overlaps are not checked, and
-                worlds end bit-equal to a run from that state.
-            state: where they go. With a Warp array as the mask one that a simulation of this model has had, such as
-                `sim.state.like()` keeps.
+            mask: [world] of True and False, or indices of worlds, by default all; or a Warp array of int32 or bool
+                [world] on the model's device: nothing is read back then, joints and overlaps are not checked, and
+                worlds end bitwise equal to a run from that state.
+            state: target state. With a Warp array as the mask it must come from a simulation of this model, such as a
+                copy by `sim.state.like()`.
 
         Raises:
-            ModelError: another shape or device, or a state that lacks what the simulation keeps.
-            ConstraintError: joints that are open there.
+            ModelError: another shape or device, or a state that lacks arrays of the simulation.
+            ConstraintError: violated joints in that state.
         """
         if isinstance(mask, wp.array):
             self._reset_on_device(mask, state)
@@ -369,8 +369,7 @@ class Simulation(Digests):
             state = self._start
         check_state(self.model, state)
         if lacks := [name for name in self.state.names if name not in state.names]:
-            raise ModelError(f"reset: the state lacks {listing(lacks)}; with a Warp array as the mask take one that "
-                             "a simulation of this model has had: sim.state.like()")  # fmt: skip
+            raise ModelError(f"reset: state lacks {listing(lacks)}: pass a copy of sim.state")
         self._own_times = True
         flags = self.stepper.loops.flags(mask)
         self.state.copy_rows(self.stepper.launch, flags, state)
@@ -382,7 +381,7 @@ class Simulation(Digests):
             self._stepped[flags.numpy() != 0] = False
 
     def _initial(self) -> State:
-        """The state that a simulation from the model's initial one begins with; the present one stays."""
+        """Initial state of a simulation from the model's initial state, without changing the present one."""
         self.stepper.take_parameters()
         now, stepped = self.state.like(), self._stepped.copy()
         everyone = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
@@ -397,7 +396,7 @@ class Simulation(Digests):
                 self.stepper.loops.stepped.assign(stepped.astype(np.int32))
 
     def observe(self, *names: str) -> Observations:
-        """Numbers of each world as one table on the device, see Observations."""
+        """Observation table of all worlds on the device, see Observations."""
         return Observations(self, names)
 
     # results of the whole run; more in Records, those of the present state in Results
@@ -405,13 +404,13 @@ class Simulation(Digests):
     def energies(self) -> dict[str, np.ndarray]:
         """Energy ledger, each (B,), J.
 
-        work_joints is the force at the end of each substep times the drive's travel, as the scheme has it; `integrator`
-        takes what that differs from the exact work, and may be negative.
+        work_joints is the force at the end of each substep times the drive's travel, as in the scheme; `integrator`
+        contains the difference to the exact work, and may be negative.
 
         kinetic, strain and potential (of gravity, from the reference) are current values. work (by loads, supports,
-        fields and driven joints, also given apart), viscous, contact, friction and integrator add up from the start;
-        ledger_residual is change of energy + losses - work, which equals `unbalanced`, the sum of g . dq that the
-        solver's tolerance left.
+        fields and driven joints, also listed separately), viscous, contact, friction and integrator accumulate from the
+        start; ledger_residual is change of energy + losses - work, which equals `unbalanced`, the sum of g . dq left by
+        the solver's tolerance.
         """
         if not self.stepper.ledger:
             raise ModelError("energies: the simulation was made with ledger=False")
@@ -420,7 +419,7 @@ class Simulation(Digests):
     def reaction(self, nodes: NodeSet) -> np.ndarray:
         """Force of the supports on the prescribed components of nodes at the last accepted step, (B, 3), N.
 
-        NaN for a world whose last step was refused, or that was reset or resumed and has not stepped since.
+        NaN for a world whose last step was rejected, or without a step since a reset or resumption.
         """
         if not isinstance(nodes, NodeSet):
             raise ModelError(f"reaction: expected nodes (body.nodes), got {nodes!r}")
@@ -433,7 +432,7 @@ class Simulation(Digests):
         return total
 
     def resume(self, path: Any) -> None:
-        """Continue from a checkpoint, bit for bit. Raises CheckpointError if it is of another model."""
+        """Continue from a checkpoint, bit for bit. Raises CheckpointError for one of another model."""
         from .checkpoint import load_checkpoint
 
         load_checkpoint(self, path)
@@ -441,7 +440,7 @@ class Simulation(Digests):
         self._unstep(np.ones(self.model.worlds, bool))
 
     def bytes(self) -> dict[str, int]:
-        """Bytes on the device: constants, scratch, and each array of the state (twice where steps may be halved)."""
+        """Bytes on the device: constants, scratch, and each array of the state (twice if steps may be halved)."""
         out = {f"model.{k}": v for k, v in self.model.bytes.items()}
         out |= {f"work.{k}": v for k, v in self.stepper.work.bytes.items()}
         for label, state in (("state", self.state), ("backup", self.stepper.backup)):

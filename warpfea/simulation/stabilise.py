@@ -1,4 +1,5 @@
-"""Springs that hold bodies in statics until contact does: k (1 - load) M (u - u at the last equilibrium)."""
+"""Stabilising springs for bodies in statics before contact is established: k (1 - load) M (u - u at the last
+equilibrium)."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ SOFT = 1e-3
 
 
 def spring_stiffness(model: Model, stabilise: Any) -> float:
-    """N/m per kg that `solve_static(stabilise=)` asks for; 0: none. ModelError for a bad value or a missing density."""
+    """Spring stiffness of `solve_static(stabilise=)`, N/m per kg; 0: none. ModelError for a bad value or a missing
+    density."""
     if stabilise is False or stabilise is None:
         return 0.0
     good = isinstance(stabilise, (bool, int, float, np.integer, np.floating))
@@ -40,10 +42,10 @@ def spring_stiffness(model: Model, stabilise: Any) -> float:
 
 
 class Springs(Output):
-    """What the springs carried, one entry per load step; an output of the run.
+    """Forces and energy of the springs, one entry per load step; an output of the run.
 
     Attributes:
-        stiffness: N/m per kg at no load.
+        stiffness: N/m per kg at zero load.
     """
 
     def __init__(self, stiffness: float) -> None:
@@ -52,12 +54,12 @@ class Springs(Output):
 
     @property
     def force(self) -> np.ndarray:
-        """Their resultant on the model, (B, load steps, 3), N; 0 at full load."""
+        """Resultant on the model, (B, load steps, 3), N; 0 at full load."""
         return np.stack([row[0] for row in self._rows], axis=1)
 
     @property
     def energy(self) -> np.ndarray:
-        """Stored in them, (B, load steps), J; 0 at full load."""
+        """Stored energy (B, load steps), J; 0 at full load."""
         return np.stack([row[1] for row in self._rows], axis=1)
 
     def __repr__(self) -> str:
@@ -65,10 +67,10 @@ class Springs(Output):
         return f"Springs({self.stiffness:.3g} N/m per kg, at most {largest:.3g} N)"
 
     def open(self, sim: Any) -> None:
-        """Nothing to prepare."""
+        """No-op."""
 
     def write(self, sim: Any) -> None:
-        """Take the load step that was done."""
+        """Record the completed load step."""
         if sim.last is None:
             return
         work = sim.stepper.work
@@ -78,7 +80,7 @@ class Springs(Output):
         self._rows.append((force, 0.5 * np.einsum("bsc,bsc->b", pull, moved)))
 
     def close(self, sim: Any) -> None:
-        """Nothing to finish."""
+        """No-op."""
 
     def abort(self) -> None:
-        """Nothing to drop."""
+        """No-op."""

@@ -1,15 +1,15 @@
-"""Stability of static equilibria: whether the tangent H is positive on what supports, joints and contact leave free.
+"""Stability of static equilibria: positive definiteness of the tangent H on the free components.
 
-Conjugate gradients on H from a random force r_0, preconditioned by B as the solves were (Lanczos' method in the inner
-product of B). A direction p with p.H p < 0 proves an equilibrium unstable. Where all curvatures are positive, a mode
-phi with H phi = -mu B^-1 phi, mu > 0, has phi.r_k = phi.r_0 prod(1 + mu / theta_i) with positive Ritz values theta_i:
-its part of the residual never falls. Once the norm of the residual has fallen to REDUCTION, such a mode would have held
-less than that share of the random force (Kuczynski and Wozniakowski 1992 bound the probability). The coefficients of
-the solves themselves don't do: a load may not excite the mode at all.
+Conjugate gradients on H from a random force r_0, preconditioned by B as in the solves (Lanczos' method in the inner
+product of B). A direction p with p.H p < 0 proves an equilibrium unstable. If all curvatures are positive, a mode phi
+with H phi = -mu B^-1 phi, mu > 0, has phi.r_k = phi.r_0 prod(1 + mu / theta_i) with positive Ritz values theta_i: its
+part of the residual never decreases. Once the residual norm has fallen to REDUCTION, such a mode would have held less
+than that fraction of the random force (Kuczynski and Wozniakowski 1992 bound the probability). The coefficients of the
+solves themselves don't suffice: a load may not excite the mode.
 
-The mode is that of least w = p.H p / p.M p, by locally optimal conjugate gradients (Knyazev 2001), from the direction
-that was found. A float32 state takes a float64 tangent, that of a twin of the model, where
-curvatures in float32 are not far above rounding.
+The mode of least w = p.H p / p.M p follows by locally optimal conjugate gradients (Knyazev 2001), from the direction
+found. A float32 state uses the float64 tangent of a copy of the model unless all float32 curvatures are far above
+round-off.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from .simulation import Simulation
 __all__ = ["Stability", "announce", "judge_stability"]
 
 REDUCTION = 1e-4
-"""Of the residual, in the norm of B, at which the search ends."""
+"""Relative residual, B norm, at which the search ends."""
 ITERATIONS, SHARE, MOST = 500, 0.3, 20_000
-"""After which it is given up: so many, or this share of the solve's own where that is more; where it must be known."""
+"""Iteration limits: the larger of ITERATIONS and SHARE times those of the solve; MOST with unstable="refuse"."""
 ROUNDING = 64.0
-"""Roundings of p.D p (D: diagonal of H) below which p.H p has no sign."""
+"""Round-off units of p.D p (D: diagonal of H) below which the sign of p.H p is unknown."""
 CLEAR = 1024.0
-"""The same in float32, above which it needs no tangent in float64."""
+"""The same units: float32 curvatures above need no float64 tangent."""
 NOISE = 4.0
-"""Changes of p.H p by rounding the state once more, below which it has no sign in float32."""
+"""Smallest float32 |p.H p| of known sign, over its change by one more rounding of the state."""
 MODE_ITERATIONS, MODE_CHANGE = 60, 1e-4
-"""Of the search for the mode: at most, and the relative change of w at which it ends."""
+"""Iteration limit of the mode search, and the relative change of w at which it ends."""
 TANGENT = 1e-3
-"""Relative difference of the true tangent of forces without a potential and that in H, from which they are not told."""
+"""Largest accepted relative difference between the true tangent of non-potential forces and that in H."""
 TWIN_SLOTS = 200_000
-"""Slots of all worlds up to which a float32 model is judged by itself: in float64 it takes about 7 kB for each."""
+"""Largest number of slots of all worlds for a float64 copy (about 7 kB each) of a float32 model."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """Of a static equilibrium.
+    """Stability of a static equilibrium.
 
     Attributes:
-        stable: (worlds,) objects: True, False, or None where it can't be known.
-        reasons: (worlds,) texts: why it can't be known, "" where it is.
-        mode: (worlds, slots, 3) unstable mode, largest displacement 1 m; 0 where there is none.
-        iterations: (worlds,) products H p of the search for a direction of negative curvature.
+        stable: (worlds,) objects: True, False, or None if unknown.
+        reasons: (worlds,) texts: the reason if unknown, else "".
+        mode: (worlds, slots, 3) unstable mode, largest displacement 1 m; 0 if none.
+        iterations: (worlds,) products H p of the search for negative curvature.
     """
 
     stable: np.ndarray
@@ -66,7 +66,7 @@ class Stability:
 
     @property
     def text(self) -> str:
-        """Stable, unstable, stability unknown; of several worlds how many."""
+        """Stable, unstable or stability unknown, as text; with counts for several worlds."""
         kinds = ((True, "stable"), (False, "unstable"), (None, "stability unknown"))
         found = [(sum(s is value for s in self.stable), text) for value, text in kinds]
         several = len(self.stable) > 1
@@ -93,8 +93,9 @@ def announce(result: Any, *, refuse: bool) -> None:
     size_m = f"{1e-3 * m.size:.1g}"
     text = (
         f"the equilibrium is unstable in {many}: body {body.name!r} buckles or snaps through; its mode is largest at "
-        f"({where}) m, along ({way}). What follows needs an imperfection: {size_m} * r.mode(body)[{world}] added to "
-        f"the points it is built from, a small load across, or a damped motion from r.perturbed({size_m})"
+        f"({where}) m, along ({way}). To follow the bifurcated path add an imperfection: {size_m} * r.mode(body)"
+        f"[{world}] added to the points it is built from, a small load across, or a damped motion from "
+        f"r.perturbed({size_m})"
     )
     if refuse:
         error = StabilityError(text, time=1.0, world=world, state=sim.state)
@@ -104,10 +105,10 @@ def announce(result: Any, *, refuse: bool) -> None:
 
 
 def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
-    """Judge the equilibrium that a simulation of `begin_static` has come to, before its time is put to 0.
+    """Determine the stability of the equilibrium of a `begin_static` simulation, before its time is reset to 0.
 
     Args:
-        every: also judge float32 models whose twin in float64 is large, at whatever cost.
+        every: include float32 models whose float64 copy is large, at any cost.
     """
     model = sim.model
     out = Stability(
@@ -123,13 +124,13 @@ def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
         return out
     if single and not sim.stepper.newton.direct and _clear(sim, out):
         return out
-    # an inverse of H itself is no preconditioner where H is indefinite
+    # an inverse of an indefinite H is no preconditioner
     probe = Tangent(_twin(sim) if single or sim.stepper.newton.direct else sim)
     strange = probe.unlike()
     for world in range(model.worlds):
         if strange[world] and not out.reasons[world]:
             names = ", ".join(term.name for term in model.terms if not term.potential)
-            out.reasons[world] = f"forces that no potential is known of: {names}"
+            out.reasons[world] = f"non-conservative forces: {names}"
     most = np.full(model.worlds, MOST) if every else np.maximum(ITERATIONS, (SHARE * sim.totals["pcg"]).astype(int))
     curvature, p = _search(probe, out, most)
     if single:
@@ -158,7 +159,7 @@ def _clear(sim: Simulation, out: Stability) -> bool:
 
 
 def _rubbing(sim: Simulation) -> list[tuple[int, str]]:
-    """Worlds and contacts that touch with friction."""
+    """Worlds and names of contacts that touch with friction."""
     found = []
     for term in (sim.model.terms.contact, sim.model.terms.pairs):
         for contact in term.tables.contacts if term else ():
@@ -169,9 +170,9 @@ def _rubbing(sim: Simulation) -> list[tuple[int, str]]:
 
 
 class Tangent:
-    """The tangent H at the iterate of a simulation, its preconditioner B and its diagonal, as functions on the host.
+    """Tangent H at the iterate of a simulation, its preconditioner B and diagonal, as host functions.
 
-    Vectors are (worlds, slots, 3) float64, 0 where prescribed; `flags` (worlds,) chooses the worlds.
+    Vectors are (worlds, slots, 3) float64, 0 where prescribed; `flags` (worlds,) selects worlds.
     """
 
     def __init__(self, sim: Simulation) -> None:
@@ -181,7 +182,7 @@ class Tangent:
         self.take()
 
     def take(self) -> None:
-        """Take H at the iterate at hand, without the stress of the linear prediction."""
+        """Assemble H at the current iterate with its own stress (not the linearly predicted one)."""
         w = self.work
         every = self.flags(np.ones(self.model.worlds))
         w.newton.active.fill_(1)
@@ -192,18 +193,18 @@ class Tangent:
         self.diagonal = np.where(self.free > 0.0, w.diagonal.numpy().astype(float), 1.0)
 
     def flags(self, chosen: np.ndarray) -> wp.array:
-        """A mask of worlds on the device."""
+        """Device mask of worlds."""
         return wp.array(chosen.astype(np.int32), dtype=wp.int32, device=self.model.device)
 
     def product(self, p: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """H p."""
+        """Product H p."""
         w = self.work
         w.p.assign(p)
         self.residual.product(w.p, w.Hp, self.flags(chosen))
         return self._read(w.Hp, chosen)
 
     def precondition(self, r: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """B r."""
+        """Preconditioner application B r."""
         w = self.work
         w.r.assign(r)
         self.stepper.newton.preconditioner.apply(w.r, w.z, self.flags(chosen))
@@ -213,13 +214,13 @@ class Tangent:
         return np.where(chosen[:, None, None], array.numpy().astype(float) * self.free, 0.0)
 
     def unlike(self) -> np.ndarray:
-        """(worlds,) whether forces without a potential change otherwise than H has it: their tangent is not symmetric
-        (of a pressure on an open surface), or not in H (of a field)."""
+        """Flags (worlds,) of non-potential forces whose tangent differs from that in H: unsymmetric (pressure on an
+        open surface), or absent from H (field)."""
         m, w, at = self.model, self.work, self.stepper.at
         terms = [term for term in m.terms if not term.potential]
         if not terms:
             return np.zeros(m.worlds, dtype=bool)
-        every, u = self.flags(np.ones(m.worlds)), w.u.numpy().copy()  # on the CPU a view
+        every, u = self.flags(np.ones(m.worlds)), w.u.numpy().copy()  # a view on the CPU
         gather = self.residual.gather.gather_force
 
         def gathered(call: str, pool: wp.array, *more: Any) -> np.ndarray:
@@ -244,7 +245,7 @@ class Tangent:
 
 
 def _norm(x: np.ndarray) -> np.ndarray:
-    """(worlds,) norms of vectors."""
+    """Norms (worlds,) of vectors."""
     return np.sqrt(np.einsum("bsc,bsc->b", x, x))
 
 
@@ -255,10 +256,12 @@ def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _search(
     probe: Tangent, out: Stability, most: np.ndarray, roundings: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Look for a direction of negative curvature in the worlds without a reason, for `most` (worlds,) iterations; sets
-    `stable` and `reasons`. Curvatures of fewer `roundings`, by default ROUNDING, have no sign.
+    """Lanczos search for p.H p < 0 in undecided worlds, at most `most` (worlds,) iterations; sets `stable`, `reasons`.
 
-    Returns (worlds,) p.H p and the directions p that it is judged by: the first negative one or the softest.
+    Curvatures below `roundings` round-off units, by default ROUNDING, have no sign.
+
+
+    Returns p.H p (worlds,) and the deciding directions p: the first negative one or the softest.
     """
     m = probe.model
     solver = probe.sim.solver
@@ -266,7 +269,7 @@ def _search(
     rounding = (roundings or ROUNDING) * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
     going = np.array([not reason for reason in out.reasons])
     random = np.random.default_rng(1).standard_normal((m.slots, 3))
-    r = np.where(going[:, None, None], random * probe.free, 0.0)  # the same in all worlds
+    r = np.where(going[:, None, None], random * probe.free, 0.0)  # equal in all worlds
     z = probe.precondition(r, going)
     p, rz = z.copy(), _dot(r, z)
     first, softest, curvature = rz.copy(), np.full(m.worlds, np.inf), np.zeros(m.worlds)
@@ -283,7 +286,7 @@ def _search(
             if ratio[world] < -rounding:
                 out.stable[world] = False
             else:
-                out.reasons[world] = "a motion meets no resistance above rounding (a body that is free to move?)"
+                out.reasons[world] = "zero stiffness within round-off (unconstrained body?)"
         going = going & (ratio > rounding)
         alpha = np.where(going, rz / np.where(going, pHp, 1.0), 0.0)[:, None, None]
         r = r - alpha * Hp
@@ -303,7 +306,7 @@ def _search(
 
 
 def _shake(probe: Tangent, sim: Simulation, out: Stability, curvature: np.ndarray, p: np.ndarray) -> None:
-    """Where the sign of p.H p does not outlive one more rounding of the state to float32, it is not known."""
+    """Set the sign of p.H p to unknown if float32 round-off of the state can change it."""
     state, u = probe.sim.state, sim.state.displacement.numpy().astype(float)
     shift = np.random.default_rng(3).uniform(-0.5, 0.5, u.shape) * np.finfo("float32").eps * np.abs(u) * probe.free
     state.displacement.assign(u + shift)
@@ -333,7 +336,7 @@ def _mode(probe: Tangent, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
     H, M = [probe.product(x, going)], [mass(x)]
     for _ in range(MODE_ITERATIONS):
         value = before.copy()
-        # a world that is done stays as it is, however long others take
+        # a converged world stays unchanged, independent of the others
         new = [[of[0].copy() for of in (basis, H, M)], [np.zeros_like(x) for _ in range(3)]]
         for b in np.flatnonzero(going):
             V, HV, MV = (np.stack([v[b].ravel() for v in of]) for of in (basis, H, M))
@@ -361,7 +364,7 @@ def _mode(probe: Tangent, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _twin(sim: Simulation) -> Simulation:
-    """The same equilibrium in float64, with the forces at it, as conjugate gradients want it."""
+    """Float64 copy of the equilibrium with its forces, ready for conjugate gradients."""
     model = sim.model
     twin = model.resized(model.worlds, dtype="float64")
     if model.terms.written:
@@ -385,7 +388,7 @@ def _twin(sim: Simulation) -> Simulation:
 
 
 def _open(stepper: Any) -> None:
-    """Evaluate all at the state as it is: an attempt at a step of no length, which is not solved."""
+    """Evaluate residual and tangent at the current state (no solve)."""
     w, m, state = stepper.work, stepper.model, stepper.state
     k, launch = stepper.kernels, stepper.launch
     w.step.dt.zero_()

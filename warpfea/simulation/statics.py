@@ -26,22 +26,22 @@ if TYPE_CHECKING:
 __all__ = ["UNSTABLE", "StaticResult", "begin_static", "run_static", "solve_static"]
 
 UNSTABLE = ("warn", "refuse", "ignore")
-"""What to do about an unstable equilibrium."""
+"""Treatments of an unstable equilibrium."""
 FULL = 1e-9
-"""Part of the load that may lack where all of it counts as acting."""
+"""Tolerance of the load factor at full load."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StaticResult:
-    """A static solution.
+    """Static solution.
 
     Attributes:
-        state: State at full load, with time 0: `Simulation(model, static.state, dt=...)` goes on from it.
+        state: State at full load, with time 0: initial state of `Simulation(model, static.state, dt=...)`.
         report: StepReport of the last load step.
-        simulation: the loop that found it: positions, displacements, field, reaction, ...
+        simulation: the completed load step loop: positions, displacements, field, reaction, ...
         newton, pcg: iterations of all load steps, [world].
-        stabilise: what the springs of `stabilise=` carried at the end of each load step; None without.
-        stability: whether each world is stable, why that can't be known, unstable modes; None with unstable="ignore".
+        stabilise: forces of the `stabilise=` springs at the end of each load step; None without.
+        stability: stability of each world, reason if unknown, unstable modes; None with unstable="ignore".
     """
 
     state: State
@@ -58,38 +58,38 @@ class StaticResult:
         return f"StaticResult({count}, {int(self.newton.max())} Newton, {int(self.pcg.max())} PCG iterations{stable})"
 
     def mode(self, body: Any) -> np.ndarray:
-        """(B, nodes, 3) unstable mode of each world, 0 where there is none; its largest displacement is 1 m.
+        """Unstable mode (B, nodes, 3) of each world, 0 if none; its largest displacement is 1 m.
 
-        Added to the points of a mesh, times a size in m, it is an imperfection.
+        Scaled by a size in m and added to the points of a mesh it is an imperfection.
         """
         if self.stability is None:
-            raise ModelError("solve_static(unstable='ignore') has looked for no unstable mode")
+            raise ModelError("no stability analysis was done (unstable='ignore')")
         self.simulation.check_body(body, "mode")
         return self.simulation._rows(body, self.stability.mode)
 
     def perturbed(self, size: float) -> State:
-        """A copy of the state, moved by the unstable mode times a size, m: where a motion leads off the equilibrium."""
+        """Copy of the state displaced by the unstable mode times a size, m: start of a motion off the equilibrium."""
         if self.stability is None:
-            raise ModelError("solve_static(unstable='ignore') has looked for no unstable mode")
+            raise ModelError("no stability analysis was done (unstable='ignore')")
         out = self.state.like()
         u = out.displacement.numpy()
         out.displacement.assign((u + size * self.stability.mode).astype(u.dtype))
         return out
 
     def probe(self, name: str) -> Any:
-        """The probe `name`, with one entry per load step; the last is at full load."""
+        """Record of the probe `name`, one entry per load step; the last is at full load."""
         return self.simulation.probe(name)
 
     def displacements(self, body: Any) -> np.ndarray:
-        """(B, nodes, 3) m."""
+        """Nodal displacements (B, nodes, 3), m."""
         return self.simulation.displacements(body)
 
     def positions(self, body: Any) -> np.ndarray:
-        """(B, nodes, 3) m."""
+        """Nodal positions (B, nodes, 3), m."""
         return self.simulation.positions(body)
 
     def reaction(self, nodes: Any) -> np.ndarray:
-        """Force of the supports, (B, 3), N."""
+        """Support force (B, 3), N."""
         return self.simulation.reaction(nodes)
 
     def joint_force(self, joint: Any) -> np.ndarray:
@@ -105,11 +105,11 @@ class StaticResult:
         return self.simulation.violation(joint)
 
     def node_gradients(self, body: Any) -> np.ndarray:
-        """(B, nodes, 3, 3) deformation gradient at the nodes of a body with gradient slots."""
+        """Deformation gradient (B, nodes, 3, 3) at the nodes of a body with gradient slots."""
         return self.simulation.node_gradients(body)
 
     def field(self, name: str, body: Any) -> np.ndarray:
-        """(B, nodes) scalars."""
+        """Scalar nodal field (B, nodes)."""
         return self.simulation.field(name, body)
 
 
@@ -129,34 +129,34 @@ def solve_static(
 ) -> StaticResult:
     """Find the static equilibrium.
 
-    A pseudo-time runs from 0 to 1 in `load_steps` equal parts. Constant loads, gravity and drives grow in proportion to
-    it, and so do the values of controls that the start has; laws over time are taken at it. A load step that fails is
-    halved. Viscosity plays no part.
+    A pseudo-time runs from 0 to 1 in `load_steps` equal parts. Constant loads, gravity, drives and the initial values
+        of controls are scaled by it; laws over time are evaluated at it. A failed load step is halved. Viscosity has no
+        effect.
 
     Args:
-        load_steps: number of load steps; "auto": the whole load at once, halved where it is refused.
+        load_steps: number of load steps; "auto": the whole load at once, halved after a rejection.
         tol: relative residual, by default the solver's.
-        solver: NewtonPCG options; by default with room for slender bodies, max_pcg = 20000.
-        constraint_tol, inversion: as of Simulation.
-        state: start; by default model.state(). It is copied.
-        stabilise: hold bodies that only contact, or nothing yet, holds: each part of them by a spring per mass of
-            (1 - load) times this many N/m per kg, from the last equilibrium to the next, and none at full load. True:
-            1e-3 E / (density size^2) of the stiffest body and the model's size. A smaller value moves a body further in
-            a load step and closes wider gaps, a larger one lets it lag. `StaticResult.stabilise` tells what the
-            springs carried.
-        unstable: whether the equilibrium at full load is stable is judged (`StepReport.stable`), and of one that is not
-            a StabilityWarning is given ("warn") or a StabilityError raised ("refuse"); "ignore": it is not judged.
-        outputs: writers (PNGWriter, USDWriter, VTUWriter, ...), which get each load step as a state; what they say of
-            time is the part of the load, 0 to 1, and pictures are labelled "load 100 %".
-        progress: show a bar on stderr; None: when stderr is a terminal.
+        solver: NewtonPCG options; by default with max_pcg = 20000, for slender bodies.
+        constraint_tol, inversion: as for Simulation.
+        state: initial state, copied; by default model.state().
+        stabilise: stabilise bodies restrained by contact alone, or not at all yet: a spring per mass of (1 - load)
+            times this many N/m per kg on each part, from the last equilibrium to the next, none at full load. True:
+            1e-3 E / (density size^2) of the stiffest body and the model's size. A smaller value lets a body move
+            further per load step and close wider gaps, a larger one retards it. Spring forces:
+            `StaticResult.stabilise`.
+        unstable: stability analysis at full load (`StepReport.stable`): an unstable equilibrium gives a
+            StabilityWarning ("warn") or raises a StabilityError ("refuse"); "ignore": no analysis.
+        outputs: writers (PNGWriter, USDWriter, VTUWriter, ...), which get each load step as a state; their time is the
+            load fraction, 0 to 1, and pictures are labelled "load 100 %".
+        progress: show a bar on stderr; None: if stderr is a terminal.
 
     Raises:
-        ModelError: a body is not supported, gravity or `stabilise` meets a material without a density, a contact is
-            explicit, or an option is out of range.
-        ConvergenceError: a load step was not accepted after all halvings.
-        ConstraintError: the same, and it is the constraints that can't be satisfied.
-        StabilityError: the equilibrium is unstable, with unstable="refuse".
-        CapacityError: the device has too little memory.
+        ModelError: an unsupported body, gravity or `stabilise` with a material without a density, an explicit contact,
+            or an option out of range.
+        ConvergenceError: a load step was rejected after all halvings.
+        ConstraintError: constraints could not be satisfied.
+        StabilityError: an unstable equilibrium with unstable="refuse".
+        CapacityError: insufficient device memory.
         OutputError: an output can't be written.
         KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """
@@ -179,7 +179,7 @@ def begin_static(
     stabilise: bool | float = False,
     on_compile: Callable[[int, int, str], None] | None = None,
 ) -> Simulation:
-    """The loop of `solve_static` before its first load step; ModelError as there. `on_compile` as of Simulation."""
+    """Simulation of `solve_static` before its first load step; ModelError as there. `on_compile` as for Simulation."""
     count = 1 if isinstance(load_steps, str) and load_steps == "auto" else load_steps
     if isinstance(count, (bool, str)) or not (isinstance(count, (int, np.integer)) and count >= 1):
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number, or 'auto'")
@@ -189,8 +189,7 @@ def begin_static(
     for contact in model.description.all_contacts:
         if contact.treatment == "explicit":
             raise ModelError(
-                f"contact {contact.name!r}: treatment = 'explicit' takes the force of the last state, which is no "
-                "equilibrium; take 'implicit' for statics"
+                f"contact {contact.name!r}: treatment = 'explicit' is for dynamics: use 'implicit' in statics"
             )
     springs = spring_stiffness(model, stabilise)
     if not springs:
@@ -214,16 +213,16 @@ def begin_static(
 def run_static(
     sim: Simulation, *, outputs: Sequence[Any] = (), progress: bool | None = False, unstable: str = "warn"
 ) -> StaticResult:
-    """Do the load steps of a simulation made by `begin_static`; see `solve_static`."""
+    """Run the load steps of a `begin_static` simulation; see `solve_static`."""
     springs = Springs(sim.integrator.stabilise) if sim.integrator.stabilise else None
     sim.run(1.0, outputs=[*outputs, *([springs] if springs else [])], progress=progress)
     assert sim.last is not None
-    sim._load = sim.time  # what is drawn of it later is at this load
+    sim._load = sim.time  # load fraction of later output
     found = None
     if unstable != "ignore" and (sim.time >= 1.0 - FULL).all():
         found = judge_stability(sim, every=unstable == "refuse")
         sim.last = replace(sim.last, stable=found.stable)
-    sim.model.terms.rewind(sim.state)  # what starts from the equilibrium starts at t = 0
+    sim.model.terms.rewind(sim.state)  # simulations from the equilibrium start at t = 0
     result = StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"], springs, found)
     if found is not None:
         announce(result, refuse=unstable == "refuse")

@@ -1,4 +1,4 @@
-"""One step on the device: predict, solve, accept or halve, book the energy, report. Recorded once, then replayed."""
+"""One step on the device (predict, solve, accept or halve, energy ledger, report), captured as a graph."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 __all__ = ["Stepper"]
 
 CANDIDATES = (0, 1, 2)
-"""Other first iterates, see the kernel `candidate`."""
+"""Alternative first iterates, see the kernel `candidate`."""
 
 
 class Stepper:
-    """The launches of a step of all worlds, and the graph that replays them.
+    """Launches of a step of all worlds, and the graph that replays them.
 
     The host writes `work.step.dt` and reads `work.report`; everything between stays on the device. `loops`: options of
     Loops, quiet and ends.
@@ -98,11 +98,11 @@ class Stepper:
         self.terms.allocate(self.work, self.at)
         self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
-        if model.terms.traits.walls:  # it has energies of contact, which nothing measures at rest
+        if model.terms.traits.walls:  # contact energy, which is not evaluated at rest
             state.register("predictor_potential", wp.float64)
             self.work.newton.potential = state.predictor_potential
         self.predictor: Predictor | None = None
-        # single roundings would grow from step to step, and so would what Jacobi's steps leave
+        # round-off would accumulate in single precision, and so would the residual of Jacobi steps
         if not integrator.static and model.dtype == "float64" and isinstance(solver, NewtonPCG):
             more = (self.newton.residual.reduce, state, self.kernels.module)
             self.predictor = Predictor(model, self.work, self.launch, *more, scheme=integrator)
@@ -131,7 +131,7 @@ class Stepper:
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
-        # a direct solver takes part on the host
+        # a direct solver runs on the host
         self.graph = self._record() if capture and self.newton.direct is None else None
 
     def _bind(self) -> None:
@@ -158,7 +158,7 @@ class Stepper:
             self.booked = self.terms.booked(w)
 
     def start_terms(self, mask: np.ndarray | None = None) -> None:
-        """The state of the chosen worlds was set: the terms follow it."""
+        """Reinitialise terms after the state of the masked worlds was set."""
         following = [term for term in self.terms if type(term).start is not Term.start]
         if not following and self.terms.dead.gravity_law is None:
             return
@@ -173,7 +173,7 @@ class Stepper:
             term.start(self.at, active)
 
     def begin_ledger(self, mask: np.ndarray) -> None:
-        """Measure the ledger of the chosen worlds from the present state; what has added up stays."""
+        """Restart the ledger of the masked worlds at the present state; accumulated columns stay."""
         m = self.model
         columns = list(m.terms.ledger)
         ledger = self.state.ledger.numpy()
@@ -187,7 +187,7 @@ class Stepper:
         self.state.ledger_time.assign(self.state.time)
 
     def _stored(self) -> np.ndarray:
-        """(worlds, 3) kinetic energy, strain energy and potential of gravity of the state, J."""
+        """Kinetic energy, strain energy and gravity potential of the state, (worlds, 3), J."""
         m = self.model
         rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
         kernel = self.newton.residual.gather.mass_product
@@ -197,9 +197,9 @@ class Stepper:
         return np.stack([rows.numpy()[0].sum(axis=1), m.strain_energy(self.state), pull], axis=1)
 
     def forget(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:
-        """The state of the chosen worlds was set from elsewhere: what follows it on the device is made anew.
+        """Invalidate solver history of worlds whose state was set externally.
 
-        `potential`: also where the state keeps it.
+        `potential`: also the stored potential of the state.
         """
         self.newton.forget(self._flags(mask))
         if potential or "predictor_potential" not in self.state.names:
@@ -208,7 +208,7 @@ class Stepper:
         self._changes[chosen] = self.model.parameters.changes[chosen]
 
     def take_parameters(self) -> None:
-        """Follow parameters set since the last step; the ledger has the jump of energies as work of fields."""
+        """Apply parameters set since the last step; the energy jump is booked as work of fields."""
         if self.growth:
             self.growth.follow()
         parameters = self.model.parameters
@@ -229,9 +229,9 @@ class Stepper:
             self.state.ledger.assign(ledger)
 
     def set_on_device(self, flags: wp.array, *, restart: bool = True) -> None:
-        """The state of the flagged worlds was set to one that terms and the ledger have been brought up to.
+        """Complete a device-side reset; terms and ledger already match the state.
 
-        `restart`: to another one than scratch is of.
+        `restart`: also reset scratch, for a state other than the one it belongs to.
         """
         self.newton.forget(flags)
         if "predictor_potential" not in self.state.names:
@@ -240,7 +240,7 @@ class Stepper:
             term.restart(self.at, flags)
 
     def _measure_potential(self, flags: np.ndarray | wp.array | None) -> None:
-        """Strain energy of the state in the chosen worlds, by which first iterates are judged."""
+        """Evaluate the strain energy of the state in the chosen worlds, for the choice of first iterates."""
         w = self.work
         active: wp.array = flags if isinstance(flags, wp.array) else self._flags(flags)
         w.u_stage.assign(self.state.displacement)
@@ -257,7 +257,7 @@ class Stepper:
             w.newton.potential.assign(np.where(active.numpy() != 0, measured.numpy(), w.newton.potential.numpy()))
 
     def _flags(self, mask: np.ndarray | None) -> wp.array:
-        """A mask of worlds, by default all, on the device."""
+        """Device mask of worlds, by default all."""
         flags = np.ones(self.model.worlds) if mask is None else np.asarray(mask)
         return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
 
@@ -267,7 +267,7 @@ class Stepper:
         return capture.graph
 
     def modules(self) -> list[wp.Module]:
-        """Modules a step launches, found by recording the launches without doing them."""
+        """Modules launched by a step, found by recording its launches without execution."""
         from ..kernels.common.reduce import reduce_kernels
         from ..kernels.common.state import state_kernels
 
@@ -281,7 +281,7 @@ class Stepper:
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
-        """Compile what a step launches, and what starts the ledger."""
+        """Compile the modules of a step and of the ledger's initialisation."""
         from ..kernels.step.gather import gather_kernels
 
         m = self.model
@@ -292,12 +292,12 @@ class Stepper:
         load_modules(modules, m.device, self.on_compile)
 
     def set_dt(self, dt: Any) -> None:
-        """Step of all worlds, s, or of each [world]."""
+        """Set the step of all worlds, s, or of each [world]."""
         self._dt = dt
         write_times(self.work.step.dt, dt)
 
     def run(self) -> None:
-        """Do one step of every running world."""
+        """Take one step in every running world."""
         if self.opening is not None:
             self.opening.prepare(self._dt)
         with enough_memory("a step", self.model.device):
@@ -306,10 +306,10 @@ class Stepper:
             else:
                 self.sequence()
 
-    # the sequence of launches
+    # sequence of launches
 
     def sequence(self) -> None:
-        """All launches of a step."""
+        """Launch all kernels of a step."""
         m, w, launch = self.model, self.work, self.launch
         w.any_flag[2:5].zero_()
         self.loops.end()
@@ -325,7 +325,7 @@ class Stepper:
 
     @labelled("commit")
     def _report(self) -> None:
-        """Undo a failed step, and tell of the step."""
+        """Roll back failed worlds; write the step report."""
         m, w, launch = self.model, self.work, self.launch
         with launch.rare():
             wp.capture_if(self.failed, self._undo)
@@ -338,7 +338,7 @@ class Stepper:
 
     @labelled("commit")
     def _undo(self) -> None:
-        """The worlds whose step failed for good have their state of before it again."""
+        """Restore the state of worlds whose step failed."""
         m, w, launch = self.model, self.work, self.launch
         launch(self.kernels.failed_now, m.worlds, [w.step, w.newton, w.newton.active])
         if self.backup is not None:
@@ -347,7 +347,7 @@ class Stepper:
 
     @labelled("commit")
     def _keep(self) -> None:
-        """Before the first halving the state is still that of the step's start: keep it."""
+        """Back up the state, still that of the step's start, before the first halving."""
         assert self.backup is not None
         self.backup.copy_rows(self.launch, self.work.step.first_refusal, self.state)
 
@@ -380,14 +380,14 @@ class Stepper:
         self.commit()
 
     def _candidate(self, kind: int) -> None:
-        """Put another first iterate into work.v where one is to be chosen."""
+        """Write an alternative first iterate to work.v in worlds that choose one."""
         m, w, state = self.model, self.work, self.state
         args = [w.step, w.newton, kind, m.is_position, m.topology.free, state.displacement, state.velocity]
         self.launch(self.kernels.candidate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
 
     @labelled("commit")
     def commit(self) -> None:
-        """Take over an accepted attempt."""
+        """Accept a converged attempt."""
         w, launch, state = self.work, self.launch, self.state
         if self.backup is not None:
             with launch.rare():
@@ -404,7 +404,7 @@ class Stepper:
 
     @labelled("loads")
     def _laws(self, active: wp.array) -> None:
-        """Values of the time laws at the end of the attempt."""
+        """Evaluate the time laws at the end of the attempt."""
         w = self.work
         laws = self.terms.laws
         laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
@@ -413,7 +413,7 @@ class Stepper:
         self.terms.dead.take_gravity(self.launch, w.law_stage, active)
 
     def law_values(self, time: float) -> np.ndarray:
-        """Values of the time laws at a time, s, or part of the load (B, laws, 3); the step's own stay."""
+        """Values of the time laws at a time, s, or load fraction, (B, laws, 3), without changing those of the step."""
         m, w = self.model, self.work
         kept = [(array, array.numpy().copy()) for array in (w.step.new_time, w.step.ramp, w.law_value, w.step.gravity)]
         w.step.new_time.fill_(time)

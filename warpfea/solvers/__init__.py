@@ -22,11 +22,11 @@ SOLVERS: dict[str, Callable[..., NewtonPCG | Jacobi]] = {
     "jacobi": Jacobi,
     "direct": partial(NewtonPCG, linear="direct"),
 }
-"""Solvers by name: what makes their options."""
+"""Solver option classes by name."""
 
 
 def get(solver: Any) -> NewtonPCG | Jacobi:
-    """Options of the solver that a name, options, or None for the default mean. Raises ModelError listing the names."""
+    """Solver options from a name, options, or None for the default. Raises ModelError listing the names."""
     if solver is None:
         return NewtonPCG()
     if isinstance(solver, str) and solver in SOLVERS:
@@ -39,10 +39,10 @@ def get(solver: Any) -> NewtonPCG | Jacobi:
 
 
 def make_loop(at: At, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
-    """The loop that the options describe.
+    """The solver loop of the given options.
 
     Raises:
-        ModelError: a solver that can't hold what couples bodies.
+        ModelError: a matrix-based solver for a term that couples bodies with a changing pattern.
     """
     if isinstance(options, Jacobi) or options.linear == "direct":
         refuse_couplings(at.model, "Jacobi" if isinstance(options, Jacobi) else "NewtonPCG(linear='direct')")
@@ -52,13 +52,12 @@ def make_loop(at: At, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
 
 
 def refuse_couplings(model: Model, name: str) -> None:
-    """ModelError where a term couples bodies that share no element, which a matrix with a fixed pattern can't hold."""
+    """Raise ModelError for a term that couples bodies without a shared element: the matrix has a fixed pattern."""
     found = [(term.name, couples) for term in model.terms if (couples := term.couples())]
     if found:
         kind, couples = found[0]
         a, b = (repr(model.bodies[k].name) for k in couples[0])
         more = f" and {len(couples) - 1} more" if len(couples) > 1 else ""
         raise ModelError(
-            f"{name} does not hold {kind!r}, which couple bodies {a} and {b}{more} with a pattern that changes: take "
-            "wf.NewtonPCG()"
+            f"{name} needs a fixed sparsity pattern, but {kind!r} couple bodies {a} and {b}{more}: use wf.NewtonPCG()"
         )

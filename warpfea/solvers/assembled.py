@@ -1,7 +1,7 @@
-"""H as a matrix of 3x3 blocks: its pattern, and its assembly on the device in a fixed order.
+"""H as a matrix of 3x3 blocks: its sparsity pattern, and its assembly on the device in a fixed order.
 
-Preconditioners and direct solvers are made from it, and it is the operator itself where a product with the matrix is
-cheaper than one with the elements (many quadrature points per slot).
+Preconditioners and direct solvers are built from it. It is also the operator where a product with the matrix is cheaper
+than one with the elements (many quadrature points per slot).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["Assembled", "Pattern", "chunk_of", "coupled_slots", "make_pattern", 
 
 
 def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
-    """(entries,) place of the entry (j, i) for each entry (i, j) of a symmetric pattern with sorted rows."""
+    """Position of the entry (j, i) for each entry (i, j) of a symmetric pattern with sorted rows, (entries,)."""
     rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
     return np.lexsort((rows, graph.indices)).argsort()
 
@@ -66,7 +66,7 @@ class Pattern:
 
 
 def make_pattern(model: Model, graph: sp.csr_matrix, *, mirrored: bool = True) -> Pattern:
-    """A pattern and its device struct; `mirrored=False` leaves out `upper`, which only assembly needs."""
+    """Pattern and its device struct; `mirrored=False` omits `upper`, which only assembly needs."""
     data = pattern_struct()()
     data.start = model.array("matrix pattern", graph.indptr, wp.int32)
     data.column = model.array("matrix pattern", graph.indices, wp.int32)
@@ -81,7 +81,7 @@ def make_pattern(model: Model, graph: sp.csr_matrix, *, mirrored: bool = True) -
 
 
 def coupled_slots(model: Model) -> sp.csr_matrix:
-    """Which slots share an element or an item of a term, rows sorted."""
+    """Pattern (slots, slots) of slots that share an element or an item of a term, rows sorted."""
     if "coupled slots" not in model.cache:
         graph = model.graph()
         for item, slot, count in filter(None, (term.incidence() for term in model.terms)):
@@ -95,24 +95,24 @@ def coupled_slots(model: Model) -> sp.csr_matrix:
 
 
 CHUNK, CHUNKS = 512, 16
-"""Worlds whose matrices are assembled at once: at least so many, and at most so many times to do all."""
+"""Worlds assembled at once: at least CHUNK, and enough for at most CHUNKS passes."""
 
 
 def chunk_of(worlds: int) -> int:
-    """Worlds of a chunk."""
+    """Number of worlds assembled at once."""
     return min(worlds, max(CHUNK, -(-worlds // CHUNKS)))
 
 
 class Assembled:
     """Assembly of the elements' part of H, c_M M + (dq/dv) K; terms add their `blocks` to it.
 
-    Prescribed components have rows and columns of zeros.
+    Rows and columns of prescribed components are zero.
 
-    Scratch is for a chunk of worlds; as worlds have nothing to do with each other, chunks change no bit.
+    Scratch covers a chunk of worlds; worlds are independent, so chunking is bitwise neutral.
 
     Attributes:
-        chunk: worlds that are assembled at once.
-        whole: a thread computes the matrix of a whole element (CPU); else one column of it (GPU).
+        chunk: worlds assembled at once.
+        whole: one thread computes a whole element matrix (CPU), else one column of it (GPU).
     """
 
     def __init__(
@@ -137,19 +137,19 @@ class Assembled:
         self.scratch = work.array("element matrices", (self.chunk, S), model.types.vec3)
 
     def _make_tables(self) -> tuple[Pattern, wp.array]:
-        """Make the pattern and the masses of its upper entries."""
+        """Build the pattern and the masses of its upper entries."""
         model = self.model
         pattern = make_pattern(model, coupled_slots(model))
         return pattern, model.array("matrix pattern", model.masses.of_pattern(pattern), model.types.T)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that assembly launches."""
+        """Modules launched by assembly."""
         out = {(k.element_rows if self.whole else k.element_matrix).module for k in self.element_kernels}
         out |= {self.assembly(block).module for block in self.model.blocks}
         return out | {module for term in self.model.terms for module in term.block_modules()}
 
     def _runs(self) -> list[list[tuple[Any, Any]]]:
-        """Blocks and their kernels; parts of one energy, which have the same elements, together."""
+        """Blocks and their kernels, grouped: parts of one energy share elements."""
         runs: list[list[tuple[Any, Any]]] = []
         seen: list[np.ndarray] = []
         for block, kernels in zip(self.model.blocks, self.element_kernels):
@@ -168,20 +168,20 @@ class Assembled:
         return assembly_kernels(self.model.dtype, block.slots, self.whole)
 
     def _size(self, block: Any) -> int:
-        """Vectors of three numbers in the matrices of a block's elements."""
+        """Number of 3-vectors in the matrices of a block's elements."""
         if self.whole:
             _, width, rows = panels_of(block.slots)
             return 3 * width * rows * block.count
         return 3 * block.slots * (block.slots + 1) // 2 * block.count
 
     def _contributions(self, block: Any) -> tuple[wp.array, wp.array]:
-        """What of its elements adds to which entry, found on the device: see `list_contributions`."""
+        """Contribution lists (element entry -> matrix entry) built on the device by `list_contributions`."""
         model = self.model
         kernels = self.assembly(block)
         if 2 * kernels.places * block.count >= 2**31:
             raise ModelError(
-                f"{block.count} elements of {block.slots} slots have too many pairs of slots for a matrix: at most "
-                f"{2**30 // kernels.places} such elements, or preconditioner='block-jacobi' with operator='elements'"
+                f"matrix too large to index: {block.count} elements of {block.slots} slots, at most "
+                f"{2**30 // kernels.places} such elements; use preconditioner='block-jacobi' with operator='elements'"
             )
         upper = len(self.pattern.upper)
         start = wp.zeros(upper + 1, dtype=wp.int32, device=model.device)
@@ -196,11 +196,11 @@ class Assembled:
         return start, source
 
     def values(self, name: str, worlds: int | None = None) -> wp.array:
-        """A new array for the blocks, [world, entry]; `worlds`: of a chunk, see `view`."""
+        """New array of block values [world, entry]; `worlds`: the size of a chunk, see `view`."""
         return self.work.array(name, (worlds or self.model.worlds, self.pattern.entries), self.model.types.mat33)
 
     def view(self, values: wp.array, first: int) -> wp.array:
-        """An array of a chunk as one of all worlds, [world, entry], where those from `first` on alone are there."""
+        """Chunk array indexed as [world, entry] over all worlds; only rows from `first` on exist."""
         out: Any = wp.array(
             ptr=values.ptr - first * values.strides[0], dtype=values.dtype, device=values.device,
             shape=(self.model.worlds, self.pattern.entries),
@@ -214,8 +214,9 @@ class Assembled:
     ) -> None:  # fmt: skip
         """out = c_M M + (dq/dv) K at u; `factors` are c_M and dq/dv per world.
 
-        `projected`: K is made positive semi-definite at each quadrature point, and depends on u and the factors alone.
-        `worlds`: those to look at.
+        `projected`: K is made positive semi-definite at each quadrature point; it then depends on u and the factors
+        only.
+        `worlds`: the worlds to scan.
         """
         w = self.work
         every = worlds or range(self.model.worlds)
@@ -229,7 +230,7 @@ class Assembled:
                 self._assemble(last - first, [a[first:last] for a in state], projected, first)
 
     def _assemble(self, count: int, state: list[wp.array], projected: bool, first_world: int = 0) -> None:
-        """Assemble so many worlds from the first one on, of which `state` has the arrays."""
+        """Assemble `count` worlds from `first_world` on; `state` holds their arrays."""
         m, launch = self.model, self.launch
         u, v, base, mixed, history, mass_factor, dq_dv, active, out = state
         mass = m.cache["matrix"][1]
@@ -259,7 +260,7 @@ class Assembled:
             launch(self.assembly(block).add_elements, (count, len(self.pattern.upper)), args)
 
     def matrix(self, values: wp.array, world: int = 0) -> sp.csr_matrix:
-        """The blocks of one world as (3 slots, 3 slots) CSR on the host."""
+        """Blocks of one world as CSR (3 slots, 3 slots) on the host."""
         graph = self.pattern.graph
         data = values.numpy()[world].astype(float)
         n = 3 * self.model.slots
@@ -267,7 +268,7 @@ class Assembled:
 
 
 def shaped(array: wp.array, shape: tuple[int, ...], dtype: Any = None) -> wp.array:
-    """The beginning of an array seen with another shape and type."""
+    """The leading entries of an array as a view of another shape and type."""
     out: Any = wp.array(ptr=array.ptr, dtype=dtype or array.dtype, shape=shape, device=array.device)
     out._owner = array
     return out

@@ -2,11 +2,11 @@
 
 Measured on one core, ms per step with the two-level preconditioner and with the band: bars of T10 with 1 x 1, 2 x 2 and
 3 x 3 cells across (bandwidth 84, 208 and 392) 10.9 and 1.0, 38 and 4.4, 40 and 10.6; 100 links of E = 7e12 Pa on joints
-43 and 5.2 (413 with 3x3 blocks); a square plate of 16 x 16 shells (404) 17.4 and 11.5 in vibration, but 29 and 41 where
-it turns and bends so fast that factors last for few steps only. Wider bands do worse.
+43 and 5.2 (413 with 3x3 blocks); a square plate of 16 x 16 shells (404) 17.4 and 11.5 in vibration, but 29 and 41 in
+fast rotation and bending, where factors last for few steps only. The gain falls further with wider bands.
 
-Where a factorisation costs little beside the matrix itself, every matrix of the operator is factored, which leaves one
-iteration of PCG per solve; wider bands are factored when the rule of kernels/solvers/reuse.py says so.
+If a factorisation is cheap relative to assembly, every matrix of the operator is factored, which leaves one PCG
+iteration per solve; factors of wider bands are kept by the reuse rule (kernels/solvers/reuse.py).
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 __all__ = ["Band", "BandFactor", "block_band", "find_band"]
 
 WIDEST = 112
-"""Widest band that is chosen by itself, blocks beside the diagonal; beyond, the two-level preconditioner is cheaper."""
+"""Widest band chosen automatically, blocks beside the diagonal; beyond it the two-level preconditioner is cheaper."""
 WHOLE_SLOTS = 160
-"""A model of up to this many slots is factored as a whole: here in a band of any width, or else as a dense matrix."""
+"""Largest number of slots of a model factored as a whole: here in a band of any width, or else as a dense matrix."""
 LARGEST = 2**31
-"""Bytes of the factors of a world from which on 32-bit indices can't address them."""
+"""Size of the factors of one world above which 32-bit indices overflow, bytes."""
 BLOCK_BYTES, WORLD_BYTES = 48 * 1024, 200_000
-"""On CUDA: of the window of a block of threads, and of the factors of a world that it may take."""
+"""CUDA limits, bytes: the shared-memory window of a thread block, and the factors of one world that it factors."""
 ASSEMBLY, FACTORISATION = 1.0, 5.5e-5
 """us per unknown on one core: assembling H of 3243 and T10 elements; a factorisation, per square of the bandwidth."""
 PRODUCT, SOLUTION = 0.06, 5.4e-4
@@ -46,7 +46,7 @@ PRODUCT, SOLUTION = 0.06, 5.4e-4
 
 
 def block_band(model: Model) -> Band | None:
-    """The narrow band of a small model on CUDA that a block of threads per world factors; else None."""
+    """Narrow band of a small model on CUDA, factored by one thread block per world, or None."""
     band = find_band(model) if model.device.is_cuda else None
     if band is None:
         return None
@@ -57,12 +57,12 @@ def block_band(model: Model) -> Band | None:
 
 @dataclass(eq=False)
 class Band:
-    """An order of the slots in which the pattern is a band.
+    """Slot order in which the pattern is a band.
 
     Attributes:
-        slot_at, place_of: (slots,) on the device, the order and its inverse.
-        rows: 4 x 4 blocks on the diagonal.
-        width: blocks beside the diagonal in a row.
+        slot_at, place_of: device tables (slots,), the order and its inverse.
+        rows: number of 4 x 4 block rows.
+        width: blocks beside the diagonal per row.
     """
 
     slot_at: wp.array
@@ -72,18 +72,18 @@ class Band:
 
     @property
     def rebuild_cost(self) -> float:
-        """Cost of the matrix and its factors, in iterations of PCG."""
+        """Cost of assembly and factorisation, in PCG iterations."""
         b = BLOCK * self.width
         return (ASSEMBLY + FACTORISATION * b * b) / (PRODUCT + SOLUTION * b)
 
     @property
     def quick(self) -> bool:
-        """Whether a factorisation costs little beside assembling the matrix."""
+        """True if factorisation is cheap relative to assembly."""
         return FACTORISATION * (BLOCK * self.width) ** 2 < 0.2 * ASSEMBLY
 
 
 def find_band(model: Model, *, any_width: bool = False) -> Band | None:
-    """The band in the reverse Cuthill-McKee order if it is narrow or the model small, or with `any_width`; else None.
+    """Band in the reverse Cuthill-McKee order if it is narrow, the model small, or `any_width` given; else None.
 
     Raises:
         ModelError: with `any_width`, factors too large to address.
@@ -98,7 +98,7 @@ def _find_band(model: Model, any_width: bool) -> Band | None:
     graph = coupled_slots(model)
     n = graph.shape[0]
     free = any_width or n <= WHOLE_SLOTS
-    # in no order is a band narrower than half the number of a row's neighbours
+    # lower bound of the bandwidth in any order: half the number of a row's neighbours
     if not free and 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (WIDEST + 1):
         return None
     order = sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True)
@@ -122,10 +122,10 @@ def _find_band(model: Model, any_width: bool) -> Band | None:
 
 
 class BandFactor:
-    """The banded factors of all worlds, and the launches that make and apply them.
+    """Banded factors of all worlds, with the launches that compute and apply them.
 
     Attributes:
-        exact: (worlds,) flags of the worlds whose factors are those of the matrix, without a shift.
+        exact: (worlds,) flags of worlds whose matrix was factored without a diagonal shift.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, band: Band, pattern: Pattern) -> None:
@@ -146,13 +146,13 @@ class BandFactor:
         self.again = work.array("band again", (1,), wp.int32)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that it launches."""
+        """Modules launched."""
         return {self.kernels.module} | ({self.by_block.module} if self.blocks else set())
 
     def make(self, value: wp.array, active: wp.array) -> None:
         """Factor the blocks `value` [world, entry] of the active worlds.
 
-        Where the matrix is not positive definite, a multiple of its diagonal is added until it is.
+        An indefinite matrix is shifted by multiples of its diagonal until it is positive definite.
         """
         self.launch(self.kernels.begin, self.worlds, [active, self.doing, self.shift])
         self._factor(value)

@@ -13,10 +13,10 @@ __all__ = ["BiCGStab"]
 
 
 class BiCGStab(PCG):
-    """Solves H p = -g for the active worlds where H is unsymmetric, with the preconditioner of a symmetric part.
+    """Solve H p = -g in the active worlds for unsymmetric H, preconditioned by its symmetric part.
 
-    An iteration takes two products and two preconditionings. Translations of free groups are deflated as in `PCG`: they
-    meet no stiffness in this operator either.
+    One iteration takes two products and two preconditioner applications. Translations of free groups are deflated as in
+    `PCG`: this operator has no stiffness along them either.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -41,7 +41,7 @@ class BiCGStab(PCG):
             wp.capture_if(bi.any_again, self._begin_again)
 
     def _begin_again(self) -> None:
-        """Go on from the best of a solve that stalled."""
+        """Restart a stalled solve from its best iterate."""
         w, k, launch, bi = self.work, self.recursion, self.launch, self.control
         self._precondition(w.r, w.z, bi.again)
         w.pcg.any_active.zero_()
@@ -50,7 +50,7 @@ class BiCGStab(PCG):
         launch(k.finish, self.model.worlds, [w.newton, w.pcg, bi, 0])
 
     def _recur(self) -> None:
-        """Iterate from r and z = B r, and take the best."""
+        """Iterate from r and z = B r; keep the best iterate."""
         w, k, launch = self.work, self.recursion, self.launch
         launch(k.first_direction, self.dim, [w.pcg, w.z, w.r, w.direction, self.shadow, w.p, *self.best])
         wp.capture_while(w.pcg.any_active, self._iterate)

@@ -21,10 +21,9 @@ __all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_clusters", 
 
 @dataclass(eq=False)
 class ClusterTables:
-    """Clusters of the elements of a block, as the device struct of kernels/elements/cluster.py has them.
+    """Element clusters of a block, as the device struct of kernels/elements/cluster.py.
 
-    The slots of a cluster are sorted by falling number of elements, so that the threads of a warp sum about as many
-    forces each.
+    The slots of a cluster are sorted by falling valence to balance the warp.
     """
 
     start: np.ndarray
@@ -36,7 +35,7 @@ class ClusterTables:
 def cluster_tables(conn: np.ndarray, size: int) -> ClusterTables:
     """Tables of clusters of up to `size` consecutive elements with slots `conn` (E, S).
 
-    A run of elements that has more slots than a cluster holds is halved.
+    A range of elements with more slots than a cluster holds is halved.
     """
     count, slots = conn.shape
     start = np.append(np.arange(0, count, size), count)
@@ -72,12 +71,12 @@ def cluster_tables(conn: np.ndarray, size: int) -> ClusterTables:
 
 @dataclass(eq=False)
 class ModelClusters:
-    """The clusters of a model.
+    """Clusters of a model.
 
     Attributes:
         blocks: device struct and number of clusters of each block.
-        topology: device struct of the gather of slots, with the sums of clusters as contributions.
-        sums: number of these sums.
+        topology: device struct of the slot gather, with the cluster sums as contributions.
+        sums: number of cluster sums.
     """
 
     blocks: list[tuple[Any, int]]
@@ -86,7 +85,7 @@ class ModelClusters:
 
 
 def make_clusters(model: Model) -> ModelClusters:
-    """The clusters of a model all of whose blocks are straight, with the mass in the same product."""
+    """Clusters of a model with straight elements only, mass included in the product."""
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
         tables = cluster_tables(block.connectivity, block.cluster)
@@ -108,7 +107,7 @@ def make_clusters(model: Model) -> ModelClusters:
 
 
 def make_pool(model: Model, work: Workspace, *, midpoint: bool) -> Any:
-    """Device struct with the arrays that take the place of shared memory on the CPU; empty on CUDA."""
+    """Device struct of the arrays that replace shared memory on the CPU; empty on CUDA."""
     pool, on_host = pool_struct(model.dtype)(), not model.device.is_cuda
     numbers = max(pool_size(b.cluster, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks)
     words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)

@@ -1,5 +1,5 @@
-"""Inverses of dense matrices, one per world or, where nothing couples parts of it, one per part, by block Gauss-Jordan
-with blocks of the size of a tile."""
+"""Inverses of dense matrices by block Gauss-Jordan with tile-sized blocks: one per world, or one per uncoupled
+component of it."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ __all__ = ["DenseInverse", "Parts", "gauss_jordan"]
 
 @dataclass(eq=False)
 class Parts:
-    """Parts of a pattern that no entry couples.
+    """Uncoupled components of a pattern.
 
     Attributes:
         count: their number; most: slots of the largest.
-        slot: device table [part, place], -1 where there is none; place_of: [slot].
+        slot: device table [component, position], -1 if unused; place_of: its inverse, [slot].
     """
 
     count: int
@@ -40,7 +40,7 @@ class Parts:
 
     @classmethod
     def of(cls, model: Model, pattern: Pattern) -> Parts | None:
-        """None where their matrices are not smaller together than that of the whole."""
+        """None if splitting saves no memory."""
         count, label = sp.csgraph.connected_components(pattern.graph, directed=False)
         slots = len(label)
         most = int(np.bincount(label).max())
@@ -56,25 +56,25 @@ class Parts:
 
 
 def filled(unknowns: int) -> int:
-    """Unknowns in whole tiles."""
+    """Number of unknowns rounded up to whole tiles."""
     return TILE * -(-unknowns // TILE)
 
 
 def gauss_jordan(
     launch: Launcher, kernels: Any, tiles: int, at: Any, matrix: wp.array, flags: wp.array, *, keep: bool
 ) -> None:
-    """Inverses in place of tiles [world, tile, TILE, TILE]; `at` has their `diagonal`, and a `column` as scratch."""
+    """Invert tiles [world, tile, TILE, TILE] in place; `at` holds their `diagonal` and a scratch `column`."""
     lanes = LANES if launch.device.is_cuda else 1
     args = [lanes, tiles, int(keep), flags, at.diagonal, at.column, matrix]
     launch(kernels.invert_tiles, flags.shape[0] * tiles * lanes, args, block_dim=LANES)
 
 
 class DenseInverse:
-    """A matrix [world, row, column] and its inverse in its place, in the precision `storage` in `stored`.
+    """Matrix [world, row, column] and its inverse in place, stored in `stored` with precision `storage`.
 
     Attributes:
-        unknowns: of the matrix; size: those and what fills its last tile.
-        matrix, scale: to be filled before `invert`, and the matrix' diagonal; zeros beyond the unknowns.
+        unknowns: matrix size; size: the same rounded up to whole tiles.
+        matrix, scale: filled before `invert`: the matrix and its diagonal; zero beyond the unknowns.
     """
 
     def __init__(
@@ -107,12 +107,12 @@ class DenseInverse:
         self.column = work.array(f"{name} column", (B, 1, TILE), T)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that it launches."""
+        """Modules launched."""
         more = {self.by_part.module} if self.parts else set()
         return {self.making.module, self.kernels.module} | more
 
     def fill(self, pattern: Pattern, value: Any, flags: wp.array) -> None:
-        """Take over a matrix of 3x3 blocks in the flagged worlds."""
+        """Copy a matrix of 3x3 blocks in the flagged worlds."""
         if self.parts:
             self.launch(self.by_part.spread, self.blocks, [flags, self.flags])
             args = [pattern.data, value, self.parts.slot, self.parts.place_of, self.flags, self.scale, self.matrix]
@@ -122,9 +122,9 @@ class DenseInverse:
         self.launch(self.making.fill_dense, (self.worlds, self.size // 3), args)
 
     def invert(self, flags: wp.array, *, keep: bool, reduce: Any) -> None:
-        """The inverse in the flagged worlds; `reduce` sums rows (residual.Reducer)."""
+        """Invert in the flagged worlds; `reduce` sums rows (residual.Reducer)."""
         B, N, k, launch = self.blocks, self.size, self.making, self.launch
-        if self.parts:  # `fill` has spread them
+        if self.parts:  # scattered by `fill`
             flags = self.flags
         for first in range(0, N, TILE):
             args = [self.matrix, self.scale, first, flags, self.diagonal, self.pivot]

@@ -1,12 +1,12 @@
-"""The direct solver: a sparse factorisation of H, used as a preconditioner so good that PCG needs one iteration.
+"""Direct solver: sparse factorisation of H as a PCG preconditioner (one iteration if exact).
 
-All of H that PCG sees is factorised: c_M M + (dq/dv) K of the elements, J^T rho J and the curvature
-sum lambda d2c/dq2 of the constraints, and the symmetric tangents of follower loads. As a preconditioner it
-needs no second path: PCG measures the residual with its own operator, so a factorisation that lost digits is refined,
-and the rules of PCG for indefinite matrices hold. Where H is singular, or indefinite so that H^-1 r leads uphill, the
-matrix made positive at each quadrature point is factorised instead, and PCG ends at a direction of negative curvature.
+The factorised matrix is the full H of PCG: c_M M + (dq/dv) K of the elements, J^T rho J and the curvature sum lambda
+d2c/dq2 of the constraints, and the symmetric tangents of follower loads. PCG measures the residual with its own
+operator, so an inaccurate factorisation is refined, and PCG's rules for indefinite matrices hold. If H is singular, or
+indefinite with r.H^-1 r < 0, the matrix made positive at each quadrature point is factorised instead, and PCG ends at a
+direction of negative curvature.
 
-Models without constraints and follower loads keep the factors as long as the operator's matrix is kept.
+Without constraints and follower loads the factors are reused with the operator's matrix.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ __all__ = ["Direct"]
 
 
 class Direct:
-    """See the module. It works on the host between launches, so a step can't be captured as a graph.
+    """See the module. Runs on the host between launches: a step can't be captured as a graph.
 
     Attributes:
-        singular: worlds whose matrix could not be factorised at the last attempt.
+        singular: worlds whose last factorisation failed.
     """
 
     def __init__(self, at: At, residual: Residual) -> None:
@@ -53,47 +53,47 @@ class Direct:
         self.singular: set[int] = set()
 
     def register(self, state: State) -> None:
-        """It remembers nothing."""
+        """Stateless."""
 
     def forget(self, flags: wp.array) -> None:
-        """It remembers nothing."""
+        """Stateless."""
 
     def modules(self) -> set[wp.Module]:
-        """Modules that it launches."""
+        """Modules launched."""
         return {self.kernels.module} | self.assembled.modules()
 
     @labelled("build")
     def start(self, active: wp.array) -> None:
-        """D and the inverses of its blocks."""
+        """Compute D and the inverses of its blocks."""
         self.residual.blocks(active)
 
     def renew(self, active: wp.array) -> None:
-        """Nothing is kept but factors of the operator's matrix."""
+        """No-op: only factors of the operator's matrix are reused."""
 
     def follow(self, active: wp.array) -> None:
-        """Nothing to do: D stays that of the start of the step."""
+        """No-op: D stays that of the start of the step."""
 
     def commit(self, accepted: wp.array) -> None:
-        """Nothing to keep."""
+        """No-op: no history."""
 
     def judge(self, active: wp.array) -> None:
-        """Nothing to learn."""
+        """No reuse rule."""
 
     @property
     def followers(self) -> list[FollowerMatrix]:
-        """Matrices of the follower loads' items, once they were wanted."""
+        """Matrices of the follower loads' items, built on first use."""
         return self.at.scratch.get(Followers.name, [])
 
     @property
     def value(self) -> wp.array:
-        """Array for the matrix H, allocated on first use."""
+        """Array of the matrix H, allocated on first use."""
         if self.spare is None:
             self.spare = self.assembled.values("direct matrix")
         return self.spare
 
     @labelled("build")
     def prepare(self, active: wp.array) -> None:
-        """Factorise H of the active worlds."""
+        """Factorise H in the active worlds."""
         residual = self.residual
         own = self.alone and residual.by_matrix
         worlds = np.flatnonzero((residual.reuse.control.build if own and residual.keep else active).numpy())
@@ -108,7 +108,7 @@ class Direct:
             self._factorise(int(world), value)
 
     def _assemble(self, flags: wp.array, value: wp.array, *, projected: bool) -> None:
-        """Assemble H or, with `projected`, its positive definite replacement."""
+        """Assemble H or, with `projected`, its positive definite approximation."""
         w = self.work
         self.assembled.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
         for term in self.model.terms:
@@ -124,7 +124,7 @@ class Direct:
             self._retreat(world)
 
     def _retreat(self, world: int) -> None:
-        """Factorise the positive matrix instead."""
+        """Factorise the positive definite approximation."""
         self.untried.discard(world)
         flags = np.zeros(self.model.worlds, dtype=np.int32)
         flags[world] = 1
@@ -136,7 +136,7 @@ class Direct:
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
-        """z = H^-1 r; r.z and r.D^-1 r in parts."""
+        """z = H^-1 r; partial sums of r.z and r.D^-1 r."""
         w = self.work
         for world in map(int, np.flatnonzero(active.numpy())):
             if not self._solve(r, z, world):
@@ -144,7 +144,7 @@ class Direct:
         self.launch(self.kernels.dot_rows, self.dim, [r, z, w.diagonal, active, w.warp, w.warp_rows])
 
     def _solve(self, r: wp.array, z: wp.array, world: int) -> bool:
-        """Whether the world has factors; the first solution shows what they are good for."""
+        """Solve in one world. False if the factorisation failed; the first solve verifies it (r.z >= 0)."""
         if world in self.singular:
             return False
         downhill = self.factors.solve(r, z, world)

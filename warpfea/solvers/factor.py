@@ -20,23 +20,23 @@ if TYPE_CHECKING:
 __all__ = ["CuDSS", "Factors", "FreeMatrix", "Singular", "SuperLU", "make_factors"]
 
 PIVOT = 1e-3
-"""A pivot on the diagonal is taken if it is at least this large against its column (matrix scaled to unit diagonal)."""
+"""Smallest accepted diagonal pivot over its column maximum (matrix scaled to unit diagonal)."""
 
 
 class Singular(Exception):
-    """A matrix can't be factorised."""
+    """The factorisation failed."""
 
 
 @dataclass(eq=False)
 class FreeMatrix:
-    """The free components of a symmetric matrix of 3x3 blocks; being symmetric, the tables are CSR and CSC at once.
+    """Free components of a symmetric matrix of 3x3 blocks; by symmetry the tables are both CSR and CSC.
 
     Attributes:
-        free: (n,) components, 3 slot + axis, in the order of rows.
+        free: (n,) components, 3 slot + axis, in row order.
         start, index: (n + 1,) and (m,), the rows.
-        take: (m,) place of each entry in the flattened blocks.
+        take: (m,) index of each entry in the flattened blocks.
         row: (m,) row of each entry.
-        diagonal: (n,) entries on the diagonal.
+        diagonal: (n,) diagonal entries.
     """
 
     free: np.ndarray
@@ -48,7 +48,7 @@ class FreeMatrix:
 
     @classmethod
     def of(cls, graph: sp.csr_matrix, free: np.ndarray, *, ordered: bool) -> FreeMatrix:
-        """From the pattern of slots and the (slots, 3) mask of free components; `ordered`: in minimum degree order."""
+        """Tables of a slot pattern and a (slots, 3) mask of free components; `ordered`: in minimum degree order."""
         count = len(graph.indices)
         place = np.arange(1.0, 9 * count + 1).reshape(count, 3, 3)
         n = 3 * graph.shape[0]
@@ -71,7 +71,7 @@ class FreeMatrix:
 
 
 def minimum_degree(pattern: sp.csr_matrix) -> np.ndarray:
-    """(n,) SuperLU's minimum degree order of a symmetric pattern, read off an incomplete LU that drops every entry."""
+    """SuperLU's minimum degree order (n,) of a symmetric pattern, from an incomplete LU that drops every entry."""
     n = pattern.shape[0]
     dominant = sp.csc_matrix((np.full(len(pattern.data), -1e-6), pattern.indices, pattern.indptr), pattern.shape)
     dominant = (dominant + sp.identity(n)).tocsc()
@@ -83,20 +83,20 @@ def minimum_degree(pattern: sp.csr_matrix) -> np.ndarray:
 
 
 class Factors(Protocol):
-    """Sparse factors of the matrices of several worlds."""
+    """Interface of sparse factors of the matrices of several worlds."""
 
     def factorise(self, values: wp.array, world: int) -> None:
-        """Factorise the matrix of a world from the blocks `values` [world, entry]. Raises Singular."""
+        """Factorise one world's matrix from the blocks `values` [world, entry]. Raises Singular."""
 
     def solve(self, r: wp.array, z: wp.array, world: int) -> float:
-        """z = A^-1 r in a world, 0 on prescribed components; returns r.z, which may be nan."""
+        """z = A^-1 r in one world, 0 on prescribed components; returns r.z, possibly nan."""
 
 
 class SuperLU:
-    """SuperLU of SciPy on the host; the matrix and vectors of a GPU are copied there and back.
+    """SciPy's SuperLU on the host; matrix and vectors of a GPU are copied both ways.
 
-    The matrix is scaled to a unit diagonal. Its order is found once and from the pattern alone, so that a resumed run
-    does the same arithmetic.
+    The matrix is scaled to a unit diagonal. The ordering is computed once from the pattern alone, so that a resumed run
+    repeats the same arithmetic.
     """
 
     def __init__(self, model: Model, graph: sp.csr_matrix) -> None:
@@ -138,7 +138,7 @@ class SuperLU:
 
 
 class CuDSS:
-    """cuDSS of nvmath-python; matrix and vectors stay on the GPU as CuPy arrays. Not tested yet."""
+    """cuDSS of nvmath-python; matrix and vectors stay on the GPU as CuPy arrays. Untested."""
 
     def __init__(self, model: Model, graph: sp.csr_matrix) -> None:
         import cupy
@@ -150,7 +150,7 @@ class CuDSS:
         self.solvers: dict[int, Any] = {}
 
     def _make(self, data: Any) -> Any:
-        """A planned solver, its matrix with the values `data`, and its right side."""
+        """Planned solver, its matrix with the values `data`, and its right-hand side."""
         import cupyx.scipy.sparse as csp
         from nvmath.sparse.advanced import DirectSolver, DirectSolverMatrixType, DirectSolverOptions
 
@@ -191,7 +191,7 @@ class CuDSS:
 
 
 def make_factors(model: Model, graph: sp.csr_matrix) -> Factors:
-    """cuDSS on a GPU where it is installed, else SuperLU; on a GPU that gives a warning.
+    """cuDSS on a GPU if installed, else SuperLU with a warning on a GPU.
 
     Raises:
         ModelError: a model without free components.

@@ -1,26 +1,26 @@
 """Tiled block-Jacobi descent with acceleration, at a fixed number of iterations per step: options and loop.
 
-An iteration evaluates the residual once and applies B once, the two-level preconditioner of H with or without its
-coarse space: v += p, where p is made of z = B r, r = -g, and of the moves before. B is reused by the rule of
+One iteration takes one residual evaluation and one application of B, the two-level preconditioner of H with or without
+its coarse space: v += p, with p from z = B r, r = -g, and previous moves. B is reused by the rule of
 kernels/solvers/reuse.py. Accelerations:
 
-- "secants": with S the last moves and Y the changes of r that they caused, p = S c + 0.7 z, where S c is the Galerkin
-  solution on the moves, (S^T Y) c = S^T r, and z = B (r - Y c), and p is made conjugate to the moves. That is a block
-  BFGS update of B (Schnabel 1983), as L-BFGS serves Liu, Bouaziz, Kavan 2017, "Quasi-Newton methods for real-time
-  simulation of hyperelastic materials", and the type I form of Anderson's method (Fang and Saad 2009) made symmetric.
-  With H constant these are conjugate gradients whose step lengths come one iteration late.
-- "anderson": the same without the conjugation, one reduction less: Anderson's method of type I.
+- "secants": with S the last moves and Y the resulting changes of r, p = S c + 0.7 z, where S c is the Galerkin solution
+  on the moves, (S^T Y) c = S^T r, and z = B (r - Y c); p is made conjugate to the moves. This is a block BFGS update of
+  B (Schnabel 1983), as used with L-BFGS by Liu, Bouaziz, Kavan 2017, "Quasi-Newton methods for real-time simulation of
+  hyperelastic materials", and symmetrised Anderson acceleration of type I (Fang and Saad 2009). For constant H it
+  reduces to conjugate gradients with step lengths delayed by one iteration.
+- "anderson": without the conjugation, one reduction less: Anderson acceleration of type I.
 - "chebyshev": the semi-iteration as in Wang 2015, "A Chebyshev semi-iterative approach for accelerating projective and
-  position-based dynamics", for eigenvalues of B H between LARGEST / max(4, iterations^2 / 4) and LARGEST.
+  position-based dynamics", for eigenvalues of B H between `LARGEST` / max(4, iterations^2 / 4) and `LARGEST`.
 - "none": p = 0.5 z.
 
 Measured (tests/results/jacobi_cpu.json): "secants" needs the fewest iterations on solids and joints, with a lead
-that grows with their number; "anderson" is about as good up to 8, and better by a factor of two on a slender
-beam; "chebyshev" serves stiff bodies at about 8 iterations as well, stalls at eigenvalues outside its interval, and
-fails with joints. Tried and dropped: Anderson of type II in the D^-1 norm (like type I), B r in full or by half in
-place of 0.7 (no clear difference), multipliers changed in every iteration (diverges).
+that grows with their number; "anderson" is comparable up to 8, and better by a factor of two on a slender beam;
+"chebyshev" is comparable on stiff bodies at about 8 iterations, stalls at eigenvalues outside its interval, and fails
+with joints. Rejected after tests: Anderson type II in the D^-1 norm (like type I), a factor of 1 or 0.5 in place of 0.7
+(no clear difference), multiplier updates in every iteration (diverges).
 
-Constraints: the multipliers stay fixed during a step and are changed once, by rho c, when it is accepted.
+Constraints: the multipliers stay fixed during a step and are updated once, by rho c, on acceptance.
 """
 
 from __future__ import annotations
@@ -44,13 +44,12 @@ __all__ = ["Jacobi", "JacobiLoop"]
 
 ACCELERATIONS = ("secants", "anderson", "chebyshev", "none")
 GROWTH = 10.0
-"""A step is rejected if its residual ends above this multiple of that at its start."""
+"""Largest accepted ratio of the final to the initial residual of a step."""
 GAP = 1e-3
-"""A step is rejected if it leaves a constraint violated by more than this share of the model's size."""
+"""Largest accepted constraint violation over the model's size."""
 REBUILD_COST = 10.0
-"""Extra iterations at which B is made anew: fewer than for Newton's method, since an old B costs accuracy here, not
-time. Of 5, 10, 20 and 40, tried on soft bars that swing far, 40 saves a tenth of the time, with an error up to 70 times
-as large."""
+"""Extra iterations that trigger a rebuild of B: fewer than for Newton's method, since an old B costs accuracy here, not
+time. Of 5, 10, 20 and 40 on soft bars in large rotations, 40 saves a tenth of the time at up to 70 times the error."""
 STEP = {"secants": 0.7, "anderson": 0.7, "chebyshev": 1.0, "none": 0.5}
 """Factor of z = B r in the move, by acceleration."""
 LARGEST = 3.5
@@ -59,24 +58,23 @@ LARGEST = 3.5
 
 @dataclass(frozen=True)
 class Jacobi:
-    """Descent with dense inverses of tiles of 48 unknowns, at a fixed cost per step: approximate, and reported as such.
+    """Tiled block-Jacobi descent (dense inverses of 48 unknowns) at a fixed cost per step; approximate.
 
-    A step is accepted after `iterations`, whatever residual is left: `StepReport.residual` and `residual_force` tell
-    it, and `StepReport.converged` is False where it is beyond the tolerance. As with Newton's method a step is rejected
-    and retried with half the step if it ends with ten times the residual of its start, leaves a constraint violated by
-    a thousandth of the model's size, or meets a force that is not finite or, with laws that need J > 0, a J <= 0.
-    Meant for soft bodies and small steps.
+    A step is accepted after `iterations` whatever its residual (`StepReport.residual`, `residual_force`);
+    `StepReport.converged` is False above the tolerance. As with Newton's method a step is rejected and halved if its
+    residual ends at ten times the initial one, a constraint stays violated by a thousandth of the model's size, a force
+    is not finite or, with laws that need J > 0, an element has J <= 0. Meant for soft bodies and small steps.
 
     Args:
-        iterations: most iterations per step, each one residual and one application of the tile inverses.
-        coarse: add the affine motions of groups of tiles. Without them an iteration is cheaper, and stiff or long
-            bodies move as if much softer or fall apart from their loads.
+        iterations: maximum iterations per step, each one residual and one application of the tile inverses.
+        coarse: add the affine motions of groups of tiles. Without them an iteration is cheaper, but stiff or long
+            bodies respond far too softly or are torn apart by their loads.
         acceleration: "secants", "anderson", "chebyshev", or "none".
-        tol: a step within this tolerance ends early and counts as converged; as of NewtonPCG, with the same defaults.
-        force_tol: as of NewtonPCG, N.
-        max_halvings: how often a rejected step may be halved.
-        penalty: stiffness of a constraint over that of what it ties. A low one lets joints give, with a high one
-            everything else converges slowly.
+        tol: a step within this tolerance ends early and counts as converged; defaults of NewtonPCG.
+        force_tol: as for NewtonPCG, N.
+        max_halvings: maximum number of halvings of a rejected step.
+        penalty: stiffness of a constraint over that of the tied slots. Low values let joints open, high ones slow down
+            convergence.
 
     Raises:
         ModelError: a value out of range.
@@ -109,7 +107,7 @@ class Jacobi:
 
     @property
     def newton(self) -> NewtonPCG:
-        """The options of Newton's loop that this loop inherits."""
+        """Options of the Newton loop that this loop inherits."""
         return NewtonPCG(
             tol=self.tol,
             force_tol=self.force_tol,
@@ -117,23 +115,23 @@ class Jacobi:
             max_pcg=1,
             max_halvings=self.max_halvings,
             preconditioner="two-level" if self.coarse else "tiles",
-            operator="elements",  # H p is never asked for: no matrix of the iterate
+            operator="elements",  # no H p: no matrix of the iterate
             multipliers="outer",
             penalty=self.penalty,
         )
 
     @property
     def max_newton(self) -> int:
-        """Most iterations per step."""
+        """Maximum iterations per step."""
         return self.iterations
 
     def tolerance(self, dtype: str) -> float:
-        """The relative tolerance in one precision, "float64" or "float32"."""
+        """Relative tolerance for precision "float64" or "float32"."""
         return self.newton.tolerance(dtype)
 
 
 class JacobiLoop(NewtonLoop):
-    """Newton's loop with one application of the preconditioner in place of the linear solve, and no line search."""
+    """Newton loop with one preconditioner application in place of the linear solve, and no line search."""
 
     def __init__(
         self,
@@ -146,7 +144,7 @@ class JacobiLoop(NewtonLoop):
         super().__init__(at, options.newton, constraint_tol=constraint_tol, inversion=inversion)
         model, work = at.model, at.work
         self.methods = {"solver": "jacobi"}
-        # multipliers are changed once, when the step is accepted: no outer loop, and convergence looks at violations
+        # multipliers are updated once, on acceptance: no outer loop, and convergence includes violations
         self.classical = False
         work.newton.constraint_tol = constraint_tol
         assert isinstance(self.preconditioner, TwoLevel)
@@ -173,11 +171,11 @@ class JacobiLoop(NewtonLoop):
         self.control.centre, self.control.half = 0.5 * (LARGEST + least), 0.5 * (LARGEST - least)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that the loop launches, except those of the reductions and of the constraints."""
+        """Modules launched by the loop, except those of reductions and constraints."""
         return super().modules() | {self.own.module}
 
     def _solve(self, first: bool = False) -> None:
-        """Iterate from the residual at hand, and tell the rule of the preconditioner what that cost and gained."""
+        """Iterate and report cost and reduction to the reuse rule."""
         w = self.work
         self.launch(self.own.begin, self.model.worlds, [w.newton, self.control])
         self._any(w.newton.active, self.iterating)
@@ -194,7 +192,7 @@ class JacobiLoop(NewtonLoop):
         if self.limited:
             launch(self.kernels.free_step, self.model.worlds, [w.newton])
         for term in self.terms:
-            if term.traits.limited:  # the others aim at multipliers, which Newton's method alone predicts
+            if term.traits.limited:  # other terms predict multipliers, for Newton's method only
                 term.aim(self.at, active)
         launch(k.advance, self.dim, [w.newton, w.direction, w.v])
         self.residual.evaluate(active)
@@ -206,7 +204,7 @@ class JacobiLoop(NewtonLoop):
 
     @labelled("vectors")
     def _find_move(self, active: wp.array) -> None:
-        """Put the next move p into work.direction."""
+        """Write the next move p to work.direction."""
         m, w, k, launch, ctl = self.model, self.work, self.own, self.launch, self.control
         args = [w.newton, w.gradient, m.topology.free, w.direction, w.p, w.r, self.moves, self.changes, w.rows]
         launch(k.remember, self.dim, args)
@@ -222,7 +220,7 @@ class JacobiLoop(NewtonLoop):
             self.residual.reduce(w.rows, PAIRS, active, ctl.sums)
             launch(k.conjugate, m.worlds, [w.newton, ctl])
         launch(k.combine, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
-        if self.pcg.deflate:  # so that a loose tolerance conserves the momentum of free bodies
+        if self.pcg.deflate:  # a loose tolerance then conserves the momentum of free bodies
             args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
             launch(k.momentum_left, self.dim, args)
             self.pcg.translate(active)

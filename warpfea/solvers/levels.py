@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 __all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
-"""Most slots of a group. Its affine motions are 4 slots of the next level, which has about a 16th of the unknowns."""
+"""Maximum slots of a group. Its affine functions are 4 slots of the next level, about 1/16 of the unknowns."""
 SMALL_GROUPS = (16, 32)
 SMALL_COARSE = 48
-"""Smaller groups are taken where the coarse level still has at most SMALL_COARSE slots: a small slender body has too
-few groups of 64 slots to bend (a cantilever of 180 slots takes half the iterations)."""
+"""Coarse level size up to which smaller groups are used: a small slender body has too few groups of 64 slots to bend (a
+cantilever of 180 slots takes half the iterations)."""
 BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
-"""A coarse level of up to this many slots is inverted as one dense matrix, by device; on CUDA that costs less than the
-launches of further levels."""
+"""Largest coarse level inverted as one dense matrix, slots by device; on CUDA this is cheaper than the launches of
+further levels."""
 PART_ENTRIES = 1344**2
-"""Most pairs of slots in parts of up to WHOLE_SLOTS slots that are each inverted as a whole."""
+"""Maximum slot pairs in components of up to WHOLE_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
 
 
@@ -40,13 +40,13 @@ class Level:
 
     Attributes:
         pattern: pattern of its matrix.
-        slots: their number.
-        dense: the level is the bottom and inverted as a whole; it has no tiles and no groups.
-        parts: of a dense level, where its matrix falls into parts.
-        band: the level is the only one and factored as a whole; it has no tiles and no groups either.
+        slots: number of slots.
+        dense: bottom level, inverted as a whole; no tiles, no groups.
+        parts: uncoupled components of a dense level.
+        band: the only level, factored as a whole; no tiles, no groups.
         data: device struct of tiles and groups.
-        tiles, groups: their numbers; with 0 groups there is no level below.
-        galerkin: device tables of the product that makes the next level's matrix.
+        tiles, groups: their numbers; 0 groups: no level below.
+        galerkin: device tables of the product that forms the next level's matrix.
     """
 
     pattern: Pattern
@@ -61,19 +61,19 @@ class Level:
 
     @property
     def whole(self) -> bool:
-        """Whether the level is inverted or factored as a whole, so that there is none below."""
+        """True if the level is inverted or factored as a whole (no level below)."""
         return self.dense or self.band is not None
 
 
 @dataclass(eq=False)
 class Points:
-    """The reference configuration of a level's slots, from which affine functions get their values there.
+    """Reference configuration of a level's slots, at which affine functions are evaluated.
 
     Attributes:
-        value: (slots, 3) the reference value of a slot: a place (m) or a gradient.
-        position: (slots,) whether it is a place.
-        node: (slots,) slots of one node stay together in a tile and a group.
-        label: (slots,) slots of different labels share neither.
+        value: (slots, 3) reference value of a slot: a position (m) or a gradient.
+        position: (slots,) True for a position slot.
+        node: (slots,) slots of one node share a tile and a group.
+        label: (slots,) slots of different labels never share a tile or group.
     """
 
     value: np.ndarray
@@ -83,9 +83,9 @@ class Points:
 
 
 def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, parted: bool = True) -> list[Level]:
-    """The levels of a model, finest first; `pattern` is that of H.
+    """Levels of a model, finest first; `pattern` is that of H.
 
-    Without `coarse`, only the tiles of the first; without `parted` dense matrices are whole.
+    Without `coarse`, only the tiles of the first level; without `parted`, dense matrices are not split into components.
     """
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
@@ -99,19 +99,19 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, parted: 
         n = pattern.graph.shape[0]
         parts = Parts.of(model, pattern) if parted else None
         small = n <= (bottom if depth else WHOLE_SLOTS)
-        if parts and not small:  # a matrix for each
+        if parts and not small:  # one matrix per component
             entries = parts.count * parts.most**2
             small = entries <= (bottom**2 if depth else PART_ENTRIES if parts.most <= WHOLE_SLOTS else 0)
         if small:
             levels.append(Level(pattern, n, True, level_struct(model.dtype)(), parts=parts))
             return levels
-        # larger groups where that makes the next level the bottom: one dense product costs less than more levels
+        # larger groups if the next level then becomes the bottom: one dense product costs less than more levels
         large = 2 * GROUP_SLOTS
         capacity = large if 4 * n / GROUP_SLOTS > bottom >= 4.05 * n / large else GROUP_SLOTS
         capacity = next((c for c in SMALL_GROUPS if 4.05 * n / c <= SMALL_COARSE), capacity)
         level, points, pattern = _make_level(model, pattern, points, capacity)
         levels.append(level)
-        # below the first level groups may span bodies that joints connect and, where they hardly shrink, any bodies
+        # below the first level groups may span bodies connected by joints and, where they hardly shrink, any bodies
         points.label = points.label if depth else model.component[_first_members(level)]
         if level.groups * 4 > n // 2:
             points.label = np.zeros_like(points.label)
@@ -119,7 +119,7 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, parted: 
 
 
 def _first_members(level: Level) -> np.ndarray:
-    """For each slot of the next level, one slot of the group that it belongs to."""
+    """One representative slot of its group for each slot of the next level."""
     start, slot = level.data.group_start.numpy(), level.data.group_slot.numpy()
     return np.repeat(slot[start[:-1]], 4)
 
@@ -166,9 +166,9 @@ def _make_level(model: Model, pattern: Pattern, points: Points, capacity: int) -
 
 
 def _affine(points: Points, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values (slots, 4) of the affine functions 1, x, y, z of each slot's group, and the groups' origins and scales.
+    """Values (slots, 4) of the affine functions 1, x, y, z of each slot's group, with the groups' origins and scales.
 
-    x, y, z are measured from the centre (groups, 3), m, and divided by the size (groups,), m.
+    x, y, z are relative to the centre (groups, 3), m, divided by the size (groups,), m.
     """
     at = np.flatnonzero(points.position)
     count = np.maximum(np.bincount(group[at], minlength=groups), 1)
@@ -183,7 +183,7 @@ def _affine(points: Points, group: np.ndarray, groups: int) -> tuple[np.ndarray,
 def _galerkin(
     model: Model, pattern: Pattern, group: np.ndarray, groups: int
 ) -> tuple[Pattern, tuple[wp.array, wp.array, wp.array]]:
-    """Pattern of the next level's matrix P^T A P, and the tables of `galerkin` in kernels/solvers/blocks.py."""
+    """Pattern of the Galerkin matrix P^T A P, and the tables of `galerkin` in kernels/solvers/blocks.py."""
     graph = pattern.graph
     rows = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
     key = group[rows].astype(np.int64) * groups + group[graph.indices]

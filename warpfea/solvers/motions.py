@@ -1,4 +1,4 @@
-"""A coarse space of the rigid motions of bodies that terms couple, see kernels/solvers/motions.py."""
+"""Coarse space of rigid body modes of bodies coupled by terms, see kernels/solvers/motions.py."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 __all__ = ["Motions", "lanes_for", "motion_bodies"]
 
 SAMPLES = 16
-"""Slots whose mean is the centre of a body."""
+"""Slots averaged for the centre of a body."""
 MOST_LANES, SHARE = 256, 4
-"""Most partial sums of a sum, and numbers in each that make more of them worth while."""
+"""Maximum number of partial sums, and the minimum count per partial sum."""
 
 
 def lanes_for(count: int) -> int:
-    """Partial sums for so many numbers: a power of two that does not depend on the number of worlds."""
+    """Number of partial sums for `count` values: a power of two, independent of the number of worlds."""
     return int(min(MOST_LANES, 1 << max(0, (max(count, 1) - 1) // SHARE).bit_length()))
 
 
 def motion_bodies(model: Model) -> dict[int, int]:
-    """Bodies that a term couples to another one free to move as a whole: their numbers among the motions.
+    """Mode index of each body that a term couples to another body with free rigid body modes.
 
-    Bodies without a free motion are left out, and so are all where their matrix would be too large to invert.
+    Bodies without free modes are omitted; the map is empty if the matrix would be too large to invert.
     """
     free = [bool(allowed.any()) for allowed in map(_allowed, [model] * len(model.bodies), range(len(model.bodies)))]
     pairs = [(a, b) for term in model.terms for a, b in term.couples() if a != b and free[a] and free[b]]
@@ -45,17 +45,17 @@ def motion_bodies(model: Model) -> dict[int, int]:
 
 
 def _allowed(model: Model, body: int) -> np.ndarray:
-    """(6,) translations that nothing prescribes, and turns where nothing at all is."""
+    """Free modes (6,): unprescribed translations, and rotations of a body without prescribed components."""
     b = model.bodies[body]
     free = model.free_host[b.slot_offset : b.slot_offset + b.slot_count]
     return np.concatenate([free.min(axis=0), np.full(3, free.min())])
 
 
 class Motions:
-    """The motions of `motion_bodies`, their matrix, and its inverse.
+    """Rigid body modes R of `motion_bodies`, the matrix R^T H R and its inverse.
 
     Attributes:
-        bodies: device struct. number: of a body of the model among them.
+        bodies: device struct. number: mode index of a body of the model.
         dense: the inverse; a term's `couple` adds to its `matrix`.
     """
 
@@ -102,15 +102,15 @@ class Motions:
         return out
 
     def lanes(self, count: int) -> int:
-        """Partial sums for so many numbers."""
+        """Number of partial sums for `count` values."""
         return lanes_for(count)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that it launches."""
+        """Modules launched."""
         return {self.kernels.module} | self.dense.modules()
 
     def begin(self, u: wp.array, value: wp.array, flags: wp.array) -> None:
-        """The matrix of the bodies by themselves at displacements u; `value`: H without what couples them."""
+        """Assemble the uncoupled matrix R^T H R at displacements u; `value`: H without the coupling terms."""
         m, k, dense = self.model, self.kernels, self.dense
         self.launch(k.arms, (m.worlds, m.slots), [self.bodies, u, flags])
         lanes = self.parts.shape[2]
@@ -119,7 +119,7 @@ class Motions:
         self.launch(k.fill, (m.worlds, dense.size), [flags, self.parts, dense.scale, dense.matrix])
 
     def end(self, flags: wp.array) -> None:
-        """Invert it, once terms have added to it."""
+        """Invert the matrix after terms have added to it."""
         self.dense.invert(flags, keep=False, reduce=self.residual.reduce)
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:

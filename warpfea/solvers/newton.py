@@ -1,4 +1,4 @@
-"""Newton's method with PCG: its options, and its loop, which runs on the device."""
+"""Newton's method with PCG: options, and the loop on the device."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ __all__ = ["NewtonLoop", "NewtonPCG"]
 
 EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
 FLOOR = {"float64": 1e-4, "float32": 2e-3}
-"""Largest estimated error, relative and in the norm of energy, of a step whose residual is stopped by rounding."""
+"""Largest accepted error estimate (relative, energy norm) when round-off stops the residual."""
 NEWTON_WORK = {False: 20, True: 100}
-"""Iterations of the conjugate gradients that one of Newton's method counts as in `max_work`, without and with contact,
-whose searches take many evaluations. A slender column that is pushed by 1e-4 of its load takes 8037 of the 10 000 in
-the load step that buckles it; steps with contact that 8 halvings refuse take 500 to 800 of the 2000."""
+"""CG iterations equivalent to one Newton iteration in `max_work`, without and with contact (line searches take many
+evaluations). A slender column perturbed by 1e-4 of its load takes 8037 of the 10 000 in the load step that buckles it;
+steps with contact rejected after 8 halvings take 500 to 800 of the 2000."""
 FALL = 9.81
-"""m/s^2. With accelerations in the state constraints are closed to FALL (dq/dv)^2 times a tolerance, the larger one,"""
+"""Acceleration scale, m/s^2, of the constraint tolerance of acceleration-level schemes: `FALL` (dq/dv)^2 tol, m."""
 CLOSED = 1e-14
-"""but to no less than this, over the model's size."""
+"""Smallest constraint tolerance of acceleration-level schemes, over the model's size."""
 
 
 @dataclass(frozen=True)
@@ -47,36 +47,36 @@ class NewtonPCG:
     """Newton's method with a line search; linear systems by preconditioned conjugate gradients or a factorisation.
 
     Args:
-        tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|), in the D^-1 norm (D: diagonal of H) and
-            for each connected part of the model apart, and in it for what is of unlike stiffness. A thousandth of the
-            reactions counts with f_int, so that a held, stressed body without loads has a scale. None: 1e-8 in float64,
-            1e-4 in float32. Where rounding stops the residual above it, the error that is left is estimated and told
-            (`StepReport.floor`); above 1e-4 in float64, 2e-3 in float32, the step is refused.
-        force_tol: a step is also accepted when |g|, the plain norm over the free components, is at most this, N
-            (gradient slots count in N m); 0: never.
+        tol: |g| over the free components <= tol x max(|f_int|, |f_ext|, |M a|) in the D^-1 norm (D: diagonal of H), for
+            each connected part of the model and each group of similar stiffness in it. A thousandth of the reactions
+            counts with f_int: a scale for a prescribed, stressed body without loads. None: 1e-8 in float64, 1e-4 in
+            float32. If round-off stops the residual above it, the remaining error is estimated and reported
+            (`StepReport.floor`); above 1e-4 in float64, 2e-3 in float32, the step is rejected.
+        force_tol: absolute tolerance of |g|, plain norm over the free components, N (gradient slots in N m), sufficient
+            for acceptance; 0: unused.
         forcing: relative residual of the linear solves; None: Eisenstat and Walker's, no further than needed.
         max_newton: iterations before a step is rejected.
         max_pcg: iterations per linear solve.
-        max_halvings: how often a rejected step may be halved.
-        max_work: iterations of the conjugate gradients in a step, refused attempts included, at which it is given up,
-            also within a solve. A refused attempt is not halved either once the step's iterations of Newton's method,
-            each counted as 20 of those, with contact as 100, have reached it (not with dt="auto").
-        preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, kept while it
-            serves; in statics of short chains of beams factors of the whole), "tiles" (those alone, without the
-            motions), "banded" (Cholesky factors of the whole, kept as well; on the CPU, for chains, strips and slender
-            or small bodies), "deflated" (3x3 blocks of every iterate, and the directions of constraints inverted),
-            "block-jacobi" (the blocks alone), or "auto": on the CPU "banded" where the band is narrow or the model
-            small, else "deflated" for many small bodies on joints, else "two-level".
-        linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS where that is installed.
-        preconditioner_dtype: precision that the inverses of "two-level" are kept in, "float32" or "float64"; None: the
-            model's. They are made in the model's precision; float32 halves what an application reads. Another precision
-            than the model's excludes "banded".
-        operator: H p from the "elements", from the "matrix" of 3x3 blocks, or "auto", by which is cheaper. In dynamics
-            without constraints the matrix of an earlier iterate serves while Newton's method does not suffer.
-        multipliers: how constraint forces are found: "newton", with every Newton step, or "outer", the classical
+        max_halvings: maximum number of halvings of a rejected step.
+        max_work: CG iterations in a step, rejected attempts included, at which the step fails, also within a solve. A
+            rejected attempt is not halved either once the step's Newton iterations, each counted as 20 of those, with
+            contact as 100, have reached it (not with dt="auto").
+        preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, reused while
+            effective; in statics of short chains of beams factors of the whole), "tiles" (the tiles alone), "banded"
+            (Cholesky factors of the whole, reused too; on the CPU, for chains, strips and slender or small bodies),
+            "deflated" (3x3 blocks of every iterate, and inverted constraint directions), "block-jacobi" (the blocks
+            alone), or "auto": on the CPU "banded" for a narrow band or small model, else "deflated" for many small
+            bodies on joints, else "two-level".
+        linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS if installed.
+        preconditioner_dtype: storage precision of the inverses of "two-level", "float32" or "float64"; None: the
+            model's. They are computed in the model's precision; float32 halves the memory traffic of an application. A
+            precision other than the model's excludes "banded".
+        operator: H p from the "elements", from the "matrix" of 3x3 blocks, or "auto", the cheaper one. In dynamics
+            without constraints the matrix of an earlier iterate is reused while Newton's method converges as fast.
+        multipliers: solution of constraint forces: "newton", with every Newton step, or "outer", the classical
             augmented Lagrangian, in a loop around the Newton solves.
-        penalty: kappa, the penalty of a constraint over the stiffness of what it ties; None: 1000 in float64, 100 in
-            float32, where inverses of tiles that hold more lose their positive eigenvalues to rounding.
+        penalty: kappa, the penalty of a constraint over the stiffness of the tied slots; None: 1000 in float64, 100 in
+            float32, where larger values cost tile inverses their positive definiteness by round-off.
         max_outer: multiplier updates of the classical method.
 
     Raises:
@@ -134,26 +134,26 @@ class NewtonPCG:
             raise ModelError(f"NewtonPCG: multipliers = {self.multipliers!r} is neither 'newton' nor 'outer'")
 
     def most_newton(self, contact: bool) -> int:
-        """Iterations of Newton's method in a step, with or without contact, that use up `max_work`."""
+        """Newton iterations in a step, with or without contact, that use up `max_work`."""
         return max(self.max_work // NEWTON_WORK[contact], 1)
 
     def tolerance(self, dtype: str) -> float:
-        """The relative tolerance in one precision, "float64" or "float32"."""
+        """Relative tolerance for precision "float64" or "float32"."""
         return self.tol if self.tol is not None else {"float64": 1e-8, "float32": 1e-4}[dtype]
 
     def kappa(self, dtype: str) -> float:
-        """The penalty of constraints in one precision."""
+        """Constraint penalty ratio kappa for one precision."""
         return self.penalty if self.penalty is not None else {"float64": 1000.0, "float32": 100.0}[dtype]
 
 
 @dataclass(frozen=True)
 class TermOptions:
-    """What terms must know of the solver.
+    """Solver options that terms need.
 
     Attributes:
-        classical: multipliers change in an outer loop.
-        kappa: penalty of a constraint over the stiffness of what it ties.
-        deflate: the preconditioner does not hold penalties; terms correct it.
+        classical: multipliers are updated in an outer loop.
+        kappa: penalty of a constraint over the stiffness of the tied slots.
+        deflate: the preconditioner lacks the penalties; terms correct it.
     """
 
     classical: bool
@@ -162,7 +162,7 @@ class TermOptions:
 
 
 class NewtonLoop:
-    """The iteration of all worlds: conditional loops on the device, one code path with and without capture."""
+    """Newton loop of all worlds: conditional loops on the device, one code path with and without capture."""
 
     def __init__(self, at: At, options: NewtonPCG, *, constraint_tol: float, inversion: str = "refuse") -> None:
         model, work, launch, inertia = at.model, at.work, at.launch, at.inertia
@@ -175,13 +175,13 @@ class NewtonLoop:
         self.max_outer = options.max_outer
         direct = options.linear == "direct"
         kind = "direct" if direct else choose(options.preconditioner, options.preconditioner_dtype, model)
-        # factors hold the penalties
+        # factors include the penalties
         deflate = kind not in ("block-jacobi", "banded") and not direct
         at.options = TermOptions(classical=self.classical, kappa=options.kappa(model.dtype), deflate=deflate)
         for term in self.terms:
             term.configure(at)
         operator = options.operator
-        if direct and operator == "auto":  # factors are kept as long as the matrix, where nothing is added to it
+        if direct and operator == "auto":  # factors live as long as the matrix, unless terms add to it
             operator = "elements" if model.terms.products or at.midpoint else "matrix"
         banded = kind == "banded" and model.device.is_cuda
         assembled = kind not in ("deflated", "block-jacobi")
@@ -190,7 +190,7 @@ class NewtonLoop:
         self.preconditioner = self.direct or make(
             kind, options.preconditioner_dtype, model, work, launch, self.residual
         )
-        kind_of_solver = BiCGStab if at.midpoint else PCG  # its operator is unsymmetric
+        kind_of_solver = BiCGStab if at.midpoint else PCG  # unsymmetric operator of mid-point schemes
         self.pcg = kind_of_solver(
             model, work, launch, self.residual, self.preconditioner,
             max_iterations=options.max_pcg, max_work=options.max_work, deflate=inertia,
@@ -206,7 +206,7 @@ class NewtonLoop:
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv
         # a good preconditioner makes a decade of PCG cheaper than another Newton iteration
-        # (in statics the first iterates are far off, and what they are solved to is lost)
+        # (in statics the first iterates are far off: solving them tightly is wasted)
         ctl.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") or not inertia else 0.001
         if traits.gated:  # constraints are stiff: a loose first solve costs more iterations than it saves
             ctl.first_forcing = min(ctl.first_forcing, 0.01)
@@ -227,11 +227,11 @@ class NewtonLoop:
         ctl.nonpotential = int(traits.nonpotential or rate)
         ctl.classical = int(self.classical)
         ctl.slack = 1.0 / math.sqrt(1.0 + options.kappa(model.dtype))
-        ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves are for g alone
-        if at.accelerated and model.dtype == "float64":  # in float32 places are rounded by more
+        ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves converge g only
+        if at.accelerated and model.dtype == "float64":  # float32 positions have a larger round-off
             ctl.constraint_pace = max(constraint_tol / model.size, ctl.tol) * FALL
             ctl.constraint_least = CLOSED * model.size
-        # in double precision roundings are far from the errors that steps are refused for; forces at a mid-point are
+        # in double precision round-off is far below the errors for which steps are rejected; forces at a mid-point are
         # not those of the positions
         self.perturbation = None
         if model.dtype == "float32" and not at.midpoint:
@@ -242,22 +242,22 @@ class NewtonLoop:
         self.searching = work.any_flag[1:2]
 
     def register(self, state: State) -> None:
-        """Make what the solvers keep from step to step part of the state."""
+        """Register the solver history in the state."""
         self.preconditioner.register(state)
         self.residual.register(state)
 
     def forget(self, flags: wp.array) -> None:
-        """The state of flagged worlds was set from elsewhere."""
+        """Invalidate solver history of the flagged worlds."""
         self.preconditioner.forget(flags)
         self.residual.forget(flags)
 
     def commit(self, accepted: wp.array) -> None:
-        """The attempt was accepted: the state hears what was done."""
+        """Store solver history in the state."""
         self.preconditioner.commit(accepted)
         self.residual.commit(accepted)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that the loop launches, except those of the reductions and of the terms."""
+        """Modules launched by the loop, except those of reductions and terms."""
         out = {self.kernels.module} | self.pcg.modules()
         out |= {self.perturbation.module} if self.perturbation else set()
         return out | self.preconditioner.modules() | self.residual.modules()
@@ -265,7 +265,7 @@ class NewtonLoop:
     def run(self) -> None:
         """Iterate from work.v until every active world has converged or failed.
 
-        `candidates` put other first iterates into work.v, in the worlds with the flag `choose`.
+        `candidates` write other first iterates to work.v in the worlds flagged by `choose`.
         """
         w = self.work
         self._clear_direction(w.newton.active)
@@ -277,7 +277,7 @@ class NewtonLoop:
 
     def _open(self, flags: wp.array) -> None:
         """Evaluate the first iterate."""
-        # D is needed to judge it, so the blocks come first
+        # its check needs D, so the blocks come first
         self.residual.place(flags)
         self._each("prepare", flags)
         self.preconditioner.start(flags)
@@ -285,19 +285,19 @@ class NewtonLoop:
         self.residual.evaluate(flags, hold=True)
 
     def _solve(self, first: bool = False) -> None:
-        """Newton's iteration from the residual at hand; `first`: of an attempt."""
+        """Newton iteration from the current residual; `first`: first solve of an attempt."""
         w = self.work
         choose = bool(self.candidates) and first
         self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
         self._rarely(self._choose if choose else self._look_for_inversion)
-        if self.terms.traits.walls:  # the first iterate may be the solution, as of a body that falls freely
+        if self.terms.traits.walls:  # the first iterate may be the solution, as in free fall
             self._refresh()
         self._any(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
 
     @labelled("control")
     def _choose(self) -> None:
-        """Take the best of the first iterate at hand and the candidates, where that may be another one."""
+        """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
         choose, better = w.newton.choose, w.newton.searching
         launch(k.compare, self.model.worlds, [w.newton, 1, better])
@@ -320,7 +320,8 @@ class NewtonLoop:
         self._any(w.newton.active, self.iterating)
 
     def _update_multipliers(self) -> None:
-        """lambda += rho c where a constraint is violated, and the inner solve again, from the velocity at hand."""
+        """Update multipliers, lambda += rho c, in worlds with violated constraints, for another solve from the current
+        v."""
         w = self.work
         self._each("outer", w.newton.stepped)
         self.residual.evaluate(w.newton.active, hold=True)
@@ -355,10 +356,10 @@ class NewtonLoop:
 
     @labelled("control")
     def _perturb(self) -> None:
-        """Put the mean of residuals at perturbed positions in place of that which the next solve tells the error of.
+        """Replace the residual by its mean over perturbed positions before the error estimate.
 
-        The residual that rounding leaves is a function of the bits of the iterate. Newton's method finds where it
-        vanishes, so that the error is not seen there, least of all along soft directions.
+        The round-off of the residual is a function of the bits of the iterate. Newton's method converges to its zero,
+        which hides the error, most of all along soft directions.
         """
         w, k, launch, flags = self.work, self.perturbation, self.launch, self.perturbed
         assert k is not None
@@ -375,7 +376,7 @@ class NewtonLoop:
 
     @labelled("control")
     def _refresh(self) -> None:
-        """Let terms take anew what they hold, where Newton's method has solved for it."""
+        """Update lagged term data (friction limits, multipliers) after convergence with frozen values."""
         w, flags = self.work, self.work.newton.stepped
         self.launch(self.kernels.begin_refresh, self.model.worlds, [w.newton, flags])
         self._any(flags, self.searching)
@@ -390,8 +391,7 @@ class NewtonLoop:
 
     @labelled("control")
     def _search_on(self) -> None:
-        """What hard steps need: the error that a residual stands for, the length of steps that Armijo's rule would cut,
-        the searches that follow, and whether an accepted iterate is inside out."""
+        """Rare branch: error estimate, step length of non-monotone trials, further searches, inversion check."""
         m, w, k = self.model, self.work, self.kernels
         parts = m.residual_parts
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
@@ -410,7 +410,7 @@ class NewtonLoop:
         self._look_for_inversion()
 
     def _look_for_inversion(self) -> None:
-        """Flag the worlds whose accepted iterate turned an element inside out."""
+        """Flag worlds with an element inverted by the accepted iterate."""
         w = self.work
         self.residual.elements.look_for_inversion(self.at, w.newton.suspect)
         w.newton.any_hard.zero_()
@@ -425,12 +425,12 @@ class NewtonLoop:
         self._any(w.newton.searching, self.searching)
 
     def _rarely(self, do: Callable[[], None]) -> None:
-        """Do what hard steps alone need."""
+        """Run `do` if any world needs the rare branch."""
         with self.launch.rare():
             wp.capture_if(self.work.newton.any_hard, do)
 
     def _each(self, what: str, flags: wp.array) -> None:
-        """Call a method of all terms."""
+        """Call one method of all terms."""
         for term in self.terms:
             getattr(term, what)(self.at, flags)
 

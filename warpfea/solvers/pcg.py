@@ -19,11 +19,10 @@ __all__ = ["PCG"]
 
 
 class PCG:
-    """Solves H p = -g for the active worlds.
+    """Solve H p = -g in the active worlds.
 
-    A solve starts from the Galerkin solution for the translations of free groups of bodies and ends with the same
-    correction, so that linear momentum is conserved however loose the tolerance is. A direction without positive
-    curvature ends a solve early.
+    A solve begins with the Galerkin solution for the translations of free groups of bodies and ends with the same
+    correction: linear momentum is conserved for any tolerance. Nonpositive curvature ends a solve early.
     """
 
     def __init__(
@@ -41,7 +40,7 @@ class PCG:
 
     @labelled("vectors")
     def solve(self, active: wp.array) -> None:
-        """Put the solution p into work.direction."""
+        """Solve and write p to work.direction."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         launch(k.start, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
         if m.component_count > 1:
@@ -55,11 +54,11 @@ class PCG:
         self.translate(active)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that it launches, except those of the operator and of the preconditioner."""
+        """Modules launched, except those of operator and preconditioner."""
         return {self.kernels.module}
 
     def _run(self) -> None:
-        """The iteration from r and z = B r."""
+        """Iterate from r and z = B r."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         launch(k.begin, m.worlds, [w.newton, w.pcg])
         launch(k.first_direction, self.dim, [w.pcg, w.z, w.p, w.direction])

@@ -1,4 +1,4 @@
-"""The interface of preconditioners, block Jacobi, and the choice among them."""
+"""Interface of preconditioners, block Jacobi, and automatic selection."""
 
 from __future__ import annotations
 
@@ -23,41 +23,41 @@ __all__ = ["NAMES", "BlockJacobi", "Preconditioner", "choose", "make"]
 
 
 class Preconditioner(Protocol):
-    """What the solvers require of a preconditioner B, an approximation of H^-1."""
+    """Interface of a preconditioner B ~ H^-1."""
 
     def register(self, state: State) -> None:
-        """Make what is kept from step to step part of the state."""
+        """Register the data kept between steps in the state."""
 
     def forget(self, flags: wp.array) -> None:
-        """The state of flagged worlds was set from elsewhere."""
+        """Invalidate history of worlds whose state was set externally."""
 
     def modules(self) -> set[wp.Module]:
-        """Modules that it launches."""
+        """Modules launched."""
 
     def start(self, active: wp.array) -> None:
-        """At the first iterate of an attempt: compute work.diagonal and work.inverse."""
+        """Compute work.diagonal and work.inverse at the first iterate of an attempt."""
 
     def renew(self, active: wp.array) -> None:
-        """The attempt begins from another iterate than that of the last `start`, which follows once more."""
+        """Discard the setup of the last `start`; the attempt restarts from another iterate."""
 
     def follow(self, active: wp.array) -> None:
-        """At every further iterate: follow it as far as needed."""
+        """Update at every further iterate as far as needed."""
 
     def commit(self, accepted: wp.array) -> None:
-        """The attempt was accepted."""
+        """Store history after acceptance of the attempt."""
 
     def prepare(self, active: wp.array) -> None:
-        """Before a linear solve: make what `apply` needs."""
+        """Compute the data of `apply` before a linear solve."""
 
     def judge(self, active: wp.array) -> None:
-        """After a linear solve: learn from what it cost."""
+        """After a linear solve: record its iteration count for the reuse rule."""
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = B r; per slot r.z in rows[0] and r.D^-1 r in rows[1]."""
 
 
 class BlockJacobi:
-    """The 3x3 diagonal blocks of H, made positive at each quadrature point."""
+    """3x3 diagonal blocks of H, made positive at each quadrature point."""
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.work, self.launch, self.residual = work, launch, residual
@@ -66,13 +66,13 @@ class BlockJacobi:
         self.dim = (model.worlds, launch.padded(model.slots))
 
     def register(self, state: State) -> None:
-        """It remembers nothing."""
+        """Stateless."""
 
     def forget(self, flags: wp.array) -> None:
-        """It remembers nothing."""
+        """Stateless."""
 
     def modules(self) -> set[wp.Module]:
-        """The module of the conjugate gradients, whose kernel it launches."""
+        """Module of the PCG kernel launched here."""
         return {self.kernels.module}
 
     @labelled("build")
@@ -83,16 +83,16 @@ class BlockJacobi:
     follow = start
 
     def renew(self, active: wp.array) -> None:
-        """Nothing is kept."""
+        """No-op: no stored setup."""
 
     def commit(self, accepted: wp.array) -> None:
-        """Nothing to keep."""
+        """No-op: no history."""
 
     def prepare(self, active: wp.array) -> None:
-        """Nothing to do: the blocks of the iterate are at hand."""
+        """No-op: the blocks of the iterate are available."""
 
     def judge(self, active: wp.array) -> None:
-        """Nothing to learn."""
+        """No reuse rule."""
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
@@ -110,12 +110,11 @@ SMALL_BODY = 64
 
 
 def choose(name: str, storage: str | None, model: Model) -> str:
-    """What a name of NAMES or "auto" stands for: factors where the band is narrow, and else block Jacobi where bodies
-    on joints are too small to hold several groups of nodes.
+    """Resolve a name of NAMES or "auto": banded factors for a narrow band, else block Jacobi if bodies on joints are
+    too small for several groups of nodes.
 
     Raises:
-        ModelError: "banded" on a GPU for a model that is not small, or with inverses in another precision than the
-            model's.
+        ModelError: "banded" for a larger model on a GPU, or with a storage precision other than the model's.
     """
     kept = storage in (None, model.dtype)
     banded = kept and (not model.device.is_cuda or block_band(model) is not None)
@@ -140,7 +139,7 @@ def choose(name: str, storage: str | None, model: Model) -> str:
 def make(
     name: str, storage: str | None, model: Model, work: Workspace, launch: Launcher, residual: Residual
 ) -> Preconditioner:
-    """The preconditioner `name` of NAMES."""
+    """Construct the preconditioner `name` of NAMES."""
     if name in ("block-jacobi", "deflated"):
         return BlockJacobi(model, work, launch, residual)
     return TwoLevel(model, work, launch, residual, storage, kind=name)

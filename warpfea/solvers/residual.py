@@ -1,4 +1,4 @@
-"""Evaluation of the step's residual, Eq. (17), and of the operator H v, for the worlds whose flag is set."""
+"""Evaluation of the step's residual, Eq. (17), and of the operator H v, in the active worlds."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ if TYPE_CHECKING:
 __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
-"""Slots per element up to which H p from the elements is cheaper than from their matrix, on a GPU."""
+"""Slots per element up to which H p from elements is cheaper than from their matrix, on a GPU."""
 MATRIX_COST = {False: 2.0, True: 0.5}
-"""Iterations of Newton's method that the matrix costs, on the CPU and on CUDA."""
+"""Assembly cost in Newton iterations, on the CPU and on CUDA."""
 BAND_COST = 3.0
-"""The same, of matrices that a GPU factors in a band. 4096 pendulums take 8.5, 8.1 and 8.2 ms per step with 0.5, 1.5
-and 3 where the tolerance is 1e-8, and 6.9, 5.7 and 4.2 ms where it is 1e-4."""
+"""Assembly cost in Newton iterations of matrices factored in a band on a GPU. 4096 pendulums take 8.5, 8.1 and 8.2 ms
+per step with 0.5, 1.5 and 3 at a tolerance of 1e-8, and 6.9, 5.7 and 4.2 ms at 1e-4."""
 SMALL_SLOTS = 16384
-"""Slots up to which a GPU makes a matrix faster than it solves with one."""
+"""Slots up to which a GPU assembles a matrix faster than it solves with one."""
 
 
 class Reducer:
-    """Sums rows [row, world, item] into [row, world], in an order that depends on the row's length alone."""
+    """Sum of rows [row, world, item] into [row, world], in an order that depends on the row length only."""
 
     def __init__(self, launch: Launcher, work: Workspace, worlds: int) -> None:
         self.launch = launch
@@ -60,7 +60,7 @@ class Reducer:
             return
         if n > CHUNK:
             partial = self.work.partial
-            # every chunk of the scratch is written: those beyond the row's end with zeros
+            # all chunks of the scratch are written: zeros beyond the row's end
             dim = (count, self.worlds, partial.shape[2])
             self.launch.tiled(self.kernels.partial_sums, dim, [rows, active, partial])
             rows = partial
@@ -72,7 +72,7 @@ class Residual:
 
     Attributes:
         by_matrix: H p is a product with the assembled matrix.
-        on_matrix: called with that matrix and the flags of the worlds for which it was made anew.
+        on_matrix: called with that matrix and the flags of worlds that reassembled it.
     """
 
     def __init__(self, at: At, *, operator: str, assembled: bool, banded: bool = False) -> None:
@@ -88,19 +88,19 @@ class Residual:
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
         self.with_mass = all(block.with_mass for block in model.blocks)
-        # elements with many points per slot cost more than the matrix that they make. On the CPU it is taken wherever
-        # the preconditioner wants one anyway: a core assembles H in the time of 2 to 7 products of ANCF elements, and
-        # of 15 of straight tetrahedra
+        # elements with many points per slot cost more than their matrix. On the CPU it is used whenever the
+        # preconditioner needs one anyway: one core assembles H in the time of 2 to 7 products of ANCF elements, and of
+        # 15 of straight tetrahedra
         cheaper = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
         if not model.device.is_cuda:
             cheaper = assembled
-        elif banded:  # and their factors solve with it
+        elif banded:  # their factors solve with the matrix
             cheaper = True
-        if at.midpoint:  # the matrix is symmetric, and the operator of a mid-point step is not
+        if at.midpoint:  # symmetric matrix, unsymmetric operator of a mid-point step
             cheaper = False
         self.by_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
         self.clusters: ModelClusters | None = None
-        # an equilibrium takes few products per iterate, and fewer iterates with the stress of the linear prediction
+        # an equilibrium takes few products per iterate, and fewer iterates with the predicted stress
         self.mixed = not at.inertia and not self.by_matrix
         if self.with_mass and not self.by_matrix and at.inertia:
             if "clusters" not in model.cache:
@@ -120,9 +120,9 @@ class Residual:
         if self.by_matrix:
             assert self.assembled is not None
             self.matrix = self.assembled.values("operator matrix")
-            # statics goes too far in a step for the last one's matrix, and the stress of the viscosity is no function
-            # of the state that a resumed run has; forces of constraints are only as good as the solve, and a GPU makes
-            # a small matrix in no time
+            # not in statics (large steps) nor with damping (the viscous stress is no function of the state of a resumed
+            # run) nor constraints (their forces are only as accurate as the solve); a GPU assembles a small matrix at
+            # negligible cost
             damped = at.midpoint or any(block.key.damping in ("incremental", "rate") for block in model.blocks)
             small = model.device.is_cuda and model.slots <= SMALL_SLOTS
             self.keep = 2 if at.inertia and not damped else 0 if small else 1
@@ -135,7 +135,7 @@ class Residual:
                 )
 
     def _additions(self) -> Any:
-        """What a product H p needs besides the elements' part."""
+        """Terms of a product H p beyond the elements' part."""
         m, w = self.model, self.work
         out = additions_struct(m.dtype)()
         of = m.terms.side_topology if m.terms.traits.tangent else m.topology
@@ -148,11 +148,11 @@ class Residual:
 
     @property
     def block_kernels(self) -> list[Any]:
-        """Kernels of the blocks of elements."""
+        """Kernels of the element blocks."""
         return self.elements.kernels(self.at)
 
     def modules(self) -> set[wp.Module]:
-        """Modules of the gather, and of the matrix where there is one; those of the terms are theirs."""
+        """Modules of the gather and of an assembled matrix; terms list their own."""
         out = {self.gather.module, self.vectors.module} | ({self.stage.module} if self.at.midpoint else set())
         if self.by_matrix:
             assert self.assembled is not None
@@ -165,17 +165,17 @@ class Residual:
         return out
 
     def register(self, state: State) -> None:
-        """Make what a resumed run must know of the operator's matrix part of the state."""
+        """Register the reuse data of the operator matrix in the state."""
         if self.lasting:
             self.reuse.register(state)
 
     def forget(self, flags: wp.array) -> None:
-        """The state of flagged worlds was set from elsewhere."""
+        """Invalidate history of worlds whose state was set externally."""
         if self.lasting:
             self.reuse.forget(flags)
 
     def commit(self, accepted: wp.array) -> None:
-        """The step was accepted: tell the state."""
+        """Store the reuse data of the operator matrix in the state."""
         if self.lasting:
             args = [self.reuse.control, self.work.newton, accepted]
             self.launch(self.reuse.kernels.count_step, self.model.worlds, args)
@@ -184,7 +184,7 @@ class Residual:
 
     @labelled("assembly")
     def linearise(self, active: wp.array) -> None:
-        """Make the operator's matrix at the iterate where the rule of its reuse asks for it."""
+        """Assemble the operator matrix at the iterate if its reuse rule requires it."""
         if not self.by_matrix:
             return
         if self.keep == 0:
@@ -209,7 +209,7 @@ class Residual:
         self.reuse.made()
 
     def take(self, active: wp.array) -> None:
-        """Make the operator's matrix at the iterate whatever the rule of its reuse says."""
+        """Assemble the operator matrix at the iterate unconditionally."""
         w = self.work
         if self.by_matrix:
             assert self.assembled is not None
@@ -219,7 +219,7 @@ class Residual:
                 self.on_matrix(self.matrix, active)
 
     def place(self, active: wp.array) -> None:
-        """q of the iterate v, and where forces are taken, if that is not there."""
+        """Positions q~ + (dq/dv) v, and stage positions of mid-point schemes."""
         w, state = self.work, self.at.state
         self.launch(self.vectors.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.at.midpoint:
@@ -228,21 +228,21 @@ class Residual:
 
     @labelled("residual")
     def reconsider(self, active: wp.array) -> None:
-        """Forces, g and all sums where only what terms hold has changed since they were taken at this iterate."""
+        """Re-evaluate forces, g and sums after an update of lagged term data."""
         self.at.moved = False
         self.balance(active, hold=True)
         self.at.moved = True
 
     @labelled("residual")
     def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
-        """q, forces, g and all sums at the iterate v; `hold`: Phi holds the non-potential forces of this iterate."""
+        """Evaluate q, forces, g and all sums at the iterate v; `hold`: Phi freezes the non-potential forces there."""
         w, launch = self.work, self.launch
         launch(self.newton.reset_min_J, self.model.worlds, [w.newton, active])
         self.place(active)
         self.balance(active, hold=hold)
 
     def balance(self, active: wp.array, *, hold: bool = False) -> None:
-        """Forces, g and all sums at work.u and work.v."""
+        """Evaluate forces, g and all sums at work.u and work.v."""
         m, w, launch = self.model, self.work, self.launch
         for term in self.terms:
             term.force(self.at, active)
@@ -267,7 +267,7 @@ class Residual:
 
     @labelled("loads")
     def hold_nonpotential(self, active: wp.array) -> None:
-        """From here on Phi holds the non-potential forces of this iterate."""
+        """Freeze the non-potential forces of Phi at this iterate."""
         if self.terms.traits.nonpotential:
             args = [self.work.nonpotential, active, self.work.nonpotential_held]
             self.launch(self.vectors.copy_active, self.dim, args)
@@ -284,7 +284,7 @@ class Residual:
 
     @labelled("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
-        """out = H p at the iterate, and p.Hp in parts in `curvature_rows`."""
+        """out = H p at the iterate; partial sums of p.Hp in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
         if self.clusters:
             for block, kernel, (data, count) in zip(m.blocks, self.products, self.clusters.blocks):
@@ -326,7 +326,7 @@ class Residual:
 
     @labelled("loads")
     def tangent_curvature(self, active: wp.array) -> None:
-        """p.K p of the forces without a potential along the direction p, into the Newton control."""
+        """p.K p of the non-potential forces along the direction p, into the Newton control."""
         w, launch = self.work, self.launch
         if not self.terms.traits.tangent:
             return

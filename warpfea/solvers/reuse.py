@@ -1,4 +1,4 @@
-"""Reuse of a preconditioner or matrix made at an earlier iterate: its rule, its place, and their part of the state."""
+"""Reuse rule of a preconditioner or matrix, its linearisation point and state arrays."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["Reuse"]
 
 
 class Reuse:
-    """The rule of kernels/solvers/reuse.py for one object (a preconditioner or a matrix), and the place of the object.
+    """Reuse rule of kernels/solvers/reuse.py for one object (preconditioner or matrix), with its linearisation point.
 
     Attributes:
-        control: the rule's counts on the device; `build` flags the worlds that make the object before a solve.
-        place: displacements that it is made at, [world, slot], m.
+        control: counts of the rule on the device; `build` flags the worlds that build the object before a solve.
+        place: displacements of the linearisation point, [world, slot], m.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, name: str, limit: float) -> None:
@@ -39,37 +39,37 @@ class Reuse:
         self.control.stale.fill_(1)
         self.control.mass_factor.fill_(-1.0)
         self.place = work.array(f"{name} place", self.dim, model.types.vec3)
-        # until `register`, no state keeps it
+        # no state owns it before `register`
         self.control.kept, self.kept = wp.zeros((0, 0), dtype=wp.float64, device=model.device), self.place
 
     def register(self, state: State) -> None:
-        """Make the place and the rule's counts part of the state, so that a resumed run takes the same decisions."""
+        """Register the linearisation point and counts in the state, so that a resumed run takes the same decisions."""
         self.control.kept = state.register(self.name, wp.float64, (6,), (0.0, -1.0, -1.0, 0.0, 0.0, 0.0))
         self.kept = state.register(f"{self.name}_displacement", self.model.types.vec3, (self.model.slots,))
 
     def forget(self, flags: wp.array) -> None:
-        """Note that the state of the flagged worlds was set from elsewhere: the object is made again from its place."""
+        """Flag worlds whose state was set externally: the object is rebuilt at the stored linearisation point."""
         self.launch(self.kernels.mark, self.model.worlds, [flags, self.control])
 
     def decide(self, active: wp.array) -> None:
-        """Flag the worlds that make the object before this solve, in `control.build`."""
+        """Flag the worlds that build the object before this solve, in `control.build`."""
         w = self.work
         self.control.any_build.zero_()
         args = [self.control, w.newton, w.step.mass_factor, w.step.dq_dv, active]
         self.launch(self.kernels.decide, self.model.worlds, args)
 
     def carry(self, accepted: wp.array | None = None) -> None:
-        """Before a solve: set the place to the iterate where the object is made anew, to the state's where restored.
+        """Set the linearisation point before a solve: the iterate for a rebuild, the state's copy after a restore.
 
-        `accepted`: flags of a step; given them, the state of accepted worlds takes the place instead.
+        `accepted`: flags of a step; the point is then copied to the state of accepted worlds instead.
         """
         args = [self.control, self.none if accepted is None else accepted, self.work.u_stage, self.kept, self.place]
         self.launch(self.kernels.carry_places, self.dim, args)
 
     def made(self) -> None:
-        """Note that the flagged worlds have made the object."""
+        """Mark the object of the flagged worlds as built."""
         self.launch(self.kernels.made, self.model.worlds, [self.control])
 
     def commit(self, accepted: wp.array) -> None:
-        """Store the rule's counts in the state of accepted worlds, after `carry` has stored the place."""
+        """Store the rule's counts in the state of accepted worlds, after `carry` has stored the point."""
         self.launch(self.kernels.commit, self.model.worlds, [self.control, accepted])

@@ -1,25 +1,25 @@
-"""The two-level preconditioner: inverses of tiles of 48 unknowns plus a coarse space, the affine motions of groups.
+"""Two-level preconditioner: inverses of tiles of 48 unknowns plus a coarse space, the affine motions of groups.
 
 z = T r + P C P^T r. T holds dense inverses of the diagonal blocks of H for the tiles, P the four affine functions per
 axis of each group of 64 slots (a position slot moves by a + B (X - Xc), a gradient slot along E by B E), and C
-approximates the inverse of P^T H P. C is a dense inverse where that matrix is small, else CHEBYSHEV_STEPS steps of the
-Chebyshev iteration, preconditioned by the same construction one level down. Adding the corrections of all levels
-instead, each once, is cheaper per iteration, but then iterations grow with the mesh.
+approximates the inverse of P^T H P. C is a dense inverse if that matrix is small, else CHEBYSHEV_STEPS steps of the
+Chebyshev iteration, preconditioned by the same construction one level down. An additive sum of all levels is cheaper
+per iteration, but its iterations grow with the mesh.
 
-Measured, and slower than without: tiles that overlap (16 of 64 slots their own: 93 iterations in
-place of 172 with nu = 0.49, but inverses 16 times as large), and the ten quadratic functions of groups for shells (in
-statics 42 iterations in place of 105; 50k unknowns in dynamics on the CPU 32 for 48, but 8.6 ms for 3.0 each, 593 ms
-per step for 478; in groups of 160 slots, where they cost the same, statics gain a third and dynamics nothing).
+Measured and rejected as slower: overlapping tiles (16 of 64 slots owned: 93 iterations in place of 172 with nu = 0.49,
+but inverses 16 times as large), and the ten quadratic functions of groups for shells (in statics 42 iterations in place
+of 105; 50k unknowns in dynamics on the CPU 32 for 48, but 8.6 ms for 3.0 each, 593 ms per step for 478; in groups of
+160 slots at equal cost statics gain a third and dynamics nothing).
 
-Where the unknowns have an order in which H is a narrow band, H itself is the only level, factored as a band (band.py).
+If some slot order makes H a narrow band, H itself is the only level, factored as a band (band.py).
 
-A model of beams that is inverted as a whole is factored instead in statics, and again with every matrix of the
-operator: there slender bodies need the tangent that Newton's method follows, and directions that are exact.
+In statics a model of beams small enough for one dense inverse is factored instead, with every matrix of the operator:
+slender bodies need the exact tangent and exact directions there.
 
-An odd number of Chebyshev steps keeps C positive whatever the largest eigenvalue is.
+An odd number of Chebyshev steps keeps C positive for any largest eigenvalue.
 
-With constraints, tiles and coarse matrices contain their penalties. As a constraint may couple slots of several tiles,
-(D + (dq/dv) J^T rho J)^-1 by Woodbury's identity is added on the slots that constraints touch.
+With constraints, tiles and coarse matrices contain the penalties. As a constraint may couple slots of several tiles, (D
++ (dq/dv) J^T rho J)^-1 by Woodbury's identity is added on the constrained slots.
 """
 
 from __future__ import annotations
@@ -56,15 +56,15 @@ __all__ = ["TwoLevel"]
 
 CHEBYSHEV_STEPS = 3
 LARGEST = 3.5
-"""Assumed largest eigenvalue of a preconditioned coarse matrix (2.7 to 3.5 were measured)."""
+"""Assumed largest eigenvalue of a preconditioned coarse matrix (2.7 to 3.5 measured)."""
 RATIO = 8.0
-"""Ratio of the largest to the smallest eigenvalue that the Chebyshev steps are designed for."""
+"""Design ratio of largest to smallest eigenvalue of the Chebyshev steps."""
 REBUILD_COST = 40.0
-"""Cost of making the preconditioner, in PCG iterations."""
+"""Setup cost of the preconditioner, in PCG iterations."""
 
 
 class TwoLevel:
-    """See the module. It is made anew when the rule of kernels/solvers/reuse.py says so."""
+    """See the module. Rebuilt by the reuse rule (kernels/solvers/reuse.py)."""
 
     def __init__(
         self,
@@ -93,11 +93,11 @@ class TwoLevel:
         first, pattern = self.levels[0], self.assembled.pattern
         band = first.band
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
-        # the factors of the operator's own matrix where they cost little, or where equilibria of beams are sought (the
-        # matrix made here serves for D alone then); wider ones are kept for longer than that
+        # factors of the operator's matrix if cheap, or for static equilibria of beams (the matrix made here then only
+        # serves D); wider bands are reused for longer
         one = self.storage == model.dtype and not residual.at.inertia and first.slots <= WHOLE_SLOTS
         order = find_band(model) if first.dense and one else band
-        # (a GPU factors the band of a small model in about the time of its matrix, and with joints what they add)
+        # (a GPU factors the band of a small model, joint terms included, in about the time of its matrix)
         quick = order is not None and (order.quick or (band is not None and model.device.is_cuda))
         traits = model.terms.traits
         whole = not self.adding or (model.device.is_cuda and not traits.pooled and residual.keep == 0)
@@ -109,7 +109,7 @@ class TwoLevel:
         if self.follows:
             residual.on_matrix = self._factor
             self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if first.dense else 0), model.types.T)
-        # the matrix of a chunk of worlds; factors of each keep a GPU busy with more of them at once
+        # matrix of a chunk of worlds; with factors a GPU needs more worlds at once to be busy
         share = 2 if self.follows and self.adding else 1
         self.chunk = model.worlds
         if not motion_bodies(model):
@@ -117,7 +117,7 @@ class TwoLevel:
             self.chunk = work.chunks["preconditioner matrix"](model.worlds)
         self.value = self.assembled.values("preconditioner matrix", self.chunk)
         self.chosen = work.array("preconditioner chunk", (model.worlds,), wp.int32)
-        free = model.group_count > 0  # bodies whose momentum the solve keeps by a correction of its own
+        free = model.group_count > 0  # bodies whose momentum is conserved by the translation correction
         if self.follows and self.band and model.dtype == "float64" and residual.at.inertia and not free:
             work.pcg.exact = self.band.exact
         self.motions, self.coupling = self._motions()
@@ -125,21 +125,21 @@ class TwoLevel:
         self.corrected = not self.levels[0].whole and any(term.preconditions(self.at) for term in self.terms)
         self.kept: dict[str, Kept] = {}
         self.rebuild_cost = band.rebuild_cost if band is not None and not self.follows else REBUILD_COST
-        # another name: iterations with factors and with levels have nothing to do with each other
+        # iteration counts are not comparable; separate key
         name = "preconditioner" if band is None else "preconditioner_banded"
         self.reuse = Reuse(model, work, launch, name, self.rebuild_cost)
         most = max([level.slots for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
     def _motions(self) -> tuple[Motions | None, set[wp.Module]]:
-        """The rigid motions of bodies that terms couple, and modules of the terms that they need."""
+        """Rigid body modes of bodies coupled by terms, and the term modules that they need."""
         if not motion_bodies(self.model):
             return None, set()
         out = Motions(self.model, self.work, self.launch, self.residual, self.assembled.pattern)
         return out, out.modules().union(*(term.reserve_motions(self.at, out) for term in self.terms))
 
     def _levels(self, kind: str) -> list[Level]:
-        """The levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
+        """Levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
         model, pattern = self.model, self.assembled.pattern
         if kind == "banded":
             band = find_band(model) or find_band(model, any_width=True)
@@ -151,7 +151,7 @@ class TwoLevel:
         return model.cache[key]
 
     def register(self, state: State) -> None:
-        """Put into the state what a run that goes on from it must know: where it was made, and the rule's counts."""
+        """Register the linearisation point and the rule's counts in the state, for resumed runs."""
         self.reuse.control.limit = self.rebuild_cost
         self.reuse.register(state)
         for term in self.terms:
@@ -176,54 +176,54 @@ class TwoLevel:
                     self.launch(reuse.kernels.carry_words, words[0].shape, [reuse.control, flags, *words])
 
     def modules(self) -> set[wp.Module]:
-        """Modules that it launches."""
+        """Modules launched."""
         k = self.kernels
         out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules() | self.coupling
         out |= self.band.modules() if self.band else {self.making.module}
         return out.union(*(arrays.dense.modules() for arrays in self.arrays if not self.band and arrays.dense))
 
-    # the seam
+    # interface of Preconditioner
 
     def renew(self, active: wp.array) -> None:
-        """What was made at the iterate before is of no use; where factors follow the operator's matrix, D still is."""
+        """Request a rebuild at the new start iterate; with factors that follow the operator's matrix, D only."""
         if self.follows and self.model.device.is_cuda:
             return
         self.launch(self.reuse.kernels.renew, self.model.worlds, [active, self.reuse.control])
 
     def follow(self, active: wp.array) -> None:
-        """Nothing to do: it is reused at later iterates."""
+        """No-op: reused at later iterates."""
 
     @labelled("build")
     def forget(self, flags: wp.array) -> None:
-        """The state of flagged worlds was set from elsewhere."""
+        """Invalidate history of worlds whose state was set externally."""
         self.reuse.forget(flags)
 
     def commit(self, accepted: wp.array) -> None:
-        """The step was accepted: tell the state."""
+        """Store history in the state."""
         self._carry(accepted)
         self.reuse.commit(accepted)
 
     @labelled("build")
     def start(self, active: wp.array) -> None:
-        """Make it anew where it is due, and D with it; penalties follow from D here."""
+        """Rebuild where due, with D and the penalties that follow from D."""
         self.reuse.decide(active)
         wp.capture_if(self.reuse.control.any_build, self._build_first)
 
     @labelled("build")
     def prepare(self, active: wp.array) -> None:
-        """Make it anew where it is due. The penalties of constraints stay those of the step."""
+        """Rebuild where due, with the constraint penalties of the step."""
         self.reuse.decide(active)
         wp.capture_if(self.reuse.control.any_build, self._build)
 
     @labelled("build")
     def judge(self, active: wp.array) -> None:
-        """Count what the solve cost."""
+        """Record the iteration count of the solve."""
         args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.follows)]
         self.launch(self.reuse.kernels.judge, self.model.worlds, args)
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
-        """z = B r; rows r.z and r.D^-1 r."""
+        """z = B r; partial sums r.z and r.D^-1 r in rows."""
         m, w, launch, k = self.model, self.work, self.launch, self.kernels
         level = self.levels[0]
         if level.whole:
@@ -263,7 +263,7 @@ class TwoLevel:
         dense.apply(flat_r, flat_x, active)
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
-        """z = T r on a level; returns the coarse correction C P^T r, which is still to be interpolated by P."""
+        """z = T r on a level; returns the coarse correction C P^T r, not yet interpolated by P."""
         level, arrays = self.levels[depth], self.arrays[depth]
         last = depth + 1 == len(self.levels)  # tiles alone
         coarse = z if last else self.arrays[depth + 1].vectors["r"]
@@ -283,7 +283,7 @@ class TwoLevel:
         return below["x"]
 
     def _chebyshev(self, depth: int, active: wp.array) -> None:
-        """x = C r on an intermediate level by Chebyshev steps; r is overwritten."""
+        """x = C r on an intermediate level by Chebyshev steps; overwrites r."""
         level, arrays = self.levels[depth], self.arrays[depth]
         v = arrays.vectors
         dim = (self.model.worlds, level.slots)
@@ -305,13 +305,13 @@ class TwoLevel:
             keep, step = new * rho, 2.0 * new / half
             rho = new
 
-    # making it
+    # setup
 
     def _build_first(self) -> None:
         self._build(penalty=True)
 
     def _chunks(self, flags: wp.array) -> Iterator[tuple[range, wp.array, wp.array]]:
-        """Worlds of each chunk, flags of those that `flags` chooses, and `value` as an array of all worlds."""
+        """Worlds of each chunk, flags of the worlds chosen by `flags`, and `value` indexed over all worlds."""
         B = self.model.worlds
         for first in range(0, B, self.chunk):
             worlds = range(first, min(first + self.chunk, B))
@@ -324,7 +324,7 @@ class TwoLevel:
     def _build(self, *, penalty: bool = False) -> None:
         m, w, launch, reuse = self.model, self.work, self.launch, self.reuse.control
         factors = (reuse.mass_factor, reuse.dq_dv)
-        # the rows follow once the penalties are known
+        # rows are scaled once the penalties are known
         self.reuse.carry()
         for worlds, flags, value in self._chunks(reuse.build):
             self.assembled.assemble(self.reuse.place, factors, flags, value, projected=True, worlds=worlds)
@@ -347,7 +347,7 @@ class TwoLevel:
             self._invert(reuse.build)
 
     def _take(self, value: wp.array, flags: wp.array) -> None:
-        """What is made of the matrix of some worlds: factors, or what inverses and the next level begin with."""
+        """Factor the matrix of some worlds, or fill the tiles and the next level."""
         level, arrays = self.levels[0], self.arrays[0]
         if self.follows:
             return
@@ -359,7 +359,7 @@ class TwoLevel:
             self._fill(0, value, flags)
 
     def _fill(self, depth: int, value: wp.array, flags: wp.array) -> None:
-        """Fill the tiles of a level, and the matrix of the next one."""
+        """Fill the tiles of a level and the matrix of the next one."""
         m, level, arrays = self.model, self.levels[depth], self.arrays[depth]
         args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
         self.launch(self.making.fill_tiles, (m.worlds, level.tiles, TILE_SLOTS), args)
@@ -370,7 +370,7 @@ class TwoLevel:
             self.launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
 
     def _invert(self, flags: wp.array) -> None:
-        """The inverses of all levels, the first of which is filled."""
+        """Invert all levels; the first is already filled."""
         for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
             if arrays.dense is not None:
                 if depth:
@@ -382,7 +382,7 @@ class TwoLevel:
             self._invert_tiles(level, arrays, flags, keep=depth == 0)
 
     def _couple(self, motions: Motions, flags: wp.array) -> None:
-        """The matrix of the bodies' rigid motions, and its inverse."""
+        """Assemble and invert the matrix of the rigid body modes."""
         motions.begin(self.reuse.place, self.value, flags)
         for term in self.terms:
             kept = self.kept[term.name].place if term.name in self.kept else []
@@ -416,7 +416,7 @@ class TwoLevel:
         self.launch(self.making.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
 
     def _add_to_copy(self, value: wp.array, worlds: range, flags: wp.array, out: wp.array) -> None:
-        """The operator's matrix of some worlds with all that terms add to it."""
+        """Operator matrix of some worlds with all term contributions."""
         w, dim = self.work, (len(worlds), 3 * self.assembled.pattern.entries)
         rows = slice(worlds.start, worlds.stop)
         given, copy = (shaped(a, dim, self.model.types.vec3) for a in (value[rows], self.value))
@@ -434,7 +434,7 @@ class TwoLevel:
 
 
 def _flat(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:
-    """Vectors seen as scalars."""
+    """A view of vectors as scalars."""
     out: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
     out._owner = array
     assert int(np.prod(shape)) * wp.types.type_size_in_bytes(dtype) == array.size * wp.types.type_size_in_bytes(

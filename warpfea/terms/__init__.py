@@ -1,1 +1,1 @@
-"""What adds to the residual of a step."""
+"""Contributions to the residual of a step."""

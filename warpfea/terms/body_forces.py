@@ -24,7 +24,7 @@ __all__ = ["BodyForces"]
 
 @dataclass(eq=False)
 class FieldPart:
-    """A body force on the elements of one block that belong to one body; `offset` in the term's own entries."""
+    """Body force on the elements of one block that belong to one body; `offset` into the term's own entries."""
 
     kernel: Any
     block: Any
@@ -35,7 +35,7 @@ class FieldPart:
 
 
 class BodyForces(Term):
-    """Fields have no potential in general: their force is held dead inside a line search."""
+    """Body force fields, non-potential in general: their force is frozen during a line search."""
 
     name = "body forces"
     potential = False
@@ -69,7 +69,7 @@ class BodyForces(Term):
             for host in block.parts:
                 members = np.arange(first, first + len(host.elements))
                 first += len(host.elements)
-                if host.body not in force.bodies or block.key.part:  # one part of an element's energy stands for it
+                if host.body not in force.bodies or block.key.part:  # one part of the energy represents the element
                     continue
                 self._tables(block)
                 take = argument_precision(force.function, m.dtype)
@@ -85,7 +85,7 @@ class BodyForces(Term):
         return out
 
     def _tables(self, block: Any) -> None:
-        """Shape functions and rho w at the points of the mass rule, made once per block."""
+        """Tables of shape functions and rho w at the points of the mass rule, built once per block."""
         m = self.model
         rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.parts]
         rule = max(rules, key=lambda r: r.degree)

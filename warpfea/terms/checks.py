@@ -1,4 +1,4 @@
-"""What is wrong with a term, told by name before a kernel writes where it must not."""
+"""Validate terms before launch."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ __all__ = [
 
 KINDS = {STORED: "STORED", WORK: "WORK", LOSS: "LOSS", NUMERICAL: "NUMERICAL", HELD_VISCOUS: "HELD_VISCOUS"}
 RESERVED = ("work",)
-"""Keys of energies() that are sums of columns."""
+"""Keys of energies() reserved for sums of columns."""
 
 
 def check_made(term: Any, make: Any, model: Model) -> None:
-    """ModelError unless what a maker made is a term with a name."""
+    """Raise ModelError unless the maker returned a named term of this model."""
     if not isinstance(term, Term):
         raise ModelError(f"add_term: {make!r} returned {term!r}; expected a warpfea.terms.Term, or None")
     if not isinstance(getattr(term, "name", None), str) or not term.name:
@@ -45,9 +45,9 @@ def check_made(term: Any, make: Any, model: Model) -> None:
 
 
 def check_names(terms: Sequence[Term], taken: Sequence[str], what: str, names: Any) -> None:
-    """ModelError where two terms give the same name, or one that is taken; `names` is a function of a term.
+    """Raise ModelError for a duplicate or reserved name; `names` maps a term to its names.
 
-    Two may share a field whose specification says how they are joined.
+    Two terms may share a field whose specification defines the join.
     """
     owner: dict[str, Term] = {}
     for term in terms:
@@ -61,7 +61,7 @@ def check_names(terms: Sequence[Term], taken: Sequence[str], what: str, names: A
 
 
 def derived_traits(term: Term) -> Traits:
-    """Traits of a term, from its tables and from what it overrides; ModelError where what it declares contradicts."""
+    """Traits of a term, from its tables and overridden methods; ModelError if they contradict the declared ones."""
     kind = type(term)
     declared = {"pooled": term.potential, "nonpotential": not term.potential, "tangent": not term.potential}
     for name, possible in declared.items():
@@ -83,7 +83,7 @@ def derived_traits(term: Term) -> Traits:
 
 
 def check_tables(term: Term, model: Model) -> None:
-    """ModelError unless connectivity and rows of a built term are sound."""
+    """Raise ModelError unless connectivity and rows of a built term are valid."""
     for k, conn in enumerate(_arrays(term)):
         where = f"term {term.name!r}, connectivity[{k}]"
         if not (isinstance(conn, np.ndarray) and conn.ndim == 2 and np.issubdtype(conn.dtype, np.integer)):
@@ -104,21 +104,21 @@ def _arrays(term: Term) -> Sequence[Any]:
 
 
 def check_stored(terms: Sequence[Term]) -> None:
-    """ModelError where a column of stored energy is booked twice: it holds what is there now, and can't add up."""
+    """Raise ModelError for a column of stored energy with two terms: it holds the present amount and can't add up."""
     every = [(column.name, term.name) for term in terms for column in term.columns if column.name]
     for name in (name for term in terms for name in stored_columns(term)):
         owners = [owner for other, owner in every if other == name]
         if len(owners) > 1:
-            raise ModelError(f"column {name!r} of stored energy is booked twice, by {owners[0]!r} and {owners[1]!r}")
+            raise ModelError(f"energy column {name!r} is written twice: by {owners[0]!r} and {owners[1]!r}")
 
 
 def stored_columns(term: Term) -> list[str]:
-    """Names of the columns that tell what it stores."""
+    """Names of the columns of stored energy."""
     return [column.name for column in term.columns if column.kind == STORED]
 
 
 def check_columns(term: Term, *, own: bool) -> None:
-    """ModelError unless the columns of the ledger that a term books are sound; `own`: it comes with warpfea."""
+    """Raise ModelError unless a term's ledger columns are valid; `own`: a term of warpfea."""
     kind = type(term)
     if term.columns and kind.book is Term.book:
         raise ModelError(f"term {term.name!r} has columns, but does not override book")
@@ -129,9 +129,7 @@ def check_columns(term: Term, *, own: bool) -> None:
         if column.kind in (STORED, WORK, LOSS) and not column.name:
             raise ModelError(f"{where}: {KINDS[column.kind]} needs a name, the column of energies()")
         if column.kind == STORED and kind.measure is Term.measure:
-            raise ModelError(
-                f"{where}: what is stored at a state must be known where the ledger begins anew: override measure"
-            )
+            raise ModelError(f"{where}: override stored_energy: the ledger restarts from it after a reset")
         if own:
             continue
         if column.kind == HELD_VISCOUS:
@@ -145,7 +143,7 @@ def check_columns(term: Term, *, own: bool) -> None:
 
 
 def check_measured(term: Term, values: Any, worlds: int) -> None:
-    """ModelError unless what `measure` returned has the columns of stored energy."""
+    """Raise ModelError unless `measure` returned all columns of stored energy."""
     if not isinstance(values, dict) or set(values) != set(stored_columns(term)):
         values = values if isinstance(values, dict) else [repr(values)]
         raise ModelError(
@@ -158,7 +156,7 @@ def check_measured(term: Term, values: Any, worlds: int) -> None:
 
 
 def check_rows(term: Term, rows: Any, worlds: int, longest: int) -> None:
-    """ModelError unless what `book` returned are rows (columns, worlds, items) in float64."""
+    """Raise ModelError unless `book` returned rows (columns, worlds, items) in float64."""
     import warp as wp
 
     where = f"term {term.name!r}: book returned"

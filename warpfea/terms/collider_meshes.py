@@ -1,4 +1,4 @@
-"""Triangles of colliders on the device."""
+"""Triangle meshes of colliders on the device."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["mesh_tables", "sizes"]
 
 
 def mesh_tables(model: Model, shapes: Sequence[Shape]) -> Any:
-    """The device struct of all meshes among the shapes of colliders; a mesh used twice is there once."""
+    """Device struct of all meshes among the collider shapes; a mesh used twice is stored once."""
     found = dict.fromkeys(shape for shape in shapes if isinstance(shape, TriMesh))
     out, parts = mesh_struct()(), [shape.tables for shape in found]
     boxes, leaves, triangles = (np.cumsum([0, *counts]) for counts in zip(
@@ -43,8 +43,8 @@ def mesh_tables(model: Model, shapes: Sequence[Shape]) -> Any:
 
 
 def sizes(shape: Shape, surfaces: Sequence[np.ndarray]) -> np.ndarray:
-    """`Shape.sizes`; the thickness of a sheet is how deep bodies may come: the second largest edge of the smallest box
-    around a surface that touches it, m. `surfaces`: their points, (n, 3)."""
+    """`Shape.sizes`; for a sheet the detection thickness, m: the second largest edge of the smallest bounding box of a
+    surface that touches it. `surfaces`: their points, (n, 3)."""
     out = shape.sizes
     if isinstance(shape, TriMesh) and not shape.closed:
         out[1] = min((np.sort(np.ptp(X, axis=0))[1] for X in surfaces), default=out[0])

@@ -1,4 +1,4 @@
-"""Tables of constraints on the device: rows, their order, and the pairs of rows that share slots."""
+"""Tables of constraints on the device: rows, their order, and pairs of rows that share slots."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
 __all__ = ["ConstraintTables"]
 
 DENSE = 64
-"""Most coupled rows of several joints whose matrix is inverted as one; beyond, joints are swept colour by colour."""
+"""Maximum coupled rows of several joints with one inverse matrix; beyond, joints are swept colour by colour."""
 
 
 class ConstraintTables:
-    """Rows of a model on the device, ordered by connected component and by cluster of rows that share slots.
+    """Constraint rows of a model on the device, ordered by connected component and by cluster of rows that share slots.
 
     Attributes:
-        joints: in the order they were added.
+        joints: in the order of addition.
         count: number of rows.
-        rows_of: for each joint the indices of its rows.
-        data: the device tables.
+        rows_of: row indices of each joint.
+        data: device tables.
     """
 
     def __init__(self, model: Model, joints: Sequence[Joint]) -> None:
@@ -54,10 +54,10 @@ class ConstraintTables:
         self.rows = [row for joint in self.joints for row in joint.rows]
         self.count = len(self.rows)
 
-    # connectivity, before the model knows its components
+    # connectivity, before components are known
 
     def slot_groups(self) -> list[np.ndarray]:
-        """For each joint the model slots that its rows tie."""
+        """Model slots tied by the rows of each joint."""
         return [
             np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.terms]))
             for joint in self.joints
@@ -76,17 +76,17 @@ class ConstraintTables:
                 axis = row.b.value if row.kind == DOT and not row.b.parts else np.ones(3)
                 free[self.component_host[k], np.abs(axis) > 1e-12] = 0.0
 
-    # the device tables
+    # device tables
 
     def build(self, component: np.ndarray, laws: TimeLaws) -> None:
-        """Upload; `component` of each slot."""
+        """Upload the tables; `component` of each slot."""
         self._order(component)
         self._fill_terms(laws)
         self._fill_pairs()
         self._fill_joints()
 
     def _order(self, component: np.ndarray) -> None:
-        """Sort the joints by component and cluster."""
+        """Sort joints by component and cluster."""
         groups = self.slot_groups()
         free = np.any(self.model.free_host > 0.0, axis=1)
         joint_of = np.concatenate([np.full(len(g), k) for k, g in enumerate(groups)])
@@ -108,7 +108,7 @@ class ConstraintTables:
             clusters += [cluster[k]] * n
             components += [own[k]] * n
         self.rows = rows
-        # renumber in order of appearance, so that clusters are runs of rows
+        # renumber in order of appearance: clusters become ranges of rows
         seen: dict[int, int] = {}
         self.cluster_host = np.array([seen.setdefault(int(c), len(seen)) for c in clusters])
         self.component_host = np.array(components)
@@ -156,7 +156,7 @@ class ConstraintTables:
         self._entries = entries
 
     def _fill_pairs(self) -> None:
-        """For each pair of rows that share slots the pairs of vectors that do: dense in clusters, else couplings."""
+        """Pairs of shared vectors for each pair of rows that share slots: dense within clusters, else couplings."""
         first = self._cluster_rows()
         shared = self._shared_vectors()
         n = np.diff(first)
@@ -204,7 +204,7 @@ class ConstraintTables:
             setattr(self.data, name, self.model.array("constraints", np.asarray(values), dtype))
 
     def _cluster_rows(self) -> np.ndarray:
-        """Split runs of coupled rows that are too large for a dense inverse into their joints; first row of each."""
+        """First row of each cluster, after splitting clusters too large for a dense inverse into joints."""
         sizes = np.bincount(self.cluster_host)
         joint = np.zeros(self.count, dtype=np.int64)
         for k, rows in enumerate(self.rows_of):
@@ -216,9 +216,9 @@ class ConstraintTables:
         return np.concatenate([starts, [self.count]])
 
     def _shared_vectors(self) -> list[dict[int, list[tuple[tuple[int, int], int]]]]:
-        """For each row the rows that it shares slots with: pairs of sides and the block of both vectors.
+        """Rows that share slots with each row: pairs of sides and the block of both vectors.
 
-        Blocks sum w w' D^-1 over the slots; rows share vectors (a pin's three rows are of one), so blocks are few.
+        Blocks sum w w' D^-1 over the slots; rows share vectors (the three rows of a pin use one), so blocks are few.
         """
         weights, rows_of_vector, sides = self._vectors()
         near, block_start, block_slot, block_weight = _shared_blocks(weights)
@@ -264,7 +264,7 @@ class ConstraintTables:
         return weights, rows_of_vector, sides
 
     def _colour_clusters(self, row: np.ndarray, column: np.ndarray) -> None:
-        """Greedy colouring of coupled clusters; `colour_sizes` counts those of each colour."""
+        """Greedy colouring of coupled clusters; `colour_sizes` counts the clusters per colour."""
         n = len(self.cluster_sizes)
         near: list[set[int]] = [set() for _ in range(n)]
         for a, b in zip(self.cluster_host[row].tolist(), self.cluster_host[column].tolist()):
@@ -286,7 +286,7 @@ class ConstraintTables:
         side = np.where(self.child_host, 1, 0)
         for rows in self.rows_of:
             own = slice(self.start_host[3 * rows[0]], self.start_host[3 * rows[-1] + 3])
-            if not self.child_host[own].any():  # the child is in space: it feels what the parent does, reversed
+            if not self.child_host[own].any():  # child in space: the parent's reaction
                 side[own] = -1
         tables: dict[str, tuple[Any, Any]] = {
             "first": ([rows[0] for rows in self.rows_of], wp.int32),
@@ -304,17 +304,17 @@ class ConstraintTables:
         for k, joint in enumerate(self.joints):
             joint.index = k
 
-    # on the host, for supports, tests and users
+    # host evaluation for supports, tests and users
 
     def expand(self, G: np.ndarray) -> sp.csr_matrix:
-        """Rows of the Jacobian from the gradients of the vectors (rows, 3, 3)."""
+        """Rows of the Jacobian, CSR, from the gradients (rows, 3, 3) of their vectors."""
         data = self.weight_host[:, None] * G.reshape(-1, 3)[self.term_host]
         rows = np.repeat(self.term_host // 3, 3)
         columns = (3 * self.slot_host[:, None] + np.arange(3)).ravel()
         return sp.csr_matrix((data.ravel(), (rows, columns)), shape=(self.count, 3 * self.model.slots))
 
     def measure(self, joint: Joint, what: str | None, state: Any) -> np.ndarray:
-        """ "angle" (rad), "travel" or "length" (m) of a joint, (worlds,); ModelError where it has none."""
+        """Joint coordinate (worlds,): "angle" (rad), "travel" or "length" (m); ModelError if undefined."""
         has = self.vectors_of(joint)
         what = what or next(iter(has), None)
         if what not in has:
@@ -338,17 +338,17 @@ class ConstraintTables:
 
     @staticmethod
     def vectors_of(joint: Joint) -> dict[str, list[Vector]]:
-        """Vectors that "angle" (three), "travel" (two) and "length" (one) of a joint are made of, where it has them."""
+        """Vectors of a joint that define its "angle" (three), "travel" (two) and "length" (one), if any."""
         length = [joint.rows[0].a] if joint.rows[0].kind == DISTANCE else []
         has = {"angle": list(joint.angle or ()), "travel": list(joint.travel or ()), "length": length}
         return {name: vectors for name, vectors in has.items() if vectors}
 
     def turn_of(self, joint: Joint) -> int:
-        """Row of the drive whose full turns the angle of a joint counts, or -1."""
+        """Row of the drive that counts the full turns of a joint's angle, or -1."""
         return next((int(k) for k in self.rows_of[joint.index] if self.rows[k].kind == TURN), -1)
 
     def targets(self, state: Any) -> np.ndarray:
-        """Right sides (worlds, rows) that the state was brought to; of a state that never stepped those of its time."""
+        """Right-hand sides (worlds, rows) of the state, or those at its time if it never stepped."""
         at_time = self.model.terms.constraints.values(state)[2]
         if "constraint_target" not in state.names:
             return at_time
@@ -361,14 +361,14 @@ class ConstraintTables:
         return vector.value + weights @ u[slots]
 
     def hash(self, h: Any) -> None:
-        """Feed what defines the rows into a hash."""
+        """Hash the definition of the rows."""
         for row in self.rows:
             h.update(f"{row.kind} {row.scale!r} {row.constant!r} {row.fixed!r} {row.component}".encode())
         for values in (self.slot_host, self.weight_host, self.start_host, self.reference_host):
             h.update(np.ascontiguousarray(values).tobytes())
 
     def couplings(self, pattern: Any) -> tuple[Any, int]:
-        """Upper entries of a matrix's pattern that the rows add to, with their pairs of vectors, and their number."""
+        """Upper pattern entries that the rows contribute to, their pairs of vectors, and the number of entries."""
         items, term_a, term_b, weight = [], [], [], []
         for row in range(self.count):
             first, last = self.start_host[3 * row], self.start_host[3 * row + 3]

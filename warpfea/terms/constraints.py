@@ -1,10 +1,9 @@
-"""Constraints by an augmented Lagrangian: their values, forces, part of H, and multipliers.
+"""Constraints by an augmented Lagrangian: values, forces, part of H, and multipliers.
 
-The classical method solves g(v; lambda) = 0 at fixed lambda, then adds rho c, and so on until |c| <= tol. Here lambda
-is updated with every Newton step by rho (c + (dq/dv) J p), which is what the constraint linearised at the iterate makes
-of the same formula: Newton's method on the pair (v, lambda), with 1/rho on the diagonal that keeps redundant rows
-solvable. The outer loop costs nothing then, and the curvature sum lambda d2c/dq2 is free of rho c. The classical update
-is `NewtonPCG(multipliers="outer")`.
+The classical method solves g(v; lambda) = 0 at fixed lambda, then adds rho c, until |c| <= tol. Here lambda is updated
+with every Newton step by rho (c + (dq/dv) J p), the same formula for the constraint linearised at the iterate: Newton's
+method on the pair (v, lambda), with 1/rho on the diagonal that keeps redundant rows solvable. No outer loop is needed,
+and the curvature sum lambda d2c/dq2 is free of rho c. The classical update is `NewtonPCG(multipliers="outer")`.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ if TYPE_CHECKING:
 __all__ = ["Constraints"]
 
 THREAD_LIMIT = 16
-"""Rows of a cluster up to which one thread inverts its matrix; larger ones take a launch per pivot."""
+"""Maximum rows of a cluster whose matrix one thread inverts; larger ones take a launch per pivot."""
 
 
 class Constraints(Term):
-    """The joints, welds and single constraints of a model.
+    """Joints, welds and single constraints of a model.
 
     Attributes:
         tables: their rows on the device.
@@ -85,14 +84,14 @@ class Constraints(Term):
     def hash(self, h: Any) -> None:
         self.tables.hash(h)
 
-    # for one simulation
+    # simulation setup
 
     def kernels_of(self, at: At) -> Any:
-        """The kernels of a simulation, as its integrator asks."""
+        """Kernels specialised for the integrator of a simulation."""
         return constraint_kernels(self.model.dtype, at.midpoint)
 
     def allocate(self, work: Workspace, at: At) -> None:
-        """Multipliers and matrices, work.multipliers."""
+        """Allocate multipliers and matrices, work.multipliers."""
         model, con = self.model, self.tables
         mul = multiplier_struct()()
         B, M = model.worlds, con.count
@@ -119,7 +118,8 @@ class Constraints(Term):
         at.state.register("constraint_target", wp.float64, (self.tables.count,), np.nan)
 
     def configure(self, at: At) -> None:
-        """Take the solver's options: classical updates or not, kappa, and whether directions are deflated."""
+        """Read the solver's options: classical updates or not, kappa, and whether constraint directions are
+        deflated."""
         at.work.newton.violation = at.work.multipliers.violation
         mul, options = at.work.multipliers, at.options
         mul.classical, mul.kappa = int(options.classical), options.kappa
@@ -134,7 +134,7 @@ class Constraints(Term):
         return {self.kernels_of(at).module, deflation_kernels(self.model.dtype).module}
 
     def start(self, at: At, active: wp.array) -> None:
-        """Right sides at the state's time, where the state does not know them, and the violation at the start."""
+        """Initialise right-hand sides missing in the state, and the violation at the start."""
         state, mul = at.state, at.work.multipliers
         self.begin(at, active)
         self.prepare(at, active)
@@ -145,13 +145,13 @@ class Constraints(Term):
 
     @part("constraints")
     def begin(self, at: At, active: wp.array) -> None:
-        """Warm start of an attempt from the state's multipliers and right sides; rho is not known yet."""
+        """Warm start of an attempt from the multipliers and right-hand sides of the state; rho is not known yet."""
         args = [at.state.constraint_force, at.state.constraint_target, active, at.work.multipliers]
         at.launch(self.kernels_of(at).load_multipliers, self.dim, args)
 
     @part("constraints")
     def force(self, at: At, active: wp.array) -> None:
-        """c, J and the augmented potential's rows at work.u."""
+        """Evaluate c, J and the rows of the augmented potential at work.u."""
         m, w, k = self.model, at.work, self.kernels_of(at)
         at.launch(k.reset_violation, (m.worlds, m.component_count), [active, w.multipliers])
         args = [self.tables.data, w.u, w.u_stage, w.law_value, w.newton.alpha, active, w.multipliers]
@@ -167,7 +167,7 @@ class Constraints(Term):
 
     @part("build")
     def invert(self, at: At, active: wp.array, *, penalty: bool = False) -> None:
-        """Matrices of the clusters from the inverse diagonal blocks; `penalty`: set rho from them."""
+        """Assemble and invert the cluster matrices from the inverse diagonal blocks; `penalty`: set rho from them."""
         deflation: Deflation = at.scratch[self.name]
         if not (deflation.on or penalty):
             return
@@ -188,31 +188,31 @@ class Constraints(Term):
             launch(k.scale_row, dim[:2], [data, deflation.large, pivot, active, mul])
 
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        """Terms of the constraints' part of H p, for the gather."""
+        """Constraint part of H p, for the gather."""
         w = at.work
         args = [self.tables.data, w.multipliers, p, w.step.dq_dv, active]
         at.launch(self.kernels_of(at).product_terms, self.dim, args)
 
     @part("constraints")
     def aim(self, at: At, active: wp.array) -> None:
-        """The multipliers' part of the Newton step in work.direction."""
+        """Multiplier part of the Newton step in work.direction."""
         w = at.work
         args = [self.tables.data, w.multipliers, w.direction, w.newton.quiet, w.step.dq_dv, active]
         at.launch(self.kernels_of(at).predict_change, self.dim, args)
 
     def adopt(self, at: At, flags: wp.array) -> None:
-        """With every Newton step; the classical method does it in its outer loop."""
+        """Accept the trial's multipliers with every Newton step; the classical method uses its outer loop."""
         if not at.options.classical:
             self.outer(at, flags)
 
     @part("constraints")
     def outer(self, at: At, flags: wp.array) -> None:
-        """Take over the multipliers of the trial."""
+        """Accept the trial's multipliers."""
         at.launch(self.kernels_of(at).adopt, self.dim, [flags, at.work.multipliers])
 
     @part("constraints")
     def book(self, at: At, accepted: wp.array) -> wp.array:
-        """Work of drives and what the chord takes from constraints at rest, along an accepted substep."""
+        """Work of drives and the constraint work of the chord at rest, J, over an accepted substep."""
         w, state = at.work, at.state
         args = [self.tables.data, w.multipliers, w.u, state.displacement, state.constraint_target, accepted]
         at.launch(self.kernels_of(at).work_terms, self.dim, args)
@@ -220,12 +220,12 @@ class Constraints(Term):
 
     @part("constraints")
     def commit(self, at: At, accepted: wp.array) -> None:
-        """Keep multipliers and right sides of an accepted substep."""
+        """Store multipliers and right-hand sides of an accepted substep."""
         args = [accepted, at.work.multipliers, at.state.constraint_force, at.state.constraint_target]
         at.launch(self.kernels_of(at).commit_multipliers, self.dim, args)
 
     def report(self, at: At) -> None:
-        """Force and moment on the child, and violation, of each joint."""
+        """Report the force and moment on the child and the violation of each joint."""
         w, con, state = at.work, self.tables, at.state
         args = [con.data, w.multipliers, con.joint_data, state.displacement, state.constraint_force]
         dim = (self.model.worlds, len(con.joints))
@@ -267,9 +267,9 @@ class Constraints(Term):
 
     @part("preconditioner")
     def precondition(self, at: At, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None) -> None:
-        """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z on the slots of constraints, z = D^-1 r; and r.z.
+        """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z on the constrained slots, z = D^-1 r; and r.z.
 
-        With `into` the result is added there instead.
+        With `into` the result is added to it instead.
         """
         m, w, k, launch = self.model, at.work, deflation_kernels(self.model.dtype), at.launch
         data, mul = self.tables.data, w.multipliers
@@ -286,10 +286,10 @@ class Constraints(Term):
         args = [data, mul, w.inverse, r, z, int(into is not None), active, w.warp]
         launch(k.project, (m.worlds, launch.padded(m.slots)), [*args, z if into is None else into, w.warp_rows])
 
-    # at a state, for checks and results
+    # evaluation at a state
 
     def evaluate(self, state: State, multipliers: np.ndarray | None = None) -> Any:
-        """Multiplier struct with the rows evaluated at a state, with given multipliers (rows,) and no penalty."""
+        """Multiplier struct with the rows evaluated at a state, for given multipliers (rows,) and no penalty."""
         m, con, B = self.model, self.tables, self.model.worlds
         launch, laws = Launcher(m.device), m.terms.laws
 
@@ -309,13 +309,13 @@ class Constraints(Term):
         mul.violation = zeros((B, m.component_count), wp.float64)
         if multipliers is not None:
             mul.force.assign(np.tile(multipliers, (B, 1)))
-        mul.last.fill_(np.nan)  # any turn is as good as another
+        mul.last.fill_(np.nan)  # any number of turns is valid
         args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), every, mul]
         launch(self.kernels.evaluate, self.dim, args)
         return mul
 
     def values(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values [world, row], gradients [world, 3 row + side, 3] and right sides [world, row] at a state."""
+        """Values [world, row], gradients [world, 3 row + side, 3] and right-hand sides [world, row] at a state."""
         mul = self.evaluate(state)
         return mul.value.numpy(), mul.gradient.numpy(), mul.target.numpy()
 
@@ -340,11 +340,11 @@ class Constraints(Term):
 
 
 class Deflation:
-    """How directions of constraints are treated apart in a preconditioner.
+    """Separate treatment of constraint directions in a preconditioner.
 
     Attributes:
-        on: they are; else the preconditioner holds the penalties itself.
-        largest, large, count: rows of the largest cluster above THREAD_LIMIT, and those clusters.
+        on: deflation is active; else the preconditioner includes the penalties.
+        largest, large, count: rows of the largest cluster above THREAD_LIMIT, these clusters, and their number.
     """
 
     def __init__(self, on: bool, largest: int, large: wp.array | None, count: int) -> None:

@@ -1,4 +1,4 @@
-"""Contact with rigid obstacles: a term whose potential is that of its points, see kernels/terms/contact.py."""
+"""Contact with rigid obstacles, with a potential per contact point, see kernels/terms/contact.py."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = ["Contact"]
 
 
 class Contact(Term):
-    """All contacts of a model with its colliders.
+    """Contacts of a model with its colliders.
 
     Attributes:
         tables: contacts, colliders and facets on the device.
@@ -78,10 +78,10 @@ class Contact(Term):
     def hash(self, h: Any) -> None:
         self.tables.hash(h)
 
-    # for one simulation
+    # simulation setup
 
     def attempt_of(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
-        """The struct of an attempt, with arrays from make(name, shape, dtype)."""
+        """Attempt struct with arrays from make(name, shape, dtype)."""
         t, B = self.tables, worlds
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
         shapes: dict[str, tuple[int, ...]] = {
@@ -103,7 +103,7 @@ class Contact(Term):
         return out
 
     def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
-        """The struct of the history, with arrays from make(name, dtype, shape of a world)."""
+        """History struct with arrays from make(name, dtype, shape per world)."""
         out = history_struct()()
         shapes: dict[str, tuple[int, ...]] = {"born": (), "posed": ()}
         shapes |= dict.fromkeys(("place", "turn", "angle", "grown"), (len(self.tables.colliders),))
@@ -126,7 +126,7 @@ class Contact(Term):
         scratch = {
             "attempt": attempt,
             "clock": clock,
-            # of Newton's method; Jacobi's iteration has no use for it
+            # Newton's method only; unused by Jacobi's iteration
             "touching": work.newton.touching,
             "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
@@ -143,15 +143,15 @@ class Contact(Term):
         return [self.kernels.module, *others]
 
     def start(self, at: At, active: wp.array) -> None:
-        """Colliders at the state's time, and what overlaps there.
+        """Collider poses at the state's time, and initial overlaps.
 
         Raises:
-            ModelError: a point that was not in contact lies in an obstacle, and `overlap` is "refuse".
+            ModelError: a new contact point overlaps an obstacle, and `overlap` is "refuse".
         """
         s, state = at.scratch[self.name], at.state
         history = s["history"]
         time = state.time.numpy()
-        # of a state with the history of its time colliders go on from there: a control may have been written since
+        # with a history at this time colliders continue from it: a control may have changed since
         known = history.turn.numpy().any(axis=(1, 2, 3)) & (history.posed.numpy() == time)
         fresh = (active.numpy() != 0) & ~known
         self._poses(at, active)
@@ -177,7 +177,7 @@ class Contact(Term):
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
-        """Stored overlaps keep their age."""
+        """Shift the start times of stored overlaps."""
         if "contact_born" in state.specs:
             state.contact_born.assign(state.contact_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
@@ -190,7 +190,7 @@ class Contact(Term):
 
     @part("contact")
     def begin(self, at: At, active: wp.array) -> None:
-        """Colliders at the end of the attempt, points at its beginning."""
+        """Poses of the colliders at the end of the attempt, points at its start."""
         s, m = at.scratch[self.name], self.model
         s["finished"] = False
         self._poses(at, active)
@@ -203,7 +203,7 @@ class Contact(Term):
                 at.launch(self.kernels.explicit_forces, dim, [*args, *more[1:]])
 
     def prepare(self, at: At, active: wp.array) -> None:
-        """The first caps, and the stiffness that blocks are made from."""
+        """Compute the first friction limits and the stiffness of the blocks."""
         self._forces(at, active, fresh=1)
 
     def force(self, at: At, active: wp.array) -> None:
@@ -225,7 +225,7 @@ class Contact(Term):
             at.launch(k.gather_points, dim, args)
 
     def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
-        """Choose the point of each lumped contact, at work.u."""
+        """Select the point of each single-point contact at work.u."""
         if not self.places:
             return
         s, w = at.scratch[self.name], at.work
@@ -265,7 +265,7 @@ class Contact(Term):
 
     @part("contact")
     def _finish(self, at: At, accepted: wp.array) -> None:
-        """History, books and records of an accepted substep."""
+        """Update history, ledger rows and records of an accepted substep."""
         s, m, k = at.scratch[self.name], self.model, self.books
         C = len(self.tables.contacts)
         for group in self.tables.groups:
@@ -278,7 +278,7 @@ class Contact(Term):
     @part("contact")
     def commit(self, at: At, accepted: wp.array) -> None:
         s, m, w = at.scratch[self.name], self.model, at.work
-        if not s["finished"]:  # without a ledger nothing is booked
+        if not s["finished"]:  # no ledger, `book` not called
             self._finish(at, accepted)
         args = [self.tables.data, s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"]]
         at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), [*args, s["attempt"]])
@@ -288,13 +288,13 @@ class Contact(Term):
         at.launch(self.books.write_records, (self.model.worlds, len(self.tables.contacts)), args)
 
     def measure(self, at: At) -> dict[str, np.ndarray]:
-        """Energy that the history says is stored, by points; a lumped contact's is at its first."""
+        """Stored energy according to the history, by points; a single-point contact stores it at its first point."""
         stored = at.scratch[self.name]["history"].stored.numpy()
         return {"contact": stored @ self.weights}
 
     @property
     def weights(self) -> np.ndarray:
-        """(points,) part of the region that a point stands for."""
+        """Fraction (points,) of the contact area represented by each point."""
         out = np.concatenate([share.ravel() for share in self.tables.shares])
         for k, contact in enumerate(self.tables.contacts):
             if contact.model == "sphere":
@@ -316,7 +316,7 @@ class Contact(Term):
         self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
-        """The points' stiffness, which is positive."""
+        """Positive semi-definite stiffness of the points."""
         m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
             args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0]]
@@ -367,8 +367,8 @@ class Contact(Term):
         return contact_parameters(self.tables) | collider_parameters(self.tables)
 
     def facts(self) -> list[dict[str, Any]]:
-        """Of each contact, in the order they were added, what `Model.info` tells: with the points that count, and those
-        left out, which clamped slots hold."""
+        """Entries of `Model.info` per contact, in the order of addition: active points, and points excluded because
+        their slots are clamped."""
         t, out = self.tables, []
         for contact in self.model.description.contacts:
             k = t.number[contact.index]
@@ -382,12 +382,12 @@ class Contact(Term):
     # at a state
 
     def nodal_force(self, state: State) -> np.ndarray:
-        """Elastic forces of all contacts on slots, (worlds, slots, 3), N, at a state."""
+        """Elastic nodal forces of all contacts at a state, (worlds, slots, 3), N."""
         return nodal_force(self.tables, self.at_points(state)[1])
 
     def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Places (worlds, colliders, 3), m, and turns (..., 3, 3) of the colliders at a state, and by how much their
-        surfaces lie further out (worlds, colliders), m; None of a state without history."""
+        """Positions (worlds, colliders, 3), m, rotations (..., 3, 3) and surface offsets (worlds, colliders), m, of the
+        colliders at a state; None without history."""
         if "contact_place" not in state.specs:
             return None
         return state.contact_place.numpy(), state.contact_turn.numpy(), self.tables.data.grow.numpy()  # type: ignore[attr-defined]
@@ -399,5 +399,5 @@ class Contact(Term):
 
     def at_points(self, state: State, history: Any = None, *, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; with `places`
-        the gap of a lumped contact's deepest place is that of the point next to it."""
+        the gap at the deepest position of a single-point contact is assigned to the nearest point."""
         return at_points(self, state, history, places)

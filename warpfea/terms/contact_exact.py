@@ -1,4 +1,4 @@
-"""What contact of a float32 model reads in float64, see kernels/terms/contact_exact.py."""
+"""Float64 displacements for contact in a float32 model, see kernels/terms/contact_exact.py."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Exact"]
 
 
 class Exact:
-    """Displacements of the slots of contact in float64.
+    """Displacements of the contact slots in float64.
 
     Attributes:
         kernels: device code.
@@ -31,11 +31,11 @@ class Exact:
         self._slots = model.array("contact", slots, wp.int32)
 
     def allocate(self, work: Workspace, term: str) -> wp.array:
-        """[world, slot] m, of which those of contact are used, of a term by its name."""
+        """Array [world, slot], m, of one term by its name; only contact slots are used."""
         return work.array(f"{term} displacements", work.u.shape, wp.vec3d)
 
     def follow(self, at: At, out: wp.array, active: wp.array) -> None:
-        """Those of the iterate; in statics, which knows no speeds, as the state has them rounded."""
+        """Displacements of the iterate; in statics (no velocities) those of the state, rounded."""
         w = at.work
         if not at.inertia:
             self.widen(at.launch, w.u, active, out)
@@ -44,5 +44,5 @@ class Exact:
         at.launch(self.kernels.follow, (len(out), len(self._slots)), args)
 
     def widen(self, launch: Launcher, u: wp.array, active: wp.array, out: wp.array) -> None:
-        """The numbers of u."""
+        """Copy u in float64."""
         launch(self.kernels.widen, (len(out), len(self._slots)), [self._slots, u, active, out])

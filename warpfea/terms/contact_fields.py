@@ -1,4 +1,4 @@
-"""Contact as fields at the nodes of a body: pressure and gap, of contact with obstacles and between bodies."""
+"""Nodal contact fields of a body: pressure and gap, for obstacles and other bodies."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ CONTACT_FIELDS = {
     "contact_pressure": FieldSpec("contact pressure", "Pa", np.add, np.maximum),
     "gap": FieldSpec("gap to the nearest obstacle or body in contact", "m", np.fmin, np.fmin),
 }
-"""Of both terms of contact: what they press adds up, and the smallest of their gaps counts."""
+"""Fields of both contact terms: pressures add up, the smallest gap counts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Points of a contact on a body, each (worlds, points).
+    """Contact points of a body, each (worlds, points).
 
     Attributes:
-        nearest: sample of the body that a point counts at, -1: none.
-        area: that it stands for, m^2. normal: elastic normal force, N. gap: m, 1e30 where it is not known.
+        nearest: sample of the body nearest to a point, -1: none.
+        area: represented area, m^2. normal: elastic normal force, N. gap: m, 1e30 if unknown.
     """
 
     nearest: np.ndarray
@@ -42,11 +42,11 @@ class Patch:
 
 
 def contact_field(name: str, body: Any, worlds: int, patches: list[Patch]) -> np.ndarray:
-    """(worlds, nodes x samples) "contact_pressure" or "gap" at the samples of each node of a body.
+    """Field "contact_pressure" or "gap" (worlds, nodes x samples) at the samples of each node of a body.
 
-    Every contact point counts at the sample closest to it in the reference. Pressure is the elastic normal force of a
-    sample's points over the area that they stand for; of several contacts it adds up. Gap is the smallest of the
-    points, NaN where a sample has none.
+    Every contact point is assigned to the sample closest to it in the reference. Pressure is the elastic normal force
+    on a sample's points over their area; several contacts add up. Gap is the minimum over the points, NaN for a sample
+    without points.
     """
     nodes = len(body.mesh.points) * body.family.node_samples.shape[1]
     pressure, least = np.zeros((worlds, nodes)), np.full((worlds, nodes), np.inf)
@@ -59,12 +59,12 @@ def contact_field(name: str, body: Any, worlds: int, patches: list[Patch]) -> np
             )
             pressure[world] += np.divide(total, area, out=np.zeros(nodes), where=area > 0.0)
             np.minimum.at(least[world], at, patch.gap[world, known])
-    # points that do not count have a gap of 1e30
+    # unassigned points have a gap of 1e30
     return pressure if name == "contact_pressure" else np.where(least < 1e29, least, np.nan)
 
 
 def obstacle_patches(t: ContactTables, body: Any, gap: np.ndarray, force: np.ndarray) -> list[Patch]:
-    """Points of a body's contacts with obstacles, from gaps and forces of all points."""
+    """Contact points of a body with obstacles, from gaps and forces of all points."""
     out = []
     for k, contact in enumerate(t.contacts):
         if contact.body is body:
@@ -77,7 +77,7 @@ def obstacle_patches(t: ContactTables, body: Any, gap: np.ndarray, force: np.nda
 
 
 def _normal_force(t: ContactTables, k: int, gap: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Elastic normal force, N, on the points (worlds, points) of a contact, from their gaps, without friction."""
+    """Elastic normal force, N, on the points (worlds, points) of a contact from their gaps, without friction."""
     contact = t.contacts[k]
     stiffness = t.data.scale.numpy()[:, k, None] * t.data.normal.numpy()[:, k, None]
     share = t.shares[k].ravel()
@@ -94,9 +94,9 @@ def _normal_force(t: ContactTables, k: int, gap: np.ndarray, force: np.ndarray) 
 def nearest_samples(
     t: ContactTables | PairTables, k: int, body: Discretisation, X: np.ndarray | None = None
 ) -> np.ndarray:  # fmt: skip
-    """(points,) the sample of a body that points at reference places X (points, 3) count at.
+    """Sample index (points,) of the body nearest to the reference positions X (points, 3).
 
-    By default those of contact k, of the nodes that its facets have.
+    By default the points of contact k and the nodes of its facets.
     """
     key = f"{type(t).__name__} {k} samples {body.name}"
     if key not in t.model.cache:
@@ -118,7 +118,7 @@ def nearest_samples(
 
 
 def _on_surface(body: Discretisation) -> np.ndarray:
-    """(slots,) whether a slot belongs to an outer face."""
+    """Mask (slots,) of slots on an outer face."""
     out = np.zeros(body.slot_count, dtype=bool)
     for face in np.unique(body.boundary[:, 1]):
         xi, _ = body.family.face_points(int(face), np.array([(0.25, 0.25), (0.5, 0.25), (0.25, 0.5)]))
@@ -130,7 +130,7 @@ def _on_surface(body: Discretisation) -> np.ndarray:
 
 
 def _sample_places(body: Discretisation) -> np.ndarray:
-    """(nodes x samples, 3) reference places, m; NaN of nodes without an element."""
+    """Reference positions (nodes x samples, 3), m; NaN for nodes without an element."""
     samples = body.family.node_samples
     cells = np.asarray(body.mesh.cells)
     s, _ = element_functions(body, np.arange(len(cells)), samples.reshape(-1, 3))
@@ -141,7 +141,7 @@ def _sample_places(body: Discretisation) -> np.ndarray:
 
 
 def nodal_force(tables: ContactTables | PairTables, force: np.ndarray) -> np.ndarray:
-    """Forces on slots (worlds, slots, 3), N, of forces on points (worlds, points, 3)."""
+    """Nodal forces (worlds, slots, 3), N, from point forces (worlds, points, 3)."""
     out = np.zeros((len(force), tables.model.slots, 3))
     bodies = [contact.body for contact in tables.contacts]
     for k, (body, p) in enumerate(zip(bodies, tables.host)):

@@ -1,4 +1,4 @@
-"""What Model.set_parameter sets of contacts and colliders, in each world."""
+"""Parameters of contacts and colliders per world, for Model.set_parameter."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WANTED = {
 
 
 def contact_parameters(tables: ContactTables | PairTables) -> dict[str, Callable[[Any, np.ndarray], None]]:
-    """What sets a parameter of a contact with a collider or of two bodies in the chosen worlds, by its name."""
+    """Setters of the parameters of a contact with a collider or of two bodies, by name."""
     out: dict[str, Callable[[Any, np.ndarray], None]] = {}
     for contact in tables.contacts:
         out |= {f"{contact.name}.{name}": partial(_set_contact, tables, contact, name) for name in PER_WORLD}
@@ -39,14 +39,14 @@ def contact_parameters(tables: ContactTables | PairTables) -> dict[str, Callable
 
 
 def collider_parameters(tables: ContactTables) -> dict[str, Callable[[Any, np.ndarray], None]]:
-    """What sets a parameter of a collider in the chosen worlds, by its name."""
+    """Setters of the parameters of a collider, by name."""
     return {f"{collider.name}.offset": partial(_set_offset, tables, collider) for collider in tables.colliders}
 
 
 def _set_contact(
     tables: ContactTables | PairTables, contact: Contact | PairContact, name: str, values: Any, mask: np.ndarray
 ) -> None:
-    """Write a value of a contact in the chosen worlds."""
+    """Write one value of a contact in the chosen worlds."""
     what, k, data = f"contact {contact.name!r}", tables.number[contact.index], tables.data
     wanted = per_world(what, name, values, tables.model.worlds)
     mu, mu_static = data.mu.numpy()[:, k], data.mu_static.numpy()[:, k]
@@ -71,7 +71,7 @@ def _set_contact(
 
 
 def _set_offset(tables: ContactTables, collider: Collider, values: Any, mask: np.ndarray) -> None:
-    """Move the surface of a collider along its normals in the chosen worlds."""
+    """Offset the surface of a collider along its normals in the chosen worlds."""
     what = f"collider {collider.name!r}"
     wanted = per_world(what, "offset", values, tables.model.worlds)
     _check(what, "offset", wanted, ~mask, np.isfinite(wanted))
@@ -83,13 +83,13 @@ def _set_offset(tables: ContactTables, collider: Collider, values: Any, mask: np
 def _check(
     what: str, name: str, values: np.ndarray, left: np.ndarray, good: np.ndarray, text: str = "", limit: Any = None
 ) -> None:  # fmt: skip
-    """Raise ModelError for the first world whose value is not good, but for those that are left as they are."""
+    """Raise ModelError for the first chosen world with an invalid value."""
     for world in np.flatnonzero(~(good | left))[:1]:
         refuse(what, name, values, good | left, text.format(limit[world]) if text else WANTED[name])
 
 
 def _write(array: wp.array, column: int, values: np.ndarray, mask: np.ndarray) -> None:
-    """Put values of the chosen worlds into a column of [world, column], in place: recorded graphs see them."""
+    """Write one column of [world, column] in the chosen worlds in place, which captured graphs read."""
     host = array.numpy()
     host[mask, column] = values[mask]
     array.assign(host)

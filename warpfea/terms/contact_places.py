@@ -1,4 +1,4 @@
-"""Where contact acts at a state: the deepest places of lumped contacts, gaps and forces of all points."""
+"""Contact evaluation at a state: the deepest positions of single-point contacts, gaps and forces of all points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Places", "at_points"]
 
 
 class Places:
-    """Lumped contacts of a model; see kernels/terms/contact_place.py.
+    """Single-point contacts of a model; see kernels/terms/contact_place.py.
 
     Attributes:
         kernels: device code.
@@ -31,17 +31,17 @@ class Places:
         self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
         active: wp.array, changed: wp.array, *, fresh: int, settled: int = 0,
     ) -> None:  # fmt: skip
-        """Take the deepest place of each lumped contact.
+        """Find the deepest position of each single-point contact.
 
         Args:
-            launch: of the device.
+            launch: launcher of the device.
             s: history, attempt, clock and row_start of the term's scratch.
-            time, u: [world] s, and displacements, at which places are compared.
-            state: displacements and velocities that the attempt begins from.
-            active: [world] where.
-            changed: [world] set to 1 where another point of a surface is the closest to the place.
-            fresh: an attempt begins.
-            settled: what follows is at a state, without motion.
+            time, u: [world] s, and displacements, at which positions are compared.
+            state: displacements and velocities at the start of the attempt.
+            active: [world] flags.
+            changed: [world] set to 1 if another point of a surface becomes the closest one.
+            fresh: start of an attempt.
+            settled: evaluation at a state, without motion.
         """
         k, t, B = self.kernels, self.tables, self.tables.model.worlds
         groups = [group for group in t.groups if group.lumped]
@@ -58,7 +58,7 @@ class Places:
 
 
 def at_points(term: Any, state: State, history: Any = None, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """See `Contact.at_points`; `term` is the term."""
+    """Implementation of `Contact.at_points` for `term`."""
     m, t, B = term.model, term.tables, state.worlds
     launch, laws = Launcher(m.device), m.terms.laws
     K, P = len(t.colliders), t.points
@@ -77,7 +77,7 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
         history = term.history_of(take)
     attempt = term.attempt_of(B, lambda _, shape, dtype: zeros(shape, dtype))
     attempt.speed.fill_(1.0)
-    if "contact_place" in state.specs:  # statics puts its time back to 0
+    if "contact_place" in state.specs:  # statics resets its time to 0
         attempt.place, attempt.turn = history.place, history.turn
     else:
         launch(term.kernels.poses, (B, K), [t.data, history, value, every, attempt])

@@ -1,4 +1,4 @@
-"""Bodies that begin across a sheet of triangles."""
+"""Initial penetration check of bodies across a sheet of triangles."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ __all__ = ["refuse_across"]
 def refuse_across(
     term: Any, attempt: Any, displacement: wp.array, tolerance: np.ndarray, new: np.ndarray, launch: Launcher
 ) -> None:  # fmt: skip
-    """Raise ModelError where a body begins on both sides of a sheet.
+    """Raise ModelError for a body that begins on both sides of a sheet.
 
     Args:
-        term: of contact.
-        attempt: where colliders are.
-        tolerance, new: (worlds,) m, and in which worlds to look.
+        term: the contact term.
+        attempt: current collider poses.
+        tolerance, new: (worlds,) m, and flags of the worlds to check.
     """
     t = term.tables
     points = _points_across(t, attempt, displacement, tolerance, launch)
@@ -42,7 +42,7 @@ def refuse_across(
 def _points_across(
     tables: ContactTables, attempt: Any, displacement: wp.array, tolerance: np.ndarray, launch: Launcher
 ) -> np.ndarray:  # fmt: skip
-    """(worlds, facets) a point of each facet, + 1, that is behind a sheet while others are in front, or 0."""
+    """One point (worlds, facets) of each facet, + 1, behind a sheet while others are in front, or 0."""
     m = tables.model
     found = wp.zeros((m.worlds, tables.rows), dtype=wp.int32, device=m.device)
     limit: Any = wp.array(tolerance, dtype=wp.float64, device=m.device)

@@ -1,4 +1,4 @@
-"""What overlaps where contact begins: refused, or stored as the contact says."""
+"""Initial overlaps: rejected or stored as offsets."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 __all__ = ["reference_place", "refuse_sunk", "store_overlaps", "touching_depth"]
 
 TOUCHING = 1e-9
-"""Depth at the start, over the model's size, that counts as touch; roundings of displacements come on top."""
+"""Initial depth over the model's size treated as touching; round-off of displacements is added."""
 
 SUNK = 0.1
-"""A place without a seat is in a body if it is deeper than this part of the depth that its thinnest facet allows: the
-skin that tells what is inside has flat triangles."""
+"""Smallest depth, over the depth limit of the body's thinnest facet, at which an unassigned point counts as inside: the
+inside test uses flat triangles."""
 
 
 def touching_depth(size: float, u: np.ndarray) -> np.ndarray:
-    """(worlds,) m that count as touch, at displacements u (worlds, slots, 3)."""
+    """Largest depth (worlds,), m, treated as touching, at displacements u (worlds, slots, 3)."""
     return np.asarray(TOUCHING * size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2)))
 
 
 def reference_place(tables: ContactTables | PairTables, k: int, point: int) -> str:
-    """Reference place of a point of a contact."""
+    """Reference position of a contact point, as text."""
     X = tables.host[k].X.reshape(-1, 3)[point]
     return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
 
@@ -40,10 +40,10 @@ def reference_place(tables: ContactTables | PairTables, k: int, point: int) -> s
 def store_overlaps(
     tables: ContactTables | PairTables, depth: np.ndarray, touching: np.ndarray, overlap: np.ndarray
 ) -> None:  # fmt: skip
-    """Put depths (worlds, points), m, above touch into `overlap` (worlds, points).
+    """Store depths (worlds, points), m, above the touching depth in `overlap` (worlds, points).
 
     Raises:
-        ModelError: a contact whose `overlap` is "refuse" has one.
+        ModelError: an overlap with `overlap` "refuse".
     """
     contacts: list[Contact | PairContact] = [*tables.contacts]
     for k, contact in enumerate(contacts):
@@ -68,16 +68,16 @@ def store_overlaps(
 
 
 def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, seats: np.ndarray, new: np.ndarray) -> None:
-    """Refuse bodies that begin so deep in another one that none of its facets holds their points.
+    """Reject bodies that begin deeper in another body than any of its facets reaches.
 
     Args:
         u: displacements (worlds, slots, 3), m.
-        places: of the points (worlds, points, 3), m.
-        seats: facets that hold them, -1 for none, (worlds, points).
-        new: (worlds,) that begin.
+        places: positions of the points (worlds, points, 3), m.
+        seats: facets that the points are assigned to, -1 for none, (worlds, points).
+        new: (worlds,) flags of the worlds that begin.
 
     Raises:
-        ModelError: a contact whose `overlap` is "refuse" has such a point.
+        ModelError: such a point in a contact with `overlap` "refuse".
     """
     for k, contact in enumerate(tables.contacts):
         if contact.overlap != "refuse":
@@ -85,7 +85,7 @@ def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, seats: np
         body, points = contact.master.body, slice(tables.first[k], tables.first[k + 1])
         limit = tables.masters[tables.of[k]].limit
         least = SUNK * float(limit.min())
-        beyond = (0.0 if body.family.solid else float(limit.max())) - least  # of the box of its nodes
+        beyond = (0.0 if body.family.solid else float(limit.max())) - least  # margin of the nodal bounding box
         nodes = body.slot_kind == 0
         spans = body.reference[nodes] + body.origin + u[:, body.slots[nodes]]
         low, high = (end(axis=1)[:, None] for end in (spans.min, spans.max))
@@ -109,7 +109,7 @@ def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, seats: np
 
 
 def _depths(body: Discretisation, u: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Distance, m, of places to the skin of a body that they are in, at displacements of its slots; 0 outside."""
+    """Distance, m, of interior points to the skin of a body at displacements of its slots; 0 outside."""
     import warp as wp
 
     from ..kernels.terms.pair_thickness import depth_kernel

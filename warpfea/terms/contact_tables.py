@@ -1,4 +1,4 @@
-"""Tables of contacts and colliders on the device, and the numbers of their laws."""
+"""Tables of contacts and colliders on the device, and contact law constants."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ __all__ = ["ContactTables", "block_entries", "law_numbers"]
 
 
 class ContactTables(FacetTables[Contact]):
-    """Contacts with colliders of a model, and those.
+    """Contacts with colliders of a model, and the colliders.
 
     Attributes:
-        colliders: as described.
-        sizes: see `law_radius`, by the index of a contact.
-        left_out: how many points of each contact only move with clamped slots, and so do not count.
+        colliders: descriptions.
+        sizes: see `law_radius`, by contact index.
+        left_out: number of points per contact excluded because all their slots are clamped.
     """
 
     def __init__(self, model: Model) -> None:
@@ -43,26 +43,26 @@ class ContactTables(FacetTables[Contact]):
 
     @property
     def lumped(self) -> bool:
-        """Whether a contact acts at its deepest point alone."""
+        """True if a contact acts at its deepest point only."""
         return any(contact.model == "sphere" for contact in self.contacts)
 
     @property
     def moving(self) -> bool:
-        """Whether a contact acts at its deepest place, wherever that is on its facets."""
+        """True if a contact acts at its deepest position anywhere on its facets."""
         return any(group.data.moving for group in self.groups)
 
     @property
     def meshes(self) -> bool:
-        """Whether a collider is a mesh of triangles."""
+        """True if a collider is a triangle mesh."""
         return any(isinstance(collider.shape, TriMesh) for collider in self.colliders)
 
     @property
     def sheets(self) -> bool:
-        """Whether one of these has no inside."""
+        """True if a collider mesh is a sheet (no inside)."""
         return any(isinstance(k.shape, TriMesh) and not k.shape.closed for k in self.colliders)
 
     def _share(self, contact: Contact, p: ContactPoints) -> np.ndarray:
-        """(F, P) area of each point over that of the region; 0 where it only moves with clamped slots."""
+        """Area fraction (F, P) of each point in the contact region; 0 if all its slots are clamped."""
         slots = p.conn + contact.body.slot_offset
         moves = np.any((np.abs(p.shape) > 1e-12) & ~self.clamped[slots][:, None, :], axis=2)
         used = moves & (p.area > 0.0)
@@ -78,7 +78,7 @@ class ContactTables(FacetTables[Contact]):
         return np.where(used, p.area / region, 0.0)
 
     def build(self, laws: TimeLaws, pool: int) -> None:
-        """Upload; `pool`: the first entry of the term in the pool."""
+        """Upload the tables; `pool`: first pool entry of the term."""
         self._build_facets(pool)
         self.data = self._contacts(laws)
         self.remember()
@@ -88,7 +88,7 @@ class ContactTables(FacetTables[Contact]):
         return super().set_arrays | {"grow": self.data.grow}
 
     def _contacts(self, laws: TimeLaws) -> Any:
-        """The device struct."""
+        """Device struct of the contacts."""
         m, C, K = self.model, self.contacts, self.colliders
         out = contact_struct(self.meshes)()
 
@@ -119,11 +119,11 @@ class ContactTables(FacetTables[Contact]):
         return law_numbers(contact, parameters.modulus(world), self.sizes[contact.index], mass)
 
     def _touching(self, collider: Collider) -> list[np.ndarray]:
-        """Points of the surfaces that may touch a collider, (n, 3), m."""
+        """Points (n, 3), m, of the surfaces in contact with a collider."""
         return [p.X.reshape(-1, 3) for c, p in zip(self.contacts, self.host) if c.collider is collider]
 
     def hash(self, h: Any) -> None:
-        """Feed what defines the contacts into a hash."""
+        """Hash the definition of the contacts."""
         for collider in self.colliders:
             center, axes = collider.shape.frame()
             h.update(f"{collider.name} {collider.shape.kind}".encode())
@@ -141,7 +141,7 @@ class ContactTables(FacetTables[Contact]):
 
 
 def law_radius(contact: Contact) -> float:
-    """Radius of the region of a contact, m, of lumped ones over the root of the depth."""
+    """Radius of the region of a contact, m; for single-point contacts over the root of the depth."""
     if contact.model == "sphere":
         # 1/R_eff = 1/R_A + 1/R_B, with a = sqrt(R_eff depth)
         assert contact.radius is not None
@@ -154,7 +154,8 @@ def law_radius(contact: Contact) -> float:
 def law_numbers(
     contact: Contact, modulus_of: Modulus = effective_modulus, a: float | None = None, mass: float | None = None
 ) -> dict[str, float]:
-    """Constants of Eqs. (74)-(76), (79) and (80) with a rigid obstacle; of lumped contacts over powers of the depth."""
+    """Constants of Eqs. (74)-(76), (79) and (80) with a rigid obstacle; for single-point contacts over powers of the
+    depth."""
     E, nu = modulus_of(contact.body, contact.surface)
     modulus = E / (1.0 - nu**2)
     shear = E / (2.0 * (1.0 + nu)) / (2.0 - nu)
@@ -169,7 +170,7 @@ def law_numbers(
 
 
 def block_entries(model: Model, conn: np.ndarray, pattern: Any) -> tuple[wp.array, wp.array, wp.array, int]:
-    """Entries of the pattern that facets add to: which, where their items begin, and (facet, slot, slot)."""
+    """Pattern entries of the facets: entry indices, start of each item, and (facet, slot, slot)."""
     a, b = (x.ravel() for x in np.indices((conn.shape[1],) * 2))
     facet = np.repeat(np.arange(len(conn)), len(a))
     a, b = np.tile(a, len(conn)), np.tile(b, len(conn))

@@ -1,7 +1,7 @@
-"""Kelvin-Voigt damping beside the elements' kernels, which hold its incremental and its rate form.
+"""Kelvin-Voigt damping outside the elements' kernels, which contain its incremental and rate forms.
 
-Incremental: the strain at the start of the step, from which the rate is taken. Explicit: the force of Eqs. (58)-(70) at
-the start of the step, held during it among the dead loads.
+Incremental: strain at the start of the step, from which the rate is computed. Explicit: the force of Eqs. (58)-(70) at
+the start of the step, frozen during it among the dead loads.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FORMS = ("incremental", "rate", "explicit")
 
 
 class Damping(Term):
-    """What damping does at the start of an attempt."""
+    """Damping data at the start of an attempt."""
 
     name = "damping"
 
@@ -55,7 +55,7 @@ class Damping(Term):
         if not at.inertia:
             return set()
         out = {b.kernels.viscous_force.module for b in self.model.blocks if b.key.damping == "explicit"}
-        if not at.midpoint:  # it has the strains of both ends at hand
+        if not at.midpoint:  # computes the strains of both ends
             name = "moving_history" if at.accelerated else "strain_history"
             out |= {getattr(b.kernels, name).module for b in self.model.blocks if b.key.damping == "incremental"}
         return out | ({self.kernels.add_explicit.module} if self.explicit else set())
@@ -85,7 +85,7 @@ class Damping(Term):
             launch(self.kernels.add_explicit, (m.worlds, m.slots), [force, active, w.dead])
 
     def book(self, at: At, accepted: wp.array) -> wp.array | None:
-        """Work of the held force: what it takes is viscous loss."""
+        """Viscous loss of the frozen force, J."""
         if not (self.explicit and at.inertia):
             return None
         m, w = self.model, at.work

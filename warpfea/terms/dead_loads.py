@@ -23,10 +23,10 @@ __all__ = ["DeadLoads"]
 
 
 class DeadLoads(Term):
-    """Fills work.dead once per attempt.
+    """Dead loads: assembled once per attempt into work.dead.
 
-    Gravity, [world] on the device, belongs to every model; without any load nothing is launched. Of gravity with a time
-    law `gravity` follows the law, and `constant`, which the load of a static path scales, is zero.
+    Gravity, [world] on the device, is part of every model; without any load nothing is launched. With a time law of
+    gravity `gravity` follows the law, and `constant`, which the load of a static path scales, is zero.
     """
 
     name = "dead loads"
@@ -41,7 +41,7 @@ class DeadLoads(Term):
 
     @classmethod
     def of(cls, model: Model) -> DeadLoads:
-        """Always there: it holds gravity."""
+        """Every model has this term, for gravity."""
         return cls(model)
 
     @classmethod
@@ -70,7 +70,7 @@ class DeadLoads(Term):
         start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
         law = np.concatenate(numbers) if numbers else np.zeros(0)
         weight = np.concatenate(weights) if weights else np.zeros(0)
-        explicit = any(b.key.damping == "explicit" for b in m.blocks)  # its force is added to those here
+        explicit = any(b.key.damping == "explicit" for b in m.blocks)  # adds its force to the dead loads
         self.present = bool(len(slots)) or self.pulls or explicit
         self.start_of_slot = m.array("loads", start, wp.int32)
         self.law = m.array("loads", law[order] if len(order) else np.zeros(1), wp.int32)
@@ -80,7 +80,7 @@ class DeadLoads(Term):
 
     @property
     def pulls(self) -> bool:
-        """Whether there is gravity, or a law of it."""
+        """True with gravity or a time law of it."""
         return self.gravity_law is not None or bool(np.any(self.gravity_host))
 
     def modules(self, at: At) -> Iterable[wp.Module]:
@@ -88,13 +88,13 @@ class DeadLoads(Term):
         return law + [self.kernels.dead_load.module] * self.present
 
     def take_gravity(self, launch: Launcher, value: wp.array, active: wp.array) -> None:
-        """Gravity at the end of the attempt, of the values of the time laws."""
+        """Set gravity at the end of the attempt from the values of the time laws."""
         if self.gravity_law is not None:
             launch(self.kernels.take_gravity, self.model.worlds, [value, self.number, active, self.gravity])
 
     @part("loads")
     def begin(self, at: At, active: wp.array) -> None:
-        """Force and magnitude of all dead loads per slot."""
+        """Assemble force and magnitude of all dead loads per slot."""
         if not self.present:
             return
         m, w = self.model, at.work
@@ -111,11 +111,11 @@ class DeadLoads(Term):
         at.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])
 
     def set_gravity(self, gravity: Any, mask: np.ndarray) -> None:
-        """Gravity of all chosen worlds (3,) or per world (worlds, 3), m/s^2.
+        """Set gravity in the chosen worlds, (3,) or (worlds, 3), m/s^2.
 
         Raises:
-            ModelError: wrong shape, a value that is not finite, a material without a density, or a model built without
-                gravity or with a law of it.
+            ModelError: wrong shape, a non-finite value, a material without density, or a model built without gravity or
+                with a time law of it.
         """
         if self.gravity_law is not None:
             raise ModelError("the model was built with a time law of gravity, which set_gravity can't replace")

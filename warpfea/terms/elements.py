@@ -1,4 +1,4 @@
-"""The elements: internal force Eq. (32) with the viscous stress of Eq. (70), its derivative, its diagonal blocks."""
+"""Element term: internal force Eq. (32) with the viscous stress of Eq. (70), its tangent and diagonal blocks."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 __all__ = ["Elements"]
 
 MANY_POINTS = 8
-"""Points of an element from which lanes of a warp share them."""
+"""Points per element from which lanes of a warp share an element."""
 
 
 class Elements(Term):
-    """The blocks of a model. Contributions lie in work.contribution, energies in work.energy_rows."""
+    """Element blocks of a model. Writes work.contribution and, for energies, work.energy_rows."""
 
     name = "elements"
 
@@ -35,7 +35,7 @@ class Elements(Term):
         }
 
     def kernels(self, at: At) -> list:
-        """Kernels of the blocks; statics has no rates, so those without damping serve there."""
+        """Kernels of the blocks; statics has no rates and uses those without damping."""
         dtype, blocks = self.model.dtype, self.model.blocks
         if at.midpoint:
             lossy = at.dissipation > 0.0
@@ -74,7 +74,7 @@ class Elements(Term):
                 at.launch(kernels.turned_over, (w.u.shape[0], block.count), args)
 
     def measure_turn(self, at: At, p: wp.array, active: wp.array) -> None:
-        """Largest gradient of a direction, into newton.turn."""
+        """Maximum gradient of a direction, into newton.turn."""
         for block, kernels in zip(self.model.blocks, self.kernels(at)):
             if not block.key.tying:
                 args = [at.work.data_of(block), p, active, at.work.newton.turn]
@@ -85,14 +85,14 @@ class Elements(Term):
         return [block.mixed_product(self.model.dtype) for block in self.model.blocks]
 
     def mixed_tangent(self, at: At, p: wp.array, active: wp.array) -> None:
-        """`tangent` with the stress of the linear prediction in its geometric part, for worlds that are `mixed`."""
+        """`tangent` with the linearly predicted stress in its geometric part, for worlds flagged `mixed`."""
         m, w = self.model, at.work
         for block, kernel in zip(m.blocks, self.mixed_kernels()):
             args = [block.data, w.u, w.v, w.base, w.newton.mixed, w.history, w.step.dq_dv, active, p, w.contribution]
             at.launch(kernel, (p.shape[0], block.count), args)
 
     def tangent(self, at: At, p: wp.array, active: wp.array) -> None:
-        """K p of all elements into work.contribution, where products go by the elements one by one."""
+        """K p of all elements into work.contribution, for matrix-free products."""
         m, w = self.model, at.work
         for block, kernels in zip(m.blocks, self.kernels(at)):
             args = [w.data_of(block), w.u_stage, w.v_stage, w.history, w.step.dq_dv, active, p, w.contribution]

@@ -1,4 +1,4 @@
-"""Functions of a state for checking and for output: forces, energy, tangent, stresses. Not on the path of a step."""
+"""Evaluation of forces, energy, tangent and stresses at a state for output and checks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = ["Evaluation"]
 
 
 class Evaluation:
-    """Evaluates a model at a state; allocates what it needs at each call."""
+    """Evaluation of a model at a state; allocates its arrays at each call."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -53,7 +53,7 @@ class Evaluation:
         return wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
 
     def _at(self, u: wp.array) -> At:
-        """Work arrays for the elements' term: the elastic part at displacements u (worlds, slots)."""
+        """Step context of the element term: the elastic part at displacements u (worlds, slots)."""
         m, B = self.model, u.shape[0]
         least = [wp.full(B, 1e30, dtype=wp.float64, device=m.device) for _ in range(2)]
         none: Any = None
@@ -89,10 +89,11 @@ class Evaluation:
         return self._gather(contribution), power.numpy().sum(axis=1)
 
     def constraints(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Constraints at a state: values [world, row], gradients [world, 3 row + side, 3], right sides [world, row].
+        """Constraint values [world, row], gradients [world, 3 row + side, 3] and right-hand sides [world, row] at a
+        state.
 
         Raises:
-            ModelError: the model has none.
+            ModelError: a model without constraints.
         """
         return self._constraints().values(state)
 
@@ -111,7 +112,7 @@ class Evaluation:
         return term
 
     def tangent_matrix(self, state: State, world: int) -> sp.csr_matrix:
-        """df_int/dq as CSR. No element holds two slots of one colour: one product per colour and axis."""
+        """df_int/dq as CSR, by one product per colour and axis; no element has two slots of one colour."""
         m = self.model
         row = state.displacement.numpy()[world : world + 1]
         at = self._at(wp.array(row, dtype=m.types.vec3, device=m.device))
@@ -143,9 +144,9 @@ class Evaluation:
         return sp.csr_matrix(data, shape=(n, n))
 
     def stresses(self, state: State, body: Any = None) -> list[tuple[Any, np.ndarray]]:
-        """Per block (of a body): Cauchy stress at the points, [world, point, elem, 6] as xx yy zz yz xz xy, Pa.
+        """Cauchy stress per block (of a body) at the points, [world, point, elem, 6] as xx yy zz yz xz xy, Pa.
 
-        Of an energy in parts each block holds its part; they add up.
+        With an energy in parts each block has the stress of its part; parts add up.
         """
         m = self.model
         out = []
@@ -155,7 +156,7 @@ class Evaluation:
             if block.key.tying:
                 scheme = block.key.output_scheme
                 if scheme is None:
-                    continue  # the transverse shear of a shell vanishes at its faces, where its stress is wanted
+                    continue  # a shell's transverse shear stress vanishes at its faces, the output points
                 block.output = block.output or output_block(m, block, scheme)
                 block = block.output
             stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
@@ -200,7 +201,7 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
     best, index, text = np.inf, -1, "no element"
     for block in model.blocks:
         if model.needs_positive_J and block.key.law in ANY_J:
-            continue  # may turn inside out
+            continue  # J <= 0 is admissible
         for part in block.parts:
             body = part.body
             rule = block.key.rule
@@ -218,10 +219,10 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
 
 
 def _extrapolation(rule: Rule, at: np.ndarray) -> np.ndarray:
-    """(n, Q) fit of a field known at the points of a rule, evaluated at parent points (n, 3).
+    """Extrapolation matrix (n, Q) from the points of a rule to parent points (n, 3).
 
-    On a box the product of Lagrange's polynomials through the points; on the simplex a linear least-squares fit, a
-    constant where the points can't carry one.
+    Product of Lagrange polynomials on a box; on the simplex a linear least-squares fit, or a constant with too few
+    points.
     """
     if rule.counts:
         out = np.ones((len(at), 1))

@@ -1,4 +1,4 @@
-"""What the tables of contacts of either kind have in common: groups of facets with points, and numbers of laws."""
+"""Common contact tables: facet groups with points, contact law numbers."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ __all__ = ["LAWS", "LISTED", "PER_WORLD", "FacetGroup", "FacetTables", "beta_of"
 AnyContact = TypeVar("AnyContact", Contact, PairContact)
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
 SMOOTHING = (1e-3, 1e-4)
-"""Of the smooth law where none is given: eps, N, and v_eps, m/s."""
+"""Default eps, N, and v_eps, m/s, of the smooth law."""
 PER_WORLD = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
-"""What Model.set_parameter sets of a contact, and the arrays with it; the restitution is in `beta` too."""
+"""Contact parameters of Model.set_parameter and their arrays; the restitution also sets `beta`."""
 FROM_BODIES = ("normal", "tangent", "normal_damping", "mass")
-"""Numbers of a contact that follow from its bodies."""
+"""Contact constants derived from the bodies' materials."""
 LISTED = 8
 """Threads that share a sum over the points of a facet on CUDA."""
 PATCH, LUMPED, MOVING = range(3)
-"""What acts on a facet: all of its points, at most one of them, at most one place of it."""
+"""Contact kinds of a facet: all points, at most one point, or at most one moving position."""
 
 
 def beta_of(restitution: float) -> float:
@@ -47,7 +47,7 @@ def beta_of(restitution: float) -> float:
 def hunt_crossley_damping(restitution: float) -> float:
     """chi v_i of the default law: the d of (1 + e) d = ln((1 + d)/(1 - e d)), 0 for e = 1.
 
-    Exact for an impact of a mass on the undamped-at-rest spring, whatever its exponent; DESIGN 8.
+    Exact for the impact of a mass on the spring, undamped at rest, for any exponent; DESIGN 8.
     """
     e = restitution
     if e >= 1.0:
@@ -58,22 +58,22 @@ def hunt_crossley_damping(restitution: float) -> float:
 
     top = 1.0 / e
     low = 1e-9
-    while excess(low) <= 0.0 and low < 0.5 * top:  # rounding, for e close to 1
+    while excess(low) <= 0.0 and low < 0.5 * top:  # round-off, for e close to 1
         low *= 2.0
     high = top * (1.0 - 1e-15)
     if excess(low) <= 0.0:
         return 0.0
-    # below e of about 0.02 the root is nearer to 1/e than numbers can be
+    # below e of about 0.02 the root is within round-off of 1/e
     return float(brentq(excess, low, high, xtol=1e-15)) if excess(high) < 0.0 else high
 
 
 def normal_damping(stiffness: float, mass: float) -> float:
-    """gamma_n over -beta of Eq. (76), N s/m, of S_n = 2 E* a in N/m and m_eff in kg."""
+    """gamma_n over -beta of Eq. (76), N s/m, for S_n = 2 E* a in N/m and m_eff in kg."""
     return 2.0 * math.sqrt(5.0 / 6.0) * math.sqrt(stiffness * mass)
 
 
 def clamped_slots(model: Model) -> np.ndarray:
-    """(slots,) whether a slot is held in all directions by supports that never move."""
+    """Mask (slots,) of slots clamped in all directions by supports that never move."""
     held = np.zeros((model.slots, 3))
     for support in model.description.supports:
         if support.law is None and support.node_laws is None and support.rotation is None:
@@ -83,14 +83,14 @@ def clamped_slots(model: Model) -> np.ndarray:
 
 @dataclass(eq=False)
 class FacetGroup:
-    """Facets with as many slots and points each, those of a contact next to each other.
+    """Facets with equal numbers of slots and points; those of a contact are contiguous.
 
     Attributes:
-        conn: (F, L) slots of the model.
-        points: (F, P) numbers of the points.
-        data: the device struct.
-        lumped: whether at most one of its places acts.
-        contacts: in the order of the device.
+        conn: (F, L) model slots.
+        points: (F, P) point indices.
+        data: device struct.
+        lumped: True if at most one position of a facet acts.
+        contacts: in device order.
     """
 
     conn: np.ndarray
@@ -100,26 +100,26 @@ class FacetGroup:
 
     @property
     def count(self) -> int:
-        """Facets."""
+        """Number of facets."""
         return len(self.conn)
 
     def sides(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
-        """Threads that sum over the points of a facet for each of its slots, and how many share a slot."""
+        """Threads that sum over the points of a facet for each of its slots, and threads per slot."""
         lanes = launch.lanes(LISTED)
         return (worlds, launch.padded(lanes * self.conn.size)), lanes
 
 
 class FacetTables(Generic[AnyContact]):
-    """Contacts and the points of their surfaces, in the order of the device: by the kind of their facets.
+    """Contacts and the points of their surfaces in device order, sorted by facet kind.
 
     Attributes:
-        contacts: handles in that order; number: of a handle's index.
-        host: shape functions, areas, slots and places of each contact, for fields and checks.
-        kinds: slots and points of facets, and what acts on them.
-        groups: facets.
-        points, rows: how many points and facets there are in all.
+        contacts: handles in that order; number: position of a handle's index.
+        host: shape functions, areas, slots and positions of each contact, for fields and checks.
+        kinds: slots and points per facet, and the contact kind.
+        groups: facet groups.
+        points, rows: total numbers of points and facets.
         first, row_start: first point and first facet of each contact.
-        shares: (F, P) of each contact: area of each point over that of the region; 0: no contact.
+        shares: (F, P) of each contact: area of each point over that of the region; 0: inactive.
     """
 
     data: Any
@@ -141,11 +141,11 @@ class FacetTables(Generic[AnyContact]):
 
     @property
     def explicit(self) -> bool:
-        """Whether a contact has the force of the last state."""
+        """True if a contact uses the force of the last state."""
         return any(contact.treatment == "explicit" for contact in self.contacts)
 
     def _build_facets(self, pool: int) -> int:
-        """Upload the facets, from an entry of the pool on; the entry that comes after them."""
+        """Upload the facets, starting at pool entry `pool`; returns the next free entry."""
         first, row_start = (np.zeros(len(self.contacts) + 1, dtype=np.int64) for _ in range(2))
         for kind in self.kinds:
             chosen = [k for k, pair in enumerate(zip(self.contacts, self.host)) if _kind(*pair) == kind]
@@ -161,7 +161,7 @@ class FacetTables(Generic[AnyContact]):
         return pool
 
     def _group(self, kind: tuple[int, int, int], chosen: list[int], pool: int) -> FacetGroup:
-        """Facets of one kind, of the contacts chosen."""
+        """Facet group of one kind for the chosen contacts."""
         m = self.model
         parts = [self.host[k] for k in chosen]
         conn = np.concatenate([self.host[k].conn + self.contacts[k].body.slot_offset for k in chosen])
@@ -188,20 +188,20 @@ class FacetTables(Generic[AnyContact]):
         return FacetGroup(conn, data, acts != PATCH, chosen)
 
     def numbers(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
-        """The numbers `FROM_BODIES` of a contact, as built or in a world."""
+        """Constants `FROM_BODIES` of a contact, as built or in one world."""
         raise NotImplementedError
 
     @property
     def set_arrays(self) -> dict[str, wp.array]:
-        """What `Model.set_parameter` writes."""
+        """Arrays written by `Model.set_parameter`."""
         return {name: getattr(self.data, name) for name in (*PER_WORLD.values(), "beta")}
 
     def remember(self) -> None:
-        """Keep what was built, by which checkpoints tell whether a model is theirs."""
+        """Store the built values: checkpoints compare them to identify the model."""
         self.built = b"".join(array.numpy().tobytes() for array in self.set_arrays.values())
 
     def take_materials(self, mask: np.ndarray) -> None:
-        """Constants of materials were set in the chosen worlds: so the numbers that follow from them."""
+        """Recompute the derived constants after material parameters were set in the chosen worlds."""
         m, data = self.model, self.data
         touched = [
             k for k, contact in enumerate(self.contacts) if any(m.parameters.varies(b) for b in bodies_of(contact))
@@ -223,7 +223,7 @@ class FacetTables(Generic[AnyContact]):
             getattr(data, name).assign(values)
 
     def _put_laws(self, out: Any, numbers: list[dict[str, float]]) -> None:
-        """Upload what a law has; `numbers` of each contact: normal, tangent, normal_damping, mass."""
+        """Upload the contact law constants; `numbers` per contact: normal, tangent, normal_damping, mass."""
         m, C = self.model, self.contacts
 
         def put(name: str, values: Any, dtype: Any = wp.float64) -> None:
@@ -253,11 +253,11 @@ class FacetTables(Generic[AnyContact]):
 
 
 def bodies_of(contact: Contact | PairContact) -> list[Any]:
-    """The bodies that a contact is of."""
+    """Bodies of a contact."""
     return [contact.body] if isinstance(contact, Contact) else [contact.first.body, contact.second.body]
 
 
 def _kind(contact: Contact | PairContact, p: ContactPoints) -> tuple[int, int, int]:
-    """Slots and points of a facet, and what acts: PATCH, LUMPED or MOVING."""
+    """Contact kind of a facet: slots, points, and PATCH, LUMPED or MOVING."""
     lumped = LUMPED if contact.treatment == "explicit" else MOVING
     return p.conn.shape[1], p.area.shape[1], PATCH if contact.model == "patch" else lumped

@@ -1,4 +1,4 @@
-"""Loads that turn with the body: pressure on faces and moments."""
+"""Follower loads: pressure on faces, and moments."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["FollowerMatrix", "FollowerPart", "Followers"]
 
 @dataclass(eq=False)
 class FollowerPart:
-    """A pressure on faces or a moment at points: device data, the force kernel and that of its symmetric tangent."""
+    """Pressure on faces or moment at points: device data, kernels of the force and of its symmetric tangent."""
 
     data: Any
     force: Any
@@ -34,7 +34,7 @@ class FollowerPart:
 
 
 class Followers(Term):
-    """Pressures and moments. They have no potential in general, but the symmetric part of their tangent counts in H."""
+    """Pressures and moments, non-potential in general; H contains the symmetric part of their tangent."""
 
     name = "followers"
     potential = False
@@ -58,7 +58,7 @@ class Followers(Term):
         self.items += [self._moment(p, laws) for p in self.model.description.moments]
 
     def _data(self, conn: np.ndarray, law: TimeLaw, laws: TimeLaws) -> Any:
-        """Device data common to both; conn (items, local) in the model's slots."""
+        """Common device data; conn (items, local) in model slots."""
         m = self.model
         data = follower_struct(m.dtype)()
         data.conn = m.array("loads", conn.T, wp.int32)
@@ -103,14 +103,14 @@ class Followers(Term):
             at.launch(item.force, (m.worlds, item.count), args)
 
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        """The symmetric tangent of the force times p."""
+        """Symmetric tangent of the force times p."""
         m, w = self.model, at.work
         for item in self.items:
             args = [item.data, at.share, w.u_stage, w.law_stage, active, p, w.nonpotential_tangent]
             at.launch(item.product, (m.worlds, item.count), args)
 
     def hold(self, free: np.ndarray) -> None:
-        """Nothing: pressures and moments are the same after a translation."""
+        """No-op: pressures and moments are translation invariant."""
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
         if not projected:
@@ -121,7 +121,7 @@ class Followers(Term):
         self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
-        """Minus the symmetric tangent of the force; nothing of it is positive for sure."""
+        """Minus the symmetric tangent of the force; indefinite, so nothing if projected."""
         if projected:
             return
         for item in at.scratch[self.name]:
@@ -137,7 +137,7 @@ class Followers(Term):
 
 
 class FollowerMatrix:
-    """Matrices of a follower load's items, column by column from the product with unit vectors at local slots."""
+    """Matrices of a follower load's items, built by columns as products with unit vectors at local slots."""
 
     def __init__(self, term: Followers, at: At, item: FollowerPart, pattern: Any) -> None:
         model, work = term.model, at.work
@@ -160,7 +160,7 @@ class FollowerMatrix:
         self.places, self.entries = self._find(conn, pattern)
 
     def _find(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
-        """Entries of the pattern that the items' matrices add to."""
+        """Pattern entries of the items' matrices."""
         i, j, item = (a.ravel() for a in np.indices((self.slots, self.slots, self.count)))
         index = pattern.find(conn[i, item], conn[j, item])
         chosen = np.flatnonzero(index >= 0)

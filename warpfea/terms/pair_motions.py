@@ -1,4 +1,4 @@
-"""Cross terms of contact between bodies in the matrix of their rigid motions (solvers/motions.py)."""
+"""Coupling of bodies in contact in the matrix of their rigid body modes (solvers/motions.py)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["PairMotions"]
 
 
 class PairMotions:
-    """Which contacts couple which bodies of a preconditioner's `motions`, and the sums over their points."""
+    """Couplings between the bodies of a preconditioner's `motions` by contacts, with sums over their points."""
 
     def __init__(self, at: At, tables: PairTables, masters: Any, motions: Any) -> None:
         m, t = at.model, tables
@@ -43,7 +43,7 @@ class PairMotions:
         self.parts = at.work.array("pairs motions", (m.worlds, len(t.contacts), motions.lanes(most), 4), wp.mat33d)
 
     def add(self, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
-        """The cross terms of the bodies, from the arrays that blocks are made from."""
+        """Add the coupling blocks, from the arrays of `keep`."""
         stiffness, _, _, _, weight, listed = kept
         B, lanes, launch, bodies = self.at.model.worlds, self.parts.shape[2], self.at.launch, self.motions.bodies
         for group, contact, count in self.groups:

@@ -1,4 +1,4 @@
-"""What contact between bodies does in a linear solve: products, blocks, and what corrects a preconditioner."""
+"""Contact between bodies in a linear solve: products, blocks, and preconditioner corrections."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ __all__ = ["PairSolves"]
 
 
 class PairSolves(Term):
-    """The part of `Pairs` that solvers of linear systems call.
+    """Linear-solver part of `Pairs`.
 
     Attributes:
         tables: points and facets on the device.
-        shared, kernels: those that contact with obstacles has too, and those of contact between bodies.
+        shared, kernels: kernels common with obstacle contact, and those of contact between bodies.
     """
 
     name = "pairs"
@@ -47,7 +47,7 @@ class PairSolves(Term):
         for group in t.groups:
             dim = (m.worlds, group.count, group.data.points)
             at.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
-        for group in t.groups:  # the last one takes the master facets along
+        for group in t.groups:  # the last group includes the master facets
             entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
             lanes = at.launch.lanes(LISTED)
             args = [masters, group.data, active, lanes, entries - 1, attempt, touching, w.pool_product]
@@ -69,7 +69,7 @@ class PairSolves(Term):
         return [("stiffness", s["attempt"].stiffness), *arrays.items()]
 
     def restart(self, at: At, flags: wp.array) -> None:
-        # lists are longer than what they hold, and a preconditioner keeps all of them
+        # lists are longer than their contents, and a preconditioner copies all of them
         for _, array in self.keep(at):
             words = words_of(array)
             at.launch(state_kernels().clear_rows, words.shape, [flags, words])
@@ -83,7 +83,7 @@ class PairSolves(Term):
         self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
-        """The points' stiffness on their own facets and on master facets; not what couples both."""
+        """Stiffness of the points on their own facets and on master facets, without the coupling of both."""
         m, t = self.model, self.tables
         stiffness, points, start, entry, weight, _ = kept
         *slaves, masters = m.cache["pair blocks"]

@@ -1,4 +1,4 @@
-"""Contact between bodies at a state, whatever simulation it is of: gaps, elastic forces, places on both bodies."""
+"""Contact between bodies at a state, independent of a simulation: gaps, elastic forces, positions on both bodies."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ __all__ = ["Survey", "survey"]
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """All points of slave surfaces at a state, [world, point].
+    """All points of the slave surfaces at a state, [world, point].
 
     Attributes:
-        gap: m, 1e30 of points with no facet near. normal: elastic normal force, N. force: on the slave, N, (..., 3).
-        facet: of the master surfaces, -1: none. spot: coordinates there. reaction: on its slots, N, (..., L, 3).
+        gap: m, 1e30 without a facet nearby. normal: elastic normal force, N. force: on the slave, N, (..., 3).
+        facet: of the master surfaces, -1: none. spot: parametric position. reaction: on its slots, N, (..., L, 3).
     """
 
     tables: PairTables
@@ -40,7 +40,7 @@ class Survey:
     reaction: np.ndarray
 
     def nodal_force(self) -> np.ndarray:
-        """Forces on slots of both bodies (worlds, slots, 3), N."""
+        """Nodal forces of both bodies (worlds, slots, 3), N."""
         t = self.tables
         out = nodal_force(t, self.force)
         for world, point in zip(*np.nonzero(self.force.any(axis=2))):
@@ -49,7 +49,7 @@ class Survey:
         return out
 
     def patches(self, body: Any) -> list[Patch]:
-        """The points that count on a body, as slave or as master."""
+        """Contact points of a body, as slave or as master."""
         t, out = self.tables, []
         for k, contact in enumerate(t.contacts):
             points = slice(t.first[k], t.first[k + 1])
@@ -62,12 +62,12 @@ class Survey:
                 nearest = np.full(gap.shape, -1)
                 seated = self.facet[:, points] >= 0
                 nearest[seated] = nearest_samples(t, k, contact.master.body, X[seated])
-                # of the master the area that is pressed: what lies beside the slave is no part of it
+                # master area: the loaded part only, without the area beside the slave
                 out.append(Patch(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
         return out
 
     def _places(self, points: slice) -> np.ndarray:
-        """(worlds, points, 3) reference places on master facets, m."""
+        """Reference positions (worlds, points, 3) on master facets, m."""
         t = self.tables
         facet, spot = self.facet[:, points], self.spot[:, points]
         out = np.zeros((*facet.shape, 3))
@@ -82,7 +82,7 @@ class Survey:
 
 
 def survey(term: Any, state: State) -> Survey:
-    """Look at all points of a state; springs of friction are those that it knows."""
+    """Evaluate all points at a state with its friction spring history."""
     m, t, B = term.model, term.tables, state.worlds
     launch = Launcher(m.device)
 

@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 __all__ = ["PairTables"]
 
 TOUCH = 1e-9
-"""Depth over the size of a model that counts as touch where a step begins."""
+"""Depth over the size of a model treated as touching at the start of a step."""
 
 
 class PairTables(FacetTables[PairContact]):
-    """Contacts between bodies of a model; the points are those of the slave surfaces.
+    """Contacts between bodies of a model; points lie on the slave surfaces.
 
     Attributes:
-        surfaces, masters: master surfaces, each once, and their facets; of: that of each contact.
-        regions: area of each contact, m^2.
-        facets: master facets in all. bodies: that are in a pair. corners: of the slave facets of each group.
-        far: how far off a gap is told, m. deepest: overlap that is looked for at the start, m.
+        surfaces, masters: distinct master surfaces and their facets; of: master surface of each contact.
+        regions: contact area of each contact, m^2.
+        facets: number of master facets. bodies: bodies in a pair. corners: of the slave facets of each group.
+        far: largest reported gap, m. deepest: search depth of initial overlaps, m.
     """
 
     def __init__(self, model: Model) -> None:
@@ -64,7 +64,7 @@ class PairTables(FacetTables[PairContact]):
         self.corners: list[wp.array] = []
 
     def _check_clamped(self) -> None:
-        """ModelError for a contact of which nothing can move."""
+        """Raise ModelError for a contact whose slots are all clamped."""
         clamped = clamped_slots(self.model)
         for contact, slots in zip(self.contacts, self.slots):
             if clamped[slots].all():
@@ -74,14 +74,14 @@ class PairTables(FacetTables[PairContact]):
                 )
 
     def _region(self, contact: PairContact) -> float:
-        """Area that the stiffness of a contact is spread over, m^2: the smaller of both surfaces'."""
+        """Area that the contact stiffness is distributed over, m^2: the smaller of both surfaces."""
         if contact.radius:
             return math.pi * contact.radius**2
         return min(float(pair_points(surface).area.sum()) for surface in (contact.slave, contact.master))
 
     @property
     def slots(self) -> list[np.ndarray]:
-        """Of each contact the model's slots of both surfaces."""
+        """Model slots of both surfaces of each contact."""
         out = []
         for contact, p, k in zip(self.contacts, self.host, self.of):
             slave = np.unique(p.conn) + contact.slave.body.slot_offset
@@ -90,7 +90,7 @@ class PairTables(FacetTables[PairContact]):
         return out
 
     def build(self, pool: int) -> None:
-        """Upload; `pool`: the first entry of the term in the pool."""
+        """Upload the tables; `pool`: first pool entry of the term."""
         self.pool = self._build_facets(pool)
         for group in self.groups:
             corners = np.concatenate([corner_points(self.host[k]) for k in group.contacts])
@@ -115,24 +115,24 @@ class PairTables(FacetTables[PairContact]):
     @property
     def set_arrays(self) -> dict[str, wp.array]:
         found = super().set_arrays
-        return {name: found[name] for name in ("mu", "mu_static", "damping", "beta", "scale")}  # as files are hashed
+        return {name: found[name] for name in ("mu", "mu_static", "damping", "beta", "scale")}  # hash order
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corners (facets, 3) of the facets in the reference."""
+        """Lower and upper corners (facets, 3) of the reference bounding boxes."""
         nodes = [np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X) for mas in self.masters]
         low, high = ([getattr(x, name)(axis=1) for x in nodes] for name in ("min", "max"))
         return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
 
     @property
     def box_groups(self) -> wp.array:
-        """Groups of the boxes of [world, facet]: one of each world and surface."""
+        """Groups of the boxes of [world, facet]: one per world and surface."""
         counts = [len(mas.conn) for mas in self.masters]
         group = np.repeat(np.arange(len(counts)), counts)
         groups = (np.arange(self.model.worlds)[:, None] * len(counts) + group).ravel()
         return wp.array(groups, dtype=wp.int32, device=self.model.device)
 
     def _padded(self, values: list[np.ndarray], axis: int, width: int, mode: str = "constant") -> np.ndarray:
-        """Facets of all surfaces, with one axis padded to a width."""
+        """Facet arrays of all surfaces, padded along one axis."""
         out = []
         for x in values:
             pad = [(0, 0)] * x.ndim
@@ -141,13 +141,13 @@ class PairTables(FacetTables[PairContact]):
         return np.concatenate(out)
 
     def _master_conn(self) -> np.ndarray:
-        """(facets, L) model slots; facets that use fewer repeat their last one, with functions of zero."""
+        """Model slots (facets, L); smaller facets repeat their last slot, with zero shape functions."""
         width = max(mas.conn.shape[1] for mas in self.masters)
         conns = [mas.conn + surface.body.slot_offset for mas, surface in zip(self.masters, self.surfaces)]
         return self._padded(conns, 1, width, "edge")
 
     def masters_of(self, tree: Any) -> Any:
-        """The device struct, for a tree of boxes."""
+        """Device struct for a bounding volume hierarchy."""
         m, all_of = self.model, self.masters
         if "pair masters" not in m.cache:
             width = self.master_conn.shape[1]
@@ -204,7 +204,7 @@ class PairTables(FacetTables[PairContact]):
         return out
 
     def hash(self, h: Any) -> None:
-        """Feed what defines the contacts into a hash."""
+        """Hash the definition of the contacts."""
         for contact, p, k in zip(self.contacts, self.host, self.of):
             fixed = ("first", "second", "slave", "master", *PER_WORLD)
             values = {name: v for name, v in vars(contact).items() if name not in fixed}

@@ -1,4 +1,4 @@
-"""Contact between bodies: a term with the potential of points of slave surfaces, see kernels/terms/pairs.py."""
+"""Contact between bodies, with a potential per slave surface point, see kernels/terms/pairs.py."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 __all__ = ["Pairs"]
 
 KEPT = ("angle", "grown", "lead", "place", "turn")
-"""History of colliders and of lumped contacts."""
+"""History of colliders and of single-point contacts."""
 
 
 class Pairs(PairSolves):
-    """All contacts of a model between its bodies.
+    """Contacts of a model between its bodies.
 
     Attributes:
         tables: points and facets on the device.
@@ -73,11 +73,11 @@ class Pairs(PairSolves):
         return {"contact between bodies": bool(model.description.pairs)}
 
     def ties(self) -> list[np.ndarray]:
-        """Bodies that may touch are one component."""
+        """Bodies in contact form one component."""
         return self.tables.slots
 
     def hold(self, free: np.ndarray) -> None:
-        """Nothing: the forces of a pair are in balance at any translation of both."""
+        """No-op: the forces of a pair are self-equilibrated under translations."""
 
     def build(self, laws: TimeLaws) -> None:
         self.tables.build(self.offset)
@@ -88,7 +88,7 @@ class Pairs(PairSolves):
     def hash(self, h: Any) -> None:
         self.tables.hash(h)
 
-    # for one simulation
+    # simulation setup
 
     def _attempt(self, work: Workspace) -> Any:
         t, B = self.tables, self.model.worlds
@@ -150,14 +150,14 @@ class Pairs(PairSolves):
         at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
 
     def _tree(self, touching: Any) -> wp.Bvh:
-        """Boxes of the facets in the reference; worlds and surfaces are groups."""
+        """Bounding volume hierarchy of the facets in the reference; one group per world and surface."""
         low, high = self.tables.boxes()
         touching.lower.assign(np.tile(low, (self.model.worlds, 1)))
         touching.upper.assign(np.tile(high, (self.model.worlds, 1)))
         return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=self.tables.box_groups)
 
     def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
-        """The structs of history and seats, with arrays from make(name, dtype, shape of a world)."""
+        """Structs of history and facet assignment, with arrays from make(name, dtype, shape per world)."""
         history, seats = history_struct()(), seat_struct()()
         points = (self.tables.points,)
         for name, var in history_struct().vars.items():
@@ -177,10 +177,10 @@ class Pairs(PairSolves):
         return [self.shared.module, self.seek.module, self.kernels.module, *exact]
 
     def start(self, at: At, active: wp.array) -> None:
-        """What overlaps at the state.
+        """Initial overlaps at the state.
 
         Raises:
-            ModelError: bodies that were not in contact overlap, and `overlap` is "refuse".
+            ModelError: a new contact overlaps, and `overlap` is "refuse".
         """
         s, t = at.scratch[self.name], self.tables
         history = s["history"]
@@ -207,7 +207,7 @@ class Pairs(PairSolves):
         history.overlap.assign(overlap)
 
     def rewind(self, state: State) -> None:
-        """Stored overlaps keep their age."""
+        """Shift the start times of stored overlaps."""
         if "pairs_born" in state.specs:
             state.pairs_born.assign(state.pairs_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
@@ -215,7 +215,7 @@ class Pairs(PairSolves):
 
     @part("pairs")
     def begin(self, at: At, active: wp.array) -> None:
-        """Facets and points as the attempt begins."""
+        """Update facets and points at the start of the attempt."""
         at.scratch[self.name]["finished"] = False
         self._begin(at, active)
 
@@ -238,7 +238,7 @@ class Pairs(PairSolves):
         s["tree"].refit()
 
     def _seek(self, at: At, u: wp.array, active: wp.array, *, settling: float) -> None:
-        """Seats of all points at u."""
+        """Assign all points to facets at u."""
         s, m, t, k = at.scratch[self.name], self.model, self.tables, self.seek
         touching, masters = s["touching"], s["masters"]
         dim = (m.worlds, t.facets, masters.most)
@@ -253,7 +253,7 @@ class Pairs(PairSolves):
             at.launch(k.seek, (m.worlds, group.count, group.data.points), [*args, s["attempt"], touching, corners])
 
     def prepare(self, at: At, active: wp.array) -> None:
-        """The first caps, and the stiffness that blocks are made from."""
+        """Compute the first friction limits and the stiffness of the blocks."""
         self._forces(at, active, fresh=1)
 
     def force(self, at: At, active: wp.array) -> None:
@@ -281,7 +281,7 @@ class Pairs(PairSolves):
         at.launch(self.kernels.gather_masters, (m.worlds, at.launch.padded(lanes * t.master_conn.size)), args)
 
     def _list(self, at: At) -> None:
-        """Lists of the points of each master facet."""
+        """Build the point lists of the master facets."""
         s, m, t, k = at.scratch[self.name], self.model, self.tables, self.lists
         touching, masters = s["touching"], s["masters"]
         at.launch(k.clear_lists, m.worlds * t.facets, [touching])
@@ -310,7 +310,7 @@ class Pairs(PairSolves):
 
     @part("pairs")
     def _finish(self, at: At, accepted: wp.array) -> None:
-        """History, books and records of an accepted substep."""
+        """Update history, ledger rows and records of an accepted substep."""
         s, m, t = at.scratch[self.name], self.model, self.tables
         C = len(t.contacts)
         self._seek(at, s["u"], accepted, settling=0.0)
@@ -326,7 +326,7 @@ class Pairs(PairSolves):
     @part("pairs")
     def commit(self, at: At, accepted: wp.array) -> None:
         s, w = at.scratch[self.name], at.work
-        if not s["finished"]:  # without a ledger nothing is booked
+        if not s["finished"]:  # no ledger, `book` not called
             self._finish(at, accepted)
         args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
         at.launch(self.ending.close, self.model.worlds, args)
@@ -336,7 +336,7 @@ class Pairs(PairSolves):
         at.launch(self.books.write_records, (self.model.worlds, len(self.tables.contacts)), args)
 
     def measure(self, at: At) -> dict[str, np.ndarray]:
-        """Energy that the history says is stored, by points."""
+        """Stored energy according to the history, by points."""
         weights = np.concatenate([share.ravel() for share in self.tables.shares])
         return {"contact_pairs": at.scratch[self.name]["history"].stored.numpy() @ weights}
 
@@ -372,7 +372,7 @@ class Pairs(PairSolves):
         return contact_parameters(self.tables)
 
     def facts(self) -> list[dict[str, Any]]:
-        """Of each contact, in the order they were added, what `Model.info` tells."""
+        """Entries of `Model.info` per contact, in the order of addition."""
         t, out = self.tables, []
         for contact in self.model.description.pairs:
             k = t.number[contact.index]
@@ -384,7 +384,7 @@ class Pairs(PairSolves):
     # at a state
 
     def nodal_force(self, state: State) -> np.ndarray:
-        """Elastic forces of all contacts on slots of both bodies, (worlds, slots, 3), N, at a state."""
+        """Elastic nodal forces of all contacts at a state, both bodies, (worlds, slots, 3), N."""
         return survey(self, state).nodal_force()
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:

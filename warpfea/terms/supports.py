@@ -1,6 +1,6 @@
 """Prescribed motion: driven slots, with a time law per component or a rotation.
 
-It is no force: prescribed components are no unknowns.
+Prescribed components are no unknowns: no force is applied.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Drives:
 
 
 class Supports:
-    """Driven slots of a model: `moved` by laws of displacement, `turned` by rotations; None where there are none."""
+    """Driven slots of a model: `moved` by displacement laws, `turned` by rotations; None if unused."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -46,7 +46,7 @@ class Supports:
         self.turned: Drives | None = None
 
     def build(self, laws: TimeLaws) -> None:
-        """One row per driven slot with a law for each component; two different laws on one component are refused.
+        """Build one row per driven slot with a law for each component; contradictory laws are rejected.
 
         Raises:
             ModelError: two supports prescribe a component differently.
@@ -89,7 +89,7 @@ class Supports:
 
     @part("loads")
     def drive(self, at: At, active: wp.array) -> None:
-        """Put the velocities of the driven components into work.v."""
+        """Write the velocities of the driven components to work.v."""
         w, launch, k, B = at.work, at.launch, self.kernels, self.model.worlds
         if self.moved:
             d = self.moved
@@ -101,13 +101,13 @@ class Supports:
             launch(k.drive_rotation, (B, d.count), args)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that `drive` launches."""
+        """Modules launched by `drive`."""
         k = self.kernels
         kernels = [k.drive_displacement] * bool(self.moved) + [k.drive_rotation] * bool(self.turned)
         return {kernel.module for kernel in kernels}
 
     def hash(self, h: Any) -> None:
-        """Feed the drives into a hash."""
+        """Hash the drives."""
         for drive in (self.moved, self.turned):
             for values in (drive.slot, drive.law, drive.components, drive.arm, drive.axis) if drive else ():
                 if values is not None:
@@ -115,7 +115,7 @@ class Supports:
 
 
 def _claim(taken: dict[tuple[int, int], Any], support: Support, slot: int, kind: tuple[Any, Any]) -> None:
-    """Note who prescribes a component; equal prescriptions may meet, others may not."""
+    """Register the prescription of a component; equal ones may overlap, others raise ModelError."""
     body = support.body
     for c in np.flatnonzero(support.components):
         other = taken.setdefault((slot, int(c)), kind)
@@ -129,7 +129,7 @@ def _claim(taken: dict[tuple[int, int], Any], support: Support, slot: int, kind:
 
 
 def _arms(support: Support, anchor: np.ndarray) -> np.ndarray:
-    """Reference values of the slots, positions from the anchor."""
+    """Reference values of the slots; positions relative to the anchor."""
     body = support.body
     arms = body.reference[support.slots].copy()
     position = body.slot_kind[support.slots] == 0

@@ -1,8 +1,8 @@
-"""The seam of all that adds to the residual of a step, Eq. (17): elements, damping, loads, constraints, contact.
+"""Interface of residual contributions, Eq. (17): elements, damping, loads, constraints, contact.
 
-A term is made once per model and holds constants; what varies is in the workspace and the state of a simulation, which
-reach it as an `At`. A term overrides the methods that it has something to do in: a step loops over the terms there are.
-Models: `Form` of PolyFEM, `BaseForceField` of SOFA, the items of felupe.
+A term is constructed once per model and holds constants; variables are in the workspace and the state of a simulation,
+passed as an `At`. A step calls the methods that each term overrides. Models: `Form` of PolyFEM, `BaseForceField` of
+SOFA, the items of felupe.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 @dataclass(eq=False)
 class At:
-    """A simulation as terms see it.
+    """Simulation context passed to terms.
 
     Attributes:
         model, work, launch, state: of the simulation.
-        u_before: [world, slot] displacements of the step before the last, of multistep schemes; the algorithmic
-            accelerations of schemes that keep them.
-        inertia: the step is dynamic; in statics there are no rates.
-        midpoint: forces are those of the middle of a step, at work.u_stage and work.stage_time.
-        dissipation: chi of the dissipative form of that, see kernels/elements/conserving.py.
-        accelerated: the scheme keeps accelerations.
-        moved: forces are taken at another place than those before; where not, only what terms hold has changed.
-        options: of the solver.
-        scratch: what terms allocated, by their names.
+        u_before: [world, slot] displacements of the step before the last, for multistep schemes; algorithmic
+            accelerations for acceleration-level schemes.
+        inertia: dynamics; no rates in statics.
+        midpoint: forces are evaluated at the middle of a step, at work.u_stage and work.stage_time.
+        dissipation: chi of its dissipative form, see kernels/elements/conserving.py.
+        accelerated: the scheme has accelerations as state variables.
+        moved: positions changed since the last evaluation; if not, only lagged term data did.
+        options: solver options for terms.
+        scratch: arrays allocated by terms, by term name.
     """
 
     model: Model
@@ -75,23 +75,23 @@ class At:
 
     @property
     def traits(self) -> Traits:
-        """What the kernels of the solvers are specialised for, of the terms and of the integrator."""
+        """Traits of terms and integrator that the solvers' kernels are specialised for."""
         return self.model.terms.traits._replace(midpoint=self.midpoint)
 
     @property
     def share(self) -> float:
-        """How much of a change at the end of a step there is where forces are taken."""
+        """Ratio of stage to end-of-step increment: 1/2 for mid-point schemes, else 1."""
         return 0.5 if self.midpoint else 1.0
 
 
 @dataclass(frozen=True)
 class Column:
-    """A row that a term books per substep.
+    """Energy row of a term per substep.
 
     Attributes:
         name: column of the energy ledger; "" for none.
-        kind: STORED, what the term stores now; WORK, done on the model; LOSS; NUMERICAL, a part of the integrator's;
-            HELD_VISCOUS, viscous loss of a force that counts among the dead loads.
+        kind: STORED, energy stored at present; WORK, done on the model; LOSS; NUMERICAL, part of the integrator's;
+            HELD_VISCOUS, viscous loss of a force among the dead loads.
     """
 
     name: str
@@ -100,12 +100,12 @@ class Column:
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """A scalar field at nodes that users may ask for.
+    """Scalar nodal field available to users.
 
     Attributes:
-        title, units: of legends.
-        join: what becomes of the samples of two terms that have this very field; None: it is one term's alone.
-        at_node: value of a node from those of its samples; None: `samples` gives one value per node.
+        title, units: for legends.
+        join: combines the samples of two terms with this field; None: one term only.
+        at_node: reduces the samples of a node; None: `samples` gives one value per node.
     """
 
     title: str
@@ -116,8 +116,8 @@ class FieldSpec:
 
 @dataclass(eq=False)
 class Kept:
-    """Arrays that a term's blocks are made from, beside the displacements: live ones, those that a kept preconditioner
-    is made with, and the state's, [world, ...]."""
+    """Inputs of a term's blocks at linearisation, besides displacements: live, cached and state arrays, [world,
+    ...]."""
 
     live: list[wp.array]
     place: list[wp.array]
@@ -125,7 +125,7 @@ class Kept:
 
 
 def part(name: str) -> Callable[[F], F]:
-    """Marks a method of a term: its launches belong to part `name` of a profile."""
+    """Decorator: attribute a method's launches to profile part `name`."""
 
     def mark(method: F) -> F:
         @functools.wraps(method)
@@ -139,29 +139,28 @@ def part(name: str) -> Callable[[F], F]:
 
 
 class Term:
-    """One contribution to the residual. Forces are in N, on slots; flags `active` are int32 arrays [world].
+    """One contribution to the residual. Forces in N, per slot; flags `active` are int32 arrays [world].
 
-    Pools: a term with a potential that has `connectivity` writes at `offset + local * items + item` of work.pool_force
-    (what it adds to the residual, the derivative of its potential), work.pool_product (the derivative of that along p)
-    and work.pool_block (3x3 blocks on the diagonal, Voigt order). A term without a potential does so in
-    work.nonpotential_contribution, with the force on the body, and in work.nonpotential_tangent. Slots gather from the
-    pools in a fixed order.
+    Pools: a potential term with `connectivity` writes at `offset + local * items + item` of work.pool_force (derivative
+    of its potential, added to the residual), work.pool_product (directional derivative of that along p) and
+    work.pool_block (3x3 diagonal blocks, Voigt order). A non-potential term writes the force on the body to
+    work.nonpotential_contribution, and work.nonpotential_tangent. Slots gather from the pools in a fixed order.
 
     Attributes:
         name: unique.
-        potential: it has one; else its force is held dead inside a line search, and its work counts as that of fields
-            as far as no column books it.
-        traits: what it asks of the kernels of a step. `limited` is a term's to declare; `ties` and `gated` belong to
-            constraints; the others follow from connectivity, rows and whether it overrides `product`.
-        connectivity: arrays (items, slots of an item) of the model's slots that it contributes to.
-        columns: what it books, see Column; energies() has a column by each name.
-        fields: scalars at nodes, by name.
-        parts: parts of a profile that its launches name, with a line about each.
-        report_columns: columns of the report of a step.
+        potential: True for potential forces; else its force is frozen during a line search, and work not in its own
+            columns counts as field work.
+        traits: kernel features that it requires. `limited` is declared by a term; `ties` and `gated` belong to
+            constraints; the others follow from connectivity, rows and an overridden `product`.
+        connectivity: arrays (items, slots of an item) of model slots that it contributes to.
+        columns: ledger rows, see Column; energies() has one key per column.
+        fields: nodal scalars by name.
+        parts: profile parts named by its launches, each with a description.
+        report_columns: columns of the step report.
         rows: rows [TERM_ROWS, world, row] of its potential in work.term_rows, see `Workspace.rows_of`.
-        booked_rows: length of the rows of `book`, where they are longer than there are slots, elements or `rows`.
-        penalty: its blocks are added to the matrix after D was taken from it.
-        offset, row_offset, report_offset: its places in the pools, the rows and the report, set by the TermSet.
+        booked_rows: length of the rows of `book`, if larger than the numbers of slots, elements and `rows`.
+        penalty: its blocks are added to the matrix after D is taken from it.
+        offset, row_offset, report_offset: offsets in the pools, rows and report, set by the TermSet.
     """
 
     name: ClassVar[str]
@@ -180,47 +179,46 @@ class Term:
 
     @classmethod
     def of(cls, model: Model) -> Term | None:
-        """The term of a model, or None where the model has nothing of it: it costs nothing then."""
+        """Construct the term of a model, or None if the model does not use it (no cost then)."""
         raise NotImplementedError
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
-        """What `info` lists as used or left out."""
+        """Optional features for `info`: used (True) or left out."""
         return {}
 
-    # before the model knows its components
+    # before components are known
 
     def ties(self) -> list[np.ndarray]:
-        """Sets of model slots that it ties to each other: they become one component."""
+        """Sets of model slots tied to each other: each becomes one component."""
         return []
 
     def build(self, laws: TimeLaws) -> None:
-        """Make what needs the components, and number time laws; sets `connectivity`, `rows`, `report_columns`."""
+        """Build tables that need the components and add time laws; sets `connectivity`, `rows`, `report_columns`."""
 
     def hold(self, free: np.ndarray) -> None:
-        """Clear directions (components, 3) in which it ties a component to the ground, or to another component.
+        """Clear directions (components, 3) in which it constrains a component to the ground or another component.
 
-        Translations of a free component pass through the elements and the mass alone. Where a term resists them, a
-        solve can't be corrected by them: by default those of all components that a tangent of this term touches. A
-        term whose forces on each component are in balance at any translation clears nothing.
+        Translations of a free component involve elements and mass only. A solve can't be corrected along translations
+        that a term resists: by default all those of components in this term's tangent. A term with self-equilibrated
+        forces on each component under translation clears nothing.
         """
         if self.potential or type(self).product is not Term.product:
             for conn in self.connectivity:
                 free[np.unique(self.model.component[conn])] = 0.0
 
     def restraints(self, state: State, component: int) -> Any:
-        """Rows (n, 3 slots), CSR: directions in which it resists motion of a component, for statics; None without."""
+        """Rows (n, 3 slots), CSR, of directions in which it resists motion of a component, for statics; None: none."""
         return None
 
     def incidence(self) -> tuple[np.ndarray, np.ndarray, int] | None:
-        """(item, slot, number of items) of entries off the elements' pattern: slots of one item couple."""
+        """Entries (item, slot, number of items) outside the elements' pattern: the slots of an item couple."""
         return None
 
     def hash(self, h: Any) -> None:
-        """Feed what defines it into a hash, so that a checkpoint of another term is refused.
+        """Hash its definition, so that a checkpoint of another term is rejected.
 
-        By default the attributes that are numbers, texts and numpy arrays; name, columns and connectivity are fed
-        already.
+        Default: attributes that are numbers, texts or numpy arrays, besides name, columns and connectivity.
         """
         for name, value in sorted(vars(self).items()):
             if isinstance(value, np.ndarray):
@@ -228,102 +226,102 @@ class Term:
             elif isinstance(value, (bool, int, float, complex, str, np.generic)):
                 h.update(f"{name} {value!r}".encode())
 
-    # for one simulation
+    # simulation setup
 
     def allocate(self, work: Workspace, at: At) -> None:
-        """Make scratch; keep it in at.scratch[name]."""
+        """Allocate scratch in at.scratch[name]."""
 
     def register(self, at: At) -> None:
-        """Register history with at.state: it is then rewound, halved, reset and saved with the state."""
+        """Register history with at.state: restored, halved, reset and saved with the state."""
 
     def configure(self, at: At) -> None:
-        """Solver and state are known."""
+        """Configure for the solver and state, both known here."""
 
     def modules(self, at: At) -> Iterable[wp.Module]:
-        """Modules that it launches in a step."""
+        """Modules launched in a step."""
         return ()
 
     def start(self, at: At, active: wp.array) -> None:
-        """The state of active worlds was set: bring up to it what follows it. Time laws and work.u are at the state."""
+        """Reinitialise after the state was set; time laws and work.u are current."""
 
     def rewind(self, state: State) -> None:
-        """The time of a state is about to be put to 0: shift what the term has stored of times."""
+        """Shift stored times before the state's time is reset to 0."""
 
     # in a step, in this order
 
     def begin(self, at: At, active: wp.array) -> None:
-        """An attempt begins; time laws are at its end."""
+        """Begin an attempt; time laws are evaluated at its end."""
 
     def prepare(self, at: At, active: wp.array) -> None:
-        """work.u is the first iterate: evaluate what blocks and penalties need."""
+        """Evaluate the data of blocks and penalties at the first iterate work.u."""
 
     def scale(self, at: At, active: wp.array) -> None:
-        """D of the first iterate is known, and so are penalties."""
+        """Scale by D of the first iterate; penalties are known."""
 
     def force(self, at: At, active: wp.array) -> None:
-        """Forces and rows of the potential at work.u, work.v; in statics work.v is the increment of a load step, m."""
+        """Forces and potential rows at work.u, work.v; in statics work.v is the load step increment, m."""
 
     def aim(self, at: At, active: wp.array) -> None:
-        """work.direction is the Newton direction. A term that limits the step lowers work.newton.limit.
+        """Process the Newton direction work.direction. To limit the step, lower work.newton.limit.
 
-        0 or less: no step is allowed, and the attempt is given up and halved.
+        A limit <= 0 allows no step: the attempt fails and is halved.
         """
 
     def adopt(self, at: At, flags: wp.array) -> None:
-        """A trial was accepted in the flagged worlds: hold its multipliers, caps, ... in the next search."""
+        """Accept a trial in the flagged worlds: freeze its multipliers, friction limits, ... for the next search."""
 
     def refresh(self, at: At, flags: wp.array) -> None:
-        """With the trait "walls": take anew, in the flagged worlds, what Newton's method has held so far.
+        """Update lagged quantities in the flagged worlds (trait "walls").
 
-        Forces are evaluated again after it, and judged: the residual is that of what is held now.
+        Forces and residual are re-evaluated and checked with the updated values.
         """
 
     def follow(self, at: At, active: wp.array) -> None:
-        """There is a new iterate, and a linear solve to come."""
+        """Prepare a linear solve at a new iterate."""
 
     def outer(self, at: At, flags: wp.array) -> None:
-        """The inner solve of a classical multiplier method is done in the flagged worlds: change multipliers."""
+        """Update multipliers after the inner solve of a classical multiplier method in the flagged worlds."""
 
     def book(self, at: At, accepted: wp.array) -> wp.array | None:
-        """Rows [column, world, item] in float64 whose sums are booked, J; the state is still that before the substep.
+        """Energy rows [column, world, item], J, float64, to be summed; the state is still that before the substep.
 
-        None: the sums of the last substep stand.
+        None: the sums of the last substep remain valid.
         """
         return None
 
     def commit(self, at: At, accepted: wp.array) -> None:
-        """An attempt was accepted: keep history."""
+        """Store history of an accepted attempt."""
 
     def report(self, at: At) -> None:
-        """Write columns of work.report, from report_offset on."""
+        """Write columns of work.report from report_offset on."""
 
     def measure(self, at: At) -> dict[str, np.ndarray]:
-        """What the STORED columns hold at the state, (worlds,), J, where the ledger begins anew."""
+        """STORED columns at the state, (worlds,), J, from which the ledger restarts."""
         return {}
 
     def restart(self, at: At, flags: wp.array) -> None:
-        """The state of the flagged worlds was set on the device: scratch that lasts is as in a new simulation again."""
+        """Reset persistent scratch of the flagged worlds after a device-side reset."""
 
     # in a linear solve
 
     def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        """The derivative of the force along p, a change of the positions, m; velocities change by p/(dq/dv)."""
+        """Derivative of the force along p, a change of the positions, m; velocities change by p/(dq/dv)."""
 
     def diagonal(self, at: At, active: wp.array) -> None:
-        """3x3 blocks on the diagonal, positive, into the pool.
+        """Positive semi-definite 3x3 diagonal blocks, into the pool.
 
-        For the solvers that work with blocks of every iterate; the others take them from `blocks`.
+        For solvers that use the blocks of every iterate; the others take them from `blocks`.
         """
 
     def keep(self, at: At) -> list[tuple[str, wp.array]]:
-        """Names and arrays [world, ...] beside the displacements that `blocks(projected=True)` is a function of.
+        """Names and arrays [world, ...] that `blocks(projected=True)` depends on besides the displacements.
 
-        A preconditioner keeps copies: a resumed run makes the one that the uninterrupted run has.
+        A preconditioner stores copies, so that a resumed run rebuilds the same one.
         """
         return []
 
     def carry(self, at: At, kept: Kept, reuse: Any, accepted: wp.array) -> bool:
-        """Copy what is kept with a kernel of its own; False: the caller does it array by array."""
+        """Copy the cached inputs with a kernel of its own; False: the caller copies array by array."""
         return False
 
     def blocks(
@@ -332,30 +330,30 @@ class Term:
     ) -> None:  # fmt: skip
         """out += (dq/dv) K, with the pattern of `matrix` (see solvers.assembled.Assembled), from the arrays of `keep`.
 
-        `projected`: only what is positive for sure. A term that is stiff and leaves this out costs iterations: neither
-        D nor the preconditioner knows of it then.
+        `projected`: the positive semi-definite part only. Omitted stiffness costs iterations: both D and the
+        preconditioner lack it then.
         """
 
     def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
-        """Make what `blocks` needs, before launches are recorded; `projected`: nothing else will be asked for."""
+        """Allocate for `blocks` before launches are captured; `projected`: no other blocks are needed."""
 
     def block_modules(self) -> Iterable[wp.Module]:
-        """Modules that `blocks` launches."""
+        """Modules launched by `blocks`."""
         return ()
 
     def couples(self) -> list[tuple[int, int]]:
-        """Numbers of two bodies each that its tangent couples, but `blocks` does not: the rest is for `couple`."""
+        """Body pairs coupled by the tangent but not by `blocks`: the rest is added by `couple`."""
         return []
 
     def reserve_motions(self, at: At, motions: Any) -> Iterable[wp.Module]:
-        """Make what `couple` needs, before launches are recorded; the modules that it launches."""
+        """Allocate for `couple` before launches are captured; returns its modules."""
         return ()
 
     def couple(self, at: At, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
-        """Put what couples bodies into the matrix of the rigid motions of `reserve_motions` (solvers/motions.py)."""
+        """Add the coupling of bodies to the rigid body mode matrix of `reserve_motions` (solvers/motions.py)."""
 
     def preconditions(self, at: At) -> bool:
-        """Whether `precondition` has something to add."""
+        """True if `precondition` adds a correction."""
         return False
 
     def precondition(
@@ -366,30 +364,30 @@ class Term:
     # results
 
     def explain(self, at: At, world: int) -> tuple[type[ConvergenceError], str] | None:
-        """Why the last attempt at a step of a world was refused, where the term knows, with the error that says so."""
+        """Error class and reason of the last rejected attempt of a world, or None if unknown to the term."""
         return None
 
     def remark(self, at: At, world: int) -> str:
-        """What else is to be told of the last attempt at a refused step of a world; "" for nothing."""
+        """Additional note on the last rejected attempt of a world; "" for none."""
         return ""
 
     def parameter_arrays(self) -> Mapping[str, wp.array]:
-        """What `parameters` write, by names of the term's own: arrays that checkpoints hold and a resumed run gets."""
+        """Arrays written by `parameters`, by the term's own names: saved in checkpoints and restored."""
         return {}
 
     def parameters_taken(self) -> None:
-        """`parameter_arrays` were written from a checkpoint."""
+        """Update after `parameter_arrays` were restored from a checkpoint."""
 
     def take_materials(self, mask: np.ndarray) -> None:
-        """Constants of materials (see `model.parameters`) were set in the chosen worlds (worlds,): follow them in
-        place; before the first simulation arrays may be replaced by longer ones."""
+        """Update in place after material constants (see `model.parameters`) were set in the chosen worlds (worlds,);
+        before the first simulation arrays may be replaced by longer ones."""
 
     def parameters(self) -> Mapping[str, Callable[[Any, np.ndarray], None]]:
-        """What `Model.set_parameter` may set, by name, with what sets it: it gets the value as the user gave it, which
-        it checks, and the mask (worlds,) of the worlds to set; the others stay."""
+        """Setters of `Model.set_parameter` by name: each validates the user's value and sets it in the worlds of the
+        mask (worlds,)."""
         return {}
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
-        """(worlds, nodes x samples of a node) values of one of `fields`, on sections and faces; of one without
+        """Values (worlds, nodes x samples of a node) of one of `fields`, on sections and faces; of one without
         `at_node` (worlds, nodes of the body's mesh)."""
         raise NotImplementedError

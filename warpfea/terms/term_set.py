@@ -1,4 +1,4 @@
-"""The terms of a model, and what is made of all of them: pools, ledger, fields, features, report."""
+"""Set of terms: pools, ledger, fields, features, report."""
 
 from __future__ import annotations
 
@@ -39,33 +39,33 @@ if TYPE_CHECKING:
 __all__ = ["KINDS", "TermSet", "all_parts"]
 
 KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Pairs, Constraints)
-"""The kinds of terms there are, in the order of their launches: what the forces of an attempt are made of first."""
+"""All kinds of terms in launch order, that in which the forces of an attempt are evaluated."""
 STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end", "summed_time",
          "energy_growth")  # fmt: skip
-"""Arrays of the state that are no term's."""
+"""State arrays owned by no term."""
 FIELDS = ("von_mises", "displacement")
 """Fields of every model, see simulation.results."""
 
 
 def all_parts() -> dict[str, str]:
-    """Parts of a profile, of every step and of all kinds of terms, with a line about each."""
+    """Profile parts of every step and of all kinds of terms, each with a description."""
     return PARTS | {name: text for kind in KINDS for name, text in kind.parts.items()}
 
 
 class TermSet:
-    """The terms there are, in order; iterate over it.
+    """Terms of a model in order; iterable.
 
     Attributes:
-        laws: the table of time laws.
+        laws: table of time laws.
         supports: prescribed motion.
         dead: dead loads and gravity.
-        traits: what the terms ask of the kernels of a step.
-        side_entries: entries of the pool of forces without a potential; pool_entries: of that of potential ones.
-        side_topology: who contributes to a slot there, None without.
+        traits: traits of the terms for the kernels of a step.
+        side_entries: pool entries of non-potential forces; pool_entries: of potential ones.
+        side_topology: gather table of the non-potential pool, or None.
         rows: rows of potentials.
-        written: how often parameters were set.
-        ledger: columns of the energy ledger. report: columns of the report of a step.
+        written: number of parameter updates.
+        ledger: columns of the energy ledger. report: columns of the step report.
     """
 
     def __init__(self, model: Model, more: list[Callable[[Model], Term | None]] | None = None) -> None:
@@ -85,7 +85,7 @@ class TermSet:
         self._check()
 
     def _check(self) -> None:
-        """ModelError where terms that were added claim a name that is taken, or what is not theirs."""
+        """Raise ModelError for added terms with duplicate names or reserved traits."""
         first = [f"name {term.name!r}" for term in self.all]
         for name in first:
             if first.count(name) > 1:
@@ -103,39 +103,39 @@ class TermSet:
 
     @property
     def added(self) -> list[Term]:
-        """Terms that do not come with warpfea."""
+        """Terms added by the user."""
         return [term for term in self.all if type(term) not in KINDS]
 
     def __iter__(self) -> Iterator[Term]:
         return iter(self.all)
 
     def find(self, kind: type[Any]) -> Any:
-        """The term of a kind, or None."""
+        """Term of one kind, or None."""
         return next((term for term in self.all if isinstance(term, kind)), None)
 
     @property
     def constraints(self) -> Constraints | None:
-        """The constraints' term, or None."""
+        """Constraint term, or None."""
         return self.find(Constraints)
 
     @property
     def products(self) -> bool:
-        """Whether terms beside the elements add to H."""
+        """True if terms besides the elements contribute to H."""
         return self.traits.tangent or self.traits.pooled or self.traits.ties
 
     # for the model
 
     def ties(self) -> list[np.ndarray]:
-        """Sets of slots that terms tie."""
+        """Sets of slots tied by terms."""
         return [slots for term in self.all for slots in term.ties()]
 
     def build(self) -> None:
-        """Make the terms' tables, once the model knows its components, and their places in the pools."""
+        """Build the terms' tables, once components are known, and their pool offsets."""
         for term in self.all:
             term.offset = self._entries(self.all, term.potential)
             term.build(self.laws)
             check_tables(term, self.model)
-            if term is self.dead:  # in this order time laws are numbered
+            if term is self.dead:  # time laws are numbered in this order
                 self.supports.build(self.laws)
         self.laws.upload()
         self.traits = Traits(*map(any, zip(*(derived_traits(term) for term in self.all))))
@@ -154,7 +154,7 @@ class TermSet:
 
     @staticmethod
     def _entries(terms: list[Term], potential: bool) -> int:
-        """Entries of a pool that are taken so far."""
+        """Number of pool entries used so far."""
         return sum(conn.size for term in terms if term.potential == potential for conn in term.connectivity)
 
     def _topology(self, conns: list[np.ndarray]) -> Any:
@@ -167,7 +167,7 @@ class TermSet:
         return out
 
     def join(self, topology: Any) -> None:
-        """Put the table of the pool of potential terms into the model's topology."""
+        """Add the gather table of the potential pool to the model's topology."""
         if self.pool_entries:
             conns = [conn for term in self.all if term.potential for conn in term.connectivity]
             pool = self._topology(conns)
@@ -180,7 +180,7 @@ class TermSet:
 
     @property
     def features(self) -> dict[str, bool]:
-        """Which optional features of all kinds of terms the model uses."""
+        """Optional features of all kinds of terms: used by the model or not."""
         kinds = [*KINDS, *(type(term) for term in self.all if type(term) not in KINDS)]
         out: dict[str, bool] = {}
         for kind in kinds:
@@ -189,13 +189,13 @@ class TermSet:
         return out | {"controls": bool(self.laws.controls)}
 
     def rewind(self, state: State) -> None:
-        """Put the time of a state to 0, and what terms have stored of times with it."""
+        """Reset the time of a state to 0, and shift the times stored by terms."""
         for term in self.all:
             term.rewind(state)
         state.time.zero_()
 
     def hash(self, h: Any) -> None:
-        """Feed what defines the terms into a hash."""
+        """Hash the definitions of the terms."""
         self.laws.hash(h)
         self.supports.hash(h)
         for term in self.all:
@@ -208,19 +208,19 @@ class TermSet:
 
     @property
     def parts(self) -> dict[str, str]:
-        """Parts of a profile that the terms add, with a line about each."""
+        """Profile parts added by the terms, each with a description."""
         return {name: text for term in self.all for name, text in term.parts.items()}
 
     @property
     def fields(self) -> dict[str, FieldSpec]:
-        """Fields that users may ask for beside those of the elements."""
+        """Fields available besides those of the elements."""
         return {name: spec for term in self.all for name, spec in term.fields.items()}
 
     def samples(self, name: str, body: Any, state: State) -> np.ndarray:
-        """(worlds, nodes x samples) values of a field, at every sample those of its node where a term has no others.
+        """Values (worlds, nodes x samples) of a field; terms with nodal values only repeat them at each sample.
 
         Raises:
-            ModelError: a term gives another shape.
+            ModelError: a term returns another shape.
         """
         spec, count = self.fields[name], body.family.node_samples.shape[1]
         found = []
@@ -233,22 +233,22 @@ class TermSet:
         return functools.reduce(spec.join, found) if spec.join else found[0]
 
     def at_nodes(self, name: str, body: Any, state: State) -> np.ndarray:
-        """(worlds, nodes) values of a field."""
+        """Values (worlds, nodes) of a field."""
         values = self.samples(name, body, state)
         values = values.reshape(len(values), len(body.mesh.points), -1)
         reduce = self.fields[name].at_node
         return np.asarray(reduce.reduce(values, axis=2) if reduce else values[:, :, 0])
 
-    # what users set and ask for
+    # parameters and fields
 
     @property
     def contact(self) -> Contact | None:
-        """The term of contact with obstacles, or None."""
+        """Term of contact with obstacles, or None."""
         return self.find(Contact)
 
     @property
     def pairs(self) -> Pairs | None:
-        """The term of contact between bodies, or None."""
+        """Term of contact between bodies, or None."""
         return self.find(Pairs)
 
     def set_parameter(self, name: Any, values: Any, mask: Any) -> None:
@@ -272,13 +272,13 @@ class TermSet:
         raise ModelError(f"set_parameter: parameter {name!r} is unknown; there are: {listing(known)}{hint}")
 
     def parameter_arrays(self) -> dict[str, wp.array]:
-        """What is set by `set_parameter` of terms, by "term name"."""
+        """Arrays of the terms' parameters, by "term name"."""
         return {f"{term.name}.{name}": a for term in self.all for name, a in term.parameter_arrays().items()}
 
-    # for one simulation
+    # simulation setup
 
     def allocate(self, work: Workspace, at: At) -> None:
-        """Let the terms register history and make scratch."""
+        """Allocate the terms' scratch and register their history."""
         owner: dict[str, str] = {}
         controls = [control_array(name) for name in self.laws.controls]
         for term in self.all:
@@ -293,11 +293,11 @@ class TermSet:
 
     @property
     def booking(self) -> list[Term]:
-        """Terms that book rows of the ledger."""
+        """Terms with ledger rows."""
         return [term for term in self.all if term.columns]
 
     def booked(self, work: Any) -> Any:
-        """Device table of what terms book; the sums are those of `book`."""
+        """Device table of the ledger columns of the terms; `book` fills their sums."""
         columns = [column for term in self.booking for column in term.columns]
         out = booked_struct()()
         device = self.model.device
@@ -310,7 +310,7 @@ class TermSet:
         return out
 
     def book(self, at: At, reduce: Any, accepted: wp.array) -> None:
-        """Let the terms book an accepted substep."""
+        """Evaluate and sum the terms' ledger rows for an accepted substep."""
         first = 0
         for term in self.booking:
             rows, count = term.book(at, accepted), len(term.columns)
@@ -320,14 +320,14 @@ class TermSet:
             first += count
 
     def modules(self, at: At) -> set[wp.Module]:
-        """Modules that terms launch in a step."""
+        """Modules launched by terms in a step."""
         out = self.laws.modules() | self.supports.modules()
         for term in self.all:
             out |= set(term.modules(at))
         return out
 
     def energies(self, ledger: np.ndarray) -> dict[str, np.ndarray]:
-        """Columns of the ledger (worlds, columns) by name; of kinds of terms that are not there zeros."""
+        """Columns of the ledger (worlds, columns) by name; zeros for unused kinds of terms."""
         out = {name: ledger[:, k].copy() for k, name in enumerate(self.ledger)}
         known = [column.name for kind in KINDS for column in kind.columns if column.name]
         for name in known:

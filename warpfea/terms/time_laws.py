@@ -1,4 +1,4 @@
-"""The table of time laws of a model on the device."""
+"""Device table of the time laws of a model."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["TimeLaws", "argument_precision", "control_array"]
 
 
 class TimeLaws:
-    """Laws are numbered as they are added, then uploaded; `evaluate` fills one row of values per world.
+    """Time laws, numbered as added, then uploaded; `evaluate` fills one row of values per world.
 
     Attributes:
-        controls: those that drive something, by name; their values are arrays of the state, see `control_array`.
+        controls: those in use, by name; their values are state arrays, see `control_array`.
     """
 
     def __init__(self, model: Model) -> None:
@@ -36,10 +36,10 @@ class TimeLaws:
         self.data = law_struct()()
 
     def add(self, law: TimeLaw) -> int:
-        """The number of a law; of a control the one that it has already.
+        """Index of a law; a control keeps its first index.
 
         Raises:
-            ModelError: another control has the name.
+            ModelError: a name used by two controls.
         """
         if law.control is not None:
             known = self.controls.setdefault(law.control.name, law.control)
@@ -55,7 +55,7 @@ class TimeLaws:
         return len(self.laws) - 1
 
     def register(self, state: State) -> None:
-        """Give a state the arrays of the controls' values, where it has none."""
+        """Add missing arrays of control values to a state."""
         for control in self.controls.values():
             state.register(control_array(control.name), wp.float64, (control.size,), control.initial)
 
@@ -65,7 +65,7 @@ class TimeLaws:
         return len(self.laws)
 
     def upload(self) -> None:
-        """Make the device table; nothing without laws."""
+        """Upload the device table; no-op without laws."""
         m, laws = self.model, self.laws
         if not laws:
             return
@@ -81,9 +81,10 @@ class TimeLaws:
     def evaluate(
         self, launch: Launcher, state: State, time: wp.array, ramp: wp.array, active: wp.array, value: wp.array
     ) -> None:
-        """value[world, law] at times [world]; constants are multiplied by the ramp [world] of a static load path.
+        """value[world, law] at times [world]; constants and controls are scaled by the ramp [world] of a static load
+        path.
 
-        So are controls, whose values are in the state.
+        Control values are read from the state.
         """
         if not self.laws:
             return
@@ -96,13 +97,13 @@ class TimeLaws:
             launch(self.kernels.evaluate_control, B, args)
 
     def modules(self) -> set[wp.Module]:
-        """Modules that `evaluate` launches."""
+        """Modules launched by `evaluate`."""
         out = {kernel.module for kernel, _ in self.functions}
         out |= {self.kernels.evaluate_control.module} if self.controls else set()
         return out | ({self.kernels.evaluate_laws.module} if self.laws else set())
 
     def hash(self, h: Any) -> None:
-        """Feed the laws into a hash."""
+        """Hash the laws."""
         for law in self.laws:
             h.update(law.times.tobytes() + law.values.tobytes())
             if law.function is not None:
@@ -112,12 +113,12 @@ class TimeLaws:
 
 
 def control_array(name: str) -> str:
-    """Name of the state's array [world, size] with the values of a control."""
+    """Name of the state array [world, size] with the values of a control."""
     return f"control_{name}"
 
 
 def argument_precision(function: wp.Function, default: str) -> str:
-    """Precision that a user's function takes, from its annotations."""
+    """Precision of a user function's arguments, from its annotations."""
     text = " ".join(str(t) for t in getattr(function, "input_types", {}).values())
     if any(word in text for word in ("float64", "vec3d", "vec_t[float64")):
         return "float64"

@@ -1,4 +1,4 @@
-"""All arrays that a step writes, allocated once when the simulation is made."""
+"""Arrays written by a step, allocated once per simulation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["Workspace"]
 
 
 class Workspace:
-    """Scratch of a simulation. Features that a scene does not use get an array of one item."""
+    """Scratch of a simulation. Unused features get an array of one item."""
 
     def __init__(
         self, model: Model, *, max_newton: int, ledger: bool, midpoint: bool = False, dissipation: float = 0.0
@@ -37,7 +37,7 @@ class Workspace:
         self.device = model.device
         self.dissipation, self._dtype = dissipation, model.dtype
         self.bytes: dict[str, int] = {}
-        # of arrays for some of the worlds: for how many, of so many in all
+        # arrays for a chunk of the worlds: chunk size as a function of the number of worlds
         self.chunks: dict[str, Callable[[int], int]] = {}
         self.blocks_shape, self.sym = (model.worlds, model.contributions), model.types.sym
         B, n, vec3 = model.worlds, model.slots, model.types.vec3
@@ -45,23 +45,23 @@ class Workspace:
         def field(name: str) -> wp.array:
             return self.array(name, (B, n), vec3)
 
-        # the iterate and what it is measured from
+        # iterate, base point of its displacements, best iterate
         self.v, self.u, self.base, self.best = field("v"), field("u"), field("base"), field("best")
-        # where forces are taken, and what elements take for velocities
+        # stage positions, and stage velocities of the elements
         self.u_stage, self.v_stage = (field("u_stage"), field("v_stage")) if midpoint else (self.u, self.v)
         self.q_tilde, self.v_tilde = field("q_tilde"), field("v_tilde")
-        # conjugate gradients
+        # PCG
         self.direction, self.r, self.z, self.p, self.Hp = (field(k) for k in ("direction", "r", "z", "p", "Hp"))
-        # the parts of the residual, and the diagonal of H
+        # parts of the residual, and the diagonal of H
         self.g, self.inertia, self.internal = field("g"), field("inertia"), field("internal")
         terms, traits = model.terms, model.terms.traits
-        # with constraints PCG solves for the gradient of the augmented potential
+        # with constraints PCG uses the gradient of the augmented potential
         self.gradient = field("gradient") if traits.ties else self.g
         self.dead, self.dead_magnitude = field("dead"), field("dead_magnitude")
         self.diagonal = field("diagonal")
         self.inverse = self.array("inverse", (B, n), model.types.mat33)
         self.contribution = self.array("contribution", (B, model.contributions), vec3)
-        # with a preconditioner that is made of blocks on the diagonal alone
+        # for a preconditioner of diagonal blocks only
         self.block_contribution: wp.array = wp.zeros((0, 0), dtype=model.types.sym, device=model.device)
         none = self.array("none", (1, 1), vec3)
         side = (B, terms.side_entries)
@@ -82,16 +82,16 @@ class Workspace:
         booked = sum(len(term.columns) for term in terms)
         self.booked = self.array("booked", (max(booked, 1), B), wp.float64)
         self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
-        # scratch for kernels whose sums are not wanted
+        # scratch for kernels whose sums are unused
         self.spare_rows = self.array("spare_rows", (2, B, n) if traits.ties else (1, 1, 1), wp.float64)
-        # sums of the conjugate gradients come per warp
+        # PCG sums have one row per warp
         self.warp = WARP if model.device.is_cuda else 1
         self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
         longest = max(n, model.element_count, terms.rows, *(term.booked_rows for term in terms))
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
-        self.longest = chunks * CHUNK  # items of a row that can be summed
+        self.longest = chunks * CHUNK  # maximum items of a summed row
         most = max(RESIDUAL_ROWS, LEDGER_ROWS, *(len(term.columns) for term in terms))
         self.partial = self.array("partial", (most, B, chunks), wp.float64)
         self.law_value = self.array("law_value", (B, max(terms.laws.count, 1)), wp.vec3d)
@@ -109,7 +109,7 @@ class Workspace:
         self.residual_group_partial = self.array(
             "residual_group_partial", (*sums, LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
         )
-        skip: tuple[str, ...] = ("violation", "negative", "unsolved", "component_of_group")  # of others
+        skip: tuple[str, ...] = ("violation", "negative", "unsolved", "component_of_group")  # for other solvers
         skip += () if traits.gated else ("outer", "open")
         skip += () if traits.stored else ("term_sums", "stepped")
         skip += () if traits.limited else ("limit",)
@@ -132,7 +132,7 @@ class Workspace:
             term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.residual_parts.count, FLOOR_LANES),
         )  # fmt: skip
         self.newton.components, self.newton.groups = C, groups
-        self.multipliers: Any = multiplier_struct()()  # the constraints' own, where there are any
+        self.multipliers: Any = multiplier_struct()()  # of constraints, if any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative, self.newton.unsolved = self.pcg.negative, self.pcg.unsolved
         unused: tuple[str, ...] = ("b", "q_a", "h_before", "any_refused", "summed", "ends", "growth", "least_energy")
@@ -145,16 +145,16 @@ class Workspace:
             setattr(self.balance, name, getattr(self.step if of_step else self, name))
 
     def data_of(self, block: Block) -> Any:
-        """The constants of a block of elements as the kernels of the scheme take them."""
+        """Constants of an element block in the form that the scheme's kernels take."""
         return block.dissipative_data(self._dtype, self.dissipation) if self.dissipation else block.data
 
     def reserve_blocks(self) -> None:
-        """Make room for the blocks on the diagonal of elements' matrices."""
+        """Allocate the diagonal blocks of element matrices."""
         if self.block_contribution.shape != self.blocks_shape:
             self.block_contribution = self.array("block_contribution", self.blocks_shape, self.sym)
 
     def rows_of(self, term: Any) -> wp.array:
-        """The rows of a term's potential, [TERM_ROWS, world, row]."""
+        """Rows of a term's potential, [TERM_ROWS, world, row]."""
         if self.term_rows is None or not term.rows:
             raise ModelError(f"term {term.name!r} has no rows of a potential: build must set `rows`, one per item")
         first, last = term.row_offset, term.row_offset + term.rows
@@ -162,7 +162,7 @@ class Workspace:
         return self.term_rows if whole else self.term_rows[:, :, first:last]
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Zeroed array; its bytes are counted. ModelError where it is too large to be addressed."""
+        """Zeroed array, counted in bytes. ModelError if too large to index."""
         step = wp.types.type_size_in_bytes(dtype)
         for k in range(len(shape) - 1, 0, -1):
             step *= shape[k]
@@ -177,7 +177,7 @@ class Workspace:
         return out
 
     def struct(self, kind: Any, worlds: int, skip: tuple[str, ...] = (), **shapes: tuple[int, ...]) -> Any:
-        """A control struct with an array [world] for each array field, unless a shape is given."""
+        """Control struct with one array [world] per array field, or of the given shape."""
         out = kind()
         special = {
             "elem_sums": (2, worlds),

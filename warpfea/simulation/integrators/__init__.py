@@ -1,7 +1,7 @@
-"""Time discretisations, one file each: small objects that say how q depends on v, and what the inertia term is.
+"""Time discretisations, one file each: definitions of q(v) and of the inertia term.
 
 With q~ = a0 q_n - a1 q_{n-1} + b v_n + q_a a_n and v~ = a0 v_n - a1 v_{n-1} + v_a a_n + v_w w_n (accelerations a_n and
-w_n: of schemes that keep them), a step solves for v in
+w_n in acceleration-level schemes), a step solves for v in
 
     m M (v - v~) + f_int(q, v) = f(t_{n+1}),      q_{n+1} = q~ + d v,      d = dq/dv, m the mass factor.
 
@@ -27,14 +27,14 @@ __all__ = ["INTEGRATORS", "EnergyMomentum", "GeneralizedAlpha", "Integrator", "g
 SCHEMES = (BACKWARD_EULER, BDF2, EnergyMomentum(), GeneralizedAlpha(), STATIC)
 INTEGRATORS = {scheme.name: scheme for scheme in SCHEMES}
 CALL = re.compile(r"(\w+)\s*\((.*)\)")
-"""A name with options."""
+"""Pattern of a name with options."""
 
 
 def get(name: str | Integrator) -> Integrator:
-    """The integrator that is given, by its name, or by its name with options: "generalized_alpha(rho_inf=0.8)".
+    """Integrator from an instance, a name, or a name with options: "generalized_alpha(rho_inf=0.8)".
 
     Raises:
-        ModelError: no integrator has the name (they are listed), or it has no such option.
+        ModelError: an unknown name (the known ones are listed) or option.
     """
     if isinstance(name, Integrator):
         return name
@@ -48,7 +48,7 @@ def get(name: str | Integrator) -> Integrator:
 
 
 def _with_options(scheme: Integrator, text: str, inside: str) -> Integrator:
-    """An integrator of the same kind with the options of `name(option=number, ...)`."""
+    """Integrator of the same kind with the options of `name(option=number, ...)`."""
     kind: Any = type(scheme)
     known = list(inspect.signature(kind).parameters) if kind is not Integrator else []
     options: dict[str, float] = {}

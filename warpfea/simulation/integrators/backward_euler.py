@@ -1,4 +1,4 @@
-"""Backward Euler, Eq. (17), and the same form without inertia: the load steps of statics."""
+"""Backward Euler, Eq. (17), and its form without inertia: the load steps of statics."""
 
 import warp as wp
 

@@ -10,7 +10,7 @@ __all__ = ["BDF2", "bdf2", "bdf2_error"]
 
 @wp.func
 def bdf2(h: wp.float64, previous: wp.float64, parameter: wp.float64):
-    """Coefficients of BDF2 for the step h after a step `previous`; backward Euler where there is none before."""
+    """Coefficients of BDF2 for the step h after a step `previous`; backward Euler for the first step."""
     c = backward_euler(h, previous, parameter)
     if previous > wp.float64(0.0):
         one = wp.float64(1.0)
@@ -26,7 +26,7 @@ def bdf2(h: wp.float64, previous: wp.float64, parameter: wp.float64):
 
 @wp.func
 def bdf2_error(h: wp.float64, previous: wp.float64):
-    """Milne's device: what linear extrapolation of the velocities misses, for the third derivative q3 of q.
+    """Milne's device: error of linear extrapolation of the velocities, for the third derivative q3 of q.
 
     With w = h / previous the formula leaves h^3 (1 + w)^2 / (6 w (1 + 2 w)) q3, and v_{n+1} - v_n - w (v_n - v_{n-1})
     is h^2 (1 + 1/w) q3 / 2. The first step is backward Euler's.

@@ -1,11 +1,11 @@
-"""The conserving mid-point scheme of Simo and Tarnow (1992), with Gonzalez' discrete gradient (2000).
+"""Conserving mid-point scheme of Simo and Tarnow (1992), with Gonzalez' discrete gradient (2000).
 
-M (v - v_n)/h + f(q_n, q) = f(t_n + h/2) with q = q_n + h/2 (v_n + v), and internal forces that do exactly the work by
-which the strain energy changes: see kernels/elements/conserving.py. Constraints hold at the end of the step and act
-along their gradient in its middle.
+M (v - v_n)/h + f(q_n, q) = f(t_n + h/2) with q = q_n + h/2 (v_n + v), and internal forces whose work equals the change
+of strain energy exactly: see kernels/elements/conserving.py. Constraints hold at the end of the step and act along
+their gradient in its middle.
 
-With rho_inf < 1 stresses have (chi/2) C0 : (E_{n+1} - E_n) besides, chi = (1 - rho_inf)/(1 + rho_inf): the dissipation
-of stresses of the energy-decaying scheme of Armero and Romero (2001), without that of velocities.
+With rho_inf < 1 stresses include (chi/2) C0 : (E_{n+1} - E_n), chi = (1 - rho_inf)/(1 + rho_inf): the stress
+dissipation of the energy-decaying scheme of Armero and Romero (2001), without its velocity dissipation.
 """
 
 import math
@@ -31,11 +31,11 @@ def energy_momentum(h: wp.float64, previous: wp.float64, parameter: wp.float64):
 
 
 class EnergyMomentum(Integrator):
-    """Mid-point scheme that keeps both momenta, and energy too or loses some of it, never gaining any.
+    """Mid-point scheme that conserves both momenta and conserves or dissipates energy, never gaining any.
 
     Args:
-        rho_inf: factor by which a step damps strains that it does not resolve, 0 to 1: 1 keeps energy, of order 2; less
-            is of order 1 in deformations, and takes nothing from rigid motions.
+        rho_inf: damping factor of strains unresolved by the step, 0 to 1: 1 conserves energy, of order 2; less is of
+            order 1 in deformations, and leaves rigid motions undamped.
 
     Raises:
         ModelError: rho_inf is not between 0 and 1.
@@ -52,7 +52,7 @@ class EnergyMomentum(Integrator):
 
     @property
     def rho_inf(self) -> float:
-        """Factor on strains that a step does not resolve."""
+        """Damping factor of strains unresolved by the step."""
         return self.parameter
 
     @property

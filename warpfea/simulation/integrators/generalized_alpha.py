@@ -5,13 +5,13 @@
     (1 - am) a_{n+1} + am a_n = (1 - af) w_{n+1} + af w_n
     M w_{n+1} + f_int + J^T lambda = f at t_{n+1}
 
-The forces are in equilibrium with w = q'' at the end of the step; a are averages of w: a_n is of the time t_n + c h_n,
+The forces are in equilibrium with w = q'' at the end of the step; a are averages of w: a_n belongs to t_n + c h_n,
 c = am - af, with the step h_n that led there. With r = h_n / h and D = 1 + c - c r
 
     am = am_1 / D,  af = af_1,  gamma = (1/2 - c r) / D,  beta = gamma beta_1 / gamma_1,
 
-where index 1 is of equal steps (Chung and Hulbert), all averages are of those times, so that the order is two for any
-steps; dq/dv is h beta_1 / gamma_1, and stiff components decay for r from 1/4 to 4 and rho_inf below 1.
+where index 1 denotes equal steps (Chung and Hulbert), all averages belong to those times, so that the order is two for
+any steps; dq/dv is h beta_1 / gamma_1, and stiff components decay for r from 1/4 to 4 and rho_inf below 1.
 """
 
 import math
@@ -49,13 +49,13 @@ def generalized_alpha(h: wp.float64, previous: wp.float64, parameter: wp.float64
 
 
 class GeneralizedAlpha(Integrator):
-    """Generalized-alpha method, of the second order, with a chosen dissipation of high frequencies.
+    """Generalized-alpha method of second order with adjustable high-frequency dissipation.
 
     Args:
-        rho_inf: spectral radius at infinite frequency, 0 to 1: the factor by which a step damps what it does not
-            resolve. 1 conserves the energy of linear systems; models with joints or drives need less than 1. Bodies
-            that turn gain energy, by more the larger rho_inf is (Kuhl and Crisfield 1999): with 0.2 none up to 2 rad a
-            step, with 0.5 from 0.6 rad on, with 0.8 from 0.2 rad on.
+        rho_inf: spectral radius at infinite frequency, 0 to 1: damping factor per step of unresolved frequencies. 1
+            conserves the energy of linear systems; models with joints or drives need less than 1. Rotating bodies gain
+            energy, increasingly with rho_inf (Kuhl and Crisfield 1999): with 0.2 none up to 2 rad a step, with 0.5 from
+            0.6 rad on, with 0.8 from 0.2 rad on.
 
     Raises:
         ModelError: rho_inf is not between 0 and 1.

@@ -1,4 +1,4 @@
-"""What an integrator is: how q~ and v~ follow from the state, and what a step then solves."""
+"""Integrator definition: predictors q~, v~ and the step equation."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ __all__ = ["Integrator"]
 
 @dataclass(frozen=True)
 class Integrator:
-    """A time discretisation, see the folder's docstring for the step that it stands for.
+    """Time discretisation; see the folder's docstring for the step equation.
 
     Attributes:
-        name: how users select it.
+        name: name for users.
         coefficients: wp.func (h, previous h, parameter) -> `Coefficients` (kernels/step/control.py).
         order: order of convergence in h.
-        multistep: keeps the state before the last, q_{n-1} and v_{n-1}.
-        takes_velocity: q~ takes v_n.
+        multistep: uses the state before the last, q_{n-1} and v_{n-1}.
+        takes_velocity: q~ depends on v_n.
         midpoint: forces are those of the middle of the step, and conserve energy and momenta.
-        accelerated: keeps accelerations, algorithmic ones a_n and those of the equilibrium w_n, and so needs a start.
+        accelerated: acceleration-level scheme, with algorithmic accelerations a_n and those of the equilibrium w_n;
+            needs consistent initial values.
         estimate: wp.func (h, previous h) -> vec3d, the weights of v_{n+1}, v_n and v_{n-1}, of sum 0, that give the
-            local error in position, m; None: steps can't be adapted to it.
+            local error in position, m; None: no adaptive steps.
         static: no inertia; v is the displacement increment of a load step.
-        parameter: the number that `coefficients` gets, such as a spectral radius.
-        stabilise: N/m per kg, of statics: springs from the last equilibrium to the next, fading with the load.
+        parameter: argument of `coefficients`, such as a spectral radius.
+        stabilise: N/m per kg, statics: springs from the last equilibrium to the next, fading with the load.
     """
 
     name: str
@@ -36,23 +37,23 @@ class Integrator:
     accelerated: bool = False
     static: bool = False
     estimate: Any = field(default=None, compare=False)  # follows from the coefficients
-    # kernels don't depend on these
+    # no kernel depends on these
     parameter: float = field(default=0.0, compare=False)
     stabilise: float = field(default=0.0, compare=False)
 
     @property
     def label(self) -> str:
-        """Its name with the options that results depend on, as users may give it."""
+        """Name with the options that affect results, in the form that users may give."""
         return self.name
 
     @property
     def dissipation(self) -> float:
-        """chi of the dissipative mid-point scheme, see kernels/elements/conserving.py; 0 of others."""
+        """chi of the dissipative mid-point scheme, see kernels/elements/conserving.py; 0 for others."""
         return 0.0
 
     @property
     def kept(self) -> tuple[str, str]:
-        """Arrays of the state beside q_n and v_n that it takes: those of the step before, or accelerations."""
+        """State arrays besides q_n and v_n: those of the previous step, or accelerations."""
         if self.accelerated:
             return "algorithmic_acceleration", "acceleration"
         return ("previous_displacement", "previous_velocity") if self.multistep else ("displacement", "velocity")
