@@ -56,7 +56,7 @@ def test_a_simulation_says_what_to_write(sim, case):
     assert sim.steps == 0
 
 
-SAMPLED = r"Python functions do not run on the device: sample it, \(times, \[f\(t\) for t in times\]\).*@wp\.func"
+SAMPLED = r"is a Python function;.*do not run on the device: sample it, \(times, \[f\(t\) for t in times\]\).*@wp\.func"
 BUILD = {
     "lambda": (
         lambda b, bar: b.add_traction(bar.surface("x+"), lambda t: (0, 0, t)),

@@ -130,8 +130,8 @@ class ModelBuilder:
         """Add a shell of ANCF 3443 elements on the mid-surface of quads.
 
         Args:
-            mesh: file, Mesh or meshio.Mesh of quads, such as wf.mesh.grid; the director points to the side from
-                which the quads are clockwise, (X_1 - X_0) x (X_3 - X_0).
+            mesh: file, Mesh or meshio.Mesh of quads, such as wf.mesh.grid; the director of a quad is along
+                (X_1 - X_0) x (X_3 - X_0).
             thickness: m.
             material: one law, or laws by element group of the mesh.
             integration: "tied" (default with SVK; remedies against thickness and shear locking, and the shear factor
@@ -276,10 +276,9 @@ class ModelBuilder:
         Args:
             kind: "spherical", "universal", "revolute", "cylindrical", "translational", "fixed", or "distance" (a rod of
                 constant length between two points).
-            parent, child: wf.GROUND, a material point (body.at), nodes (body.nodes, beam.end), or a surface,
-                represented by its mean position and rotation. Attach rotational joints of solids to a surface or
-                several nodes: at a single point the stress is singular, and the joint softens as the mesh is
-                refined.
+            parent, child: wf.GROUND, a material point (body.at), nodes (body.nodes, beam.end), or a surface, by its
+                mean position and rotation. On a solid take a surface or several nodes: at one
+                point the stress is singular, and the joint softens as the mesh is refined.
             anchor: (3,) m, joint position in the reference; by default that of the child's handle. For a distance
                 joint with the ground: the rod's end there.
             axis: (3,) of the hinge or the slide, or the parent's axis of a universal joint.
