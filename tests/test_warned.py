@@ -59,10 +59,10 @@ def test_a_solid_that_locks(law):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"drive": (0.1, 0, 0)}, r"drive of 'x\+' on body 'bar': displacement moves nodes by 0.1 m in the first step"),
-        ({"drive": ([0, 1], [(0.01, 0, 0), (0.1, 0, 0)])}, r"displacement moves nodes by 0.01 m .* at t = 0 s"),
-        ({"drive": shake}, r"displacement moves nodes by 0.05 m in the first step"),
-        ({"turn": 0.3}, r"angle moves nodes by 0.0423 m in the first step"),
+        ({"drive": (0.1, 0, 0)}, r"initial jump of 0.1 m: drive of 'x\+' on body 'bar': displacement at t = 0 s"),
+        ({"drive": ([0, 1], [(0.01, 0, 0), (0.1, 0, 0)])}, r"jump of 0.01 m: .*displacement at t = 0 s"),
+        ({"drive": shake}, r"jump of 0.05 m: .*displacement at t = 0 s"),
+        ({"turn": 0.3}, r"jump of 0.0423 m: .*angle at t = 0 s"),
     ],
 )
 def test_a_drive_that_jumps_at_the_start(options, told):
@@ -113,7 +113,7 @@ def test_laws_that_are_over_where_they_end(shape, warned):
     law = (0.01 * S, shape[:, None] * (0.0, 0.0, -1.0))
     sim = wf.Simulation(bar(load=law), dt=1e-2)
     if warned:
-        with pytest.warns(wf.ModelWarning, match="time laws end before the run"):
+        with pytest.warns(wf.ModelWarning, match="time laws end before t_end"):
             sim.run(0.02)
     else:
         silent(lambda: sim.run(0.02))

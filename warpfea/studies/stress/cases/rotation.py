@@ -113,7 +113,7 @@ SCHEMES = (
     "backward_euler", "bdf2", "generalized_alpha", "generalized_alpha(rho_inf=0)", "energy_momentum",
     "energy_momentum(rho_inf=0.8)",
 )  # fmt: skip
-GROWN = {dtype: ("has added",) for dtype in ("float64", "float32")}
+GROWN = {dtype: ("energy gain",) for dtype in ("float64", "float32")}
 """How a scheme that adds energy is refused."""
 GROWTH = 0.1
 """Part of its energy that a rotating body may gain before it has to be refused."""
