@@ -84,7 +84,7 @@ def test_a_drive_that_begins_where_its_nodes_are():
 def test_a_law_that_ends_before_the_run():
     sim = wf.Simulation(bar(load=([0, 0.01], [(0, 0, 0), (0, 0, -1.0)])), dt=2e-3)
     silent(lambda: sim.run(0.01))
-    told = r"end before the run, at t = 0.014 s.*: traction on 'x\+' of body 'bar' \(t = 0.01 s\);.*two equal samples"
+    told = r"end before t_end = 0.014 s.*: traction on 'x\+' of body 'bar' \(t = 0.01 s\);.*two equal samples"
     with pytest.warns(wf.ModelWarning, match=told):
         sim.run(0.014)
     silent(lambda: sim.run(0.016))  # once
