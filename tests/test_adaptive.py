@@ -319,12 +319,12 @@ def test_a_whole_interval_has_always_the_same_bits():
         ({"dt": "auto", "error": float("nan")}, "needs error"),
         ({"dt": "auto", "error": 2.0}, "needs error"),
         ({"dt": "auto", "error": "1e-4"}, "needs error"),
-        ({"dt": "auto", "error": 1e-12}, "below what float64 resolves"),
+        ({"dt": "auto", "error": 1e-12}, "below float64 round-off"),
         ({"dt": 1e-3, "error": 1e-4}, "error = 0.0001 is for dt = 'auto'"),
         ({"dt": 1e-3, "interval": 1e-4}, "interval = 0.0001 is for dt = 'auto'"),
         ({"dt": "auto", "error": 1e-4, "interval": 0.0}, "interval = 0.0 must be"),
         ({"dt": "auto", "error": 1e-4, "horizon": -1.0}, "horizon = -1.0 must be"),
-        ({"dt": "auto", "error": 1e-4, "solver": "jacobi"}, "needs the solver 'newton-pcg'"),
+        ({"dt": "auto", "error": 1e-4, "solver": "jacobi"}, "needs solver 'newton-pcg'"),
     ],
 )
 def test_bad_input_is_refused_by_name(options, text):
