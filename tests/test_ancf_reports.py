@@ -201,7 +201,7 @@ def test_node_gradients_need_gradients():
     b = wf.ModelBuilder()
     body = b.add_solid(tets("T10"), material=SVK)
     sim = wf.Simulation(finalize(b), dt=1.0)
-    with pytest.raises(wf.ModelError, match="T10 has no gradients at its nodes"):
+    with pytest.raises(wf.ModelError, match="T10 has no nodal gradients"):
         sim.node_gradients(body)
 
 

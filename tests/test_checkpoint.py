@@ -254,7 +254,7 @@ def damaged(path, tmp_path, how):
         ("no totals", "totals"),
         ("shape", "velocity"),
         ("schema", "schema 9"),
-        ("old schema", "earlier version"),
+        ("old schema", "older version"),
     ],
 )
 def test_a_damaged_checkpoint_is_refused(small, tmp_path, how, word):

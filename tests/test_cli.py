@@ -262,7 +262,7 @@ CRUSHED += ["--device", "cpu", "--dt", "2e-3", "--t-end", "0.1"]
 def test_inversion_is_refused_or_told(folder, capfd):
     code, out, err = run(capfd, *CRUSHED, "--json", "a.json")
     assert code == 3
-    assert "an element turned inside out (J <= 0)" in err
+    assert "an element inverted (J <= 0)" in err
     assert json.loads((folder / "a.json").read_text())["min_J"] > 0
     assert "WARNING" not in out
     code, out, _ = run(capfd, *CRUSHED, "--inversion", "report", "--json", "a.json")

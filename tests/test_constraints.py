@@ -204,7 +204,7 @@ def test_an_open_joint_is_refused_in_dynamics_and_closed_by_statics():
     joint = b.add_constraint("PIN", points=(tip, (1, 0.1, 0.1)), value=(0, 0, 0.05), name="lift")
     b.add_probe("tip", tip)
     model = b.finalize(device="cpu")
-    with pytest.raises(wf.ConstraintError, match=r"'lift' is 0.05 m off at the start.*solve_static"):
+    with pytest.raises(wf.ConstraintError, match=r"'lift': initial violation 0.05 m.*solve_static"):
         wf.Simulation(model, dt=1e-3)
     static = wf.solve_static(model, load_steps=1)
     assert static.probe("tip").displacement[0, -1] == pytest.approx([0, 0, 0.05], abs=1e-7)
@@ -321,7 +321,7 @@ def test_a_reset_to_an_open_state_is_refused():
     model, _ = joined("spherical", ("ground", "surface"))
     sim = wf.Simulation(model, dt=0.01)
     moved_state = state_at(model, 0.3 + np.zeros((model.slots, 3)) * (model.slot_kind == 0)[:, None])
-    with pytest.raises(wf.ConstraintError, match="snap shut"):
+    with pytest.raises(wf.ConstraintError, match="initial violation"):
         sim.reset(state=moved_state)
 
 

@@ -459,5 +459,5 @@ def test_equal_controls_may_meet_on_a_component():
 
 
 def test_an_open_joint_is_told_at_the_start():
-    with pytest.raises(wf.ConstraintError, match="begin its drive at the present value"):
+    with pytest.raises(wf.ConstraintError, match="start its drive at the present value"):
         simulation("joint", wf.Control("c", initial=0.01))

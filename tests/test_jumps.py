@@ -38,7 +38,7 @@ def refusal(sim):
 
 def test_a_joint_that_jumps_is_named():
     text = refusal(crank([0.0, 2.5 * DT, 2.500001 * DT, 1.0], 4.0))
-    assert "a drive jumps within 3.91e-06 s: joint 'crank' by 4 rad" in text
+    assert "discontinuous drive within 3.91e-06 s: joint 'crank' by 4 rad" in text
 
 
 def test_an_even_turn_that_halving_resolves_is_none():
@@ -47,7 +47,7 @@ def test_an_even_turn_that_halving_resolves_is_none():
 
 def test_driven_nodes_that_jump_are_named_and_those_that_stay_are_not():
     text = refusal(moved([0.0, 2.5 * DT, 2.500001 * DT, 1.0], [0.0, 0.0, -0.6, -0.6]))
-    assert "jumps within 0.00025 s: the drive of body 'bar' by 0.6 m; give it a ramp" in text
+    assert "discontinuous drive within 0.00025 s: the drive of body 'bar' by 0.6 m: use a ramp" in text
     assert "'still'" not in text
 
 

@@ -190,7 +190,7 @@ def test_a_report_reads_until_the_next_step():
     assert kept.time == pytest.approx(2 * DT)
     sim.step()
     assert kept.time == pytest.approx(2 * DT)
-    with pytest.raises(wf.ModelError, match="the report of step 1 was not read before the simulation went on to 3"):
+    with pytest.raises(wf.ModelError, match=r"report of step 1 is no longer available \(simulation at step 3\)"):
         _ = first.time
     assert "step 1" in repr(first)
 
@@ -302,7 +302,7 @@ def test_a_reset_that_is_refused_leaves_nothing_behind():
     sim = wf.Simulation(model, state, dt=DT, **QUIET)
     sim.step(5)
     before = [values(sim, world) for world in range(2)]
-    with pytest.raises(wf.ConstraintError, match=r"'hook' is 0\.05 m off"):
+    with pytest.raises(wf.ConstraintError, match=r"'hook': initial violation 0\.05 m"):
         sim.reset(flags(0, of=2))
     assert all(same(values(sim, world), before[world]) for world in range(2))
 
@@ -552,7 +552,7 @@ def test_names_of_observations_are_checked(names, text):
         ({"dt": 1e-3, "t_end": [1.0]}, "t_end = .* 2 of them"),
         ({"dt": 1e-3, "t_end": np.inf}, "t_end = inf must be a finite time"),
         ({"dt": [1e-3, 2e-3], "integrator": "generalized_alpha(rho_inf=0.8)"}, "takes one step for all worlds"),
-        ({"dt": "auto", "error": 1e-4, "t_end": 1.0}, "only steps of a fixed size"),
+        ({"dt": "auto", "error": 1e-4, "t_end": 1.0}, "needs a fixed dt"),
     ],
 )
 def test_times_are_checked(options, text):
@@ -568,7 +568,7 @@ def test_resets_on_the_device_are_checked():
     for mask in (flags(0), wp.zeros(2, dtype=wp.float32, device="cpu")):
         with pytest.raises(wf.ModelError, match=r"reset: the mask is .* expected int32 or bool \(2,\) on cpu"):
             sim.reset(mask)
-    with pytest.raises(wf.ModelError, match="the state lacks 'status'"):
+    with pytest.raises(wf.ModelError, match="state lacks 'status'"):
         sim.reset(flags(0, of=2), model.state())
     for mask in (flags(0, of=2), [True, False]):
         with pytest.raises(wf.ModelError, match="of another model"):

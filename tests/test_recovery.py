@@ -180,7 +180,7 @@ def test_a_refusal_by_rounding_is_not_halved():
     bar = b.add_solid(wf.mesh.box((1, 0.01, 0.01), cells=(20, 1, 1), element="T10"), material=wf.SVK(E=2e11, nu=0.3))
     b.clamp(bar.nodes("x-"))
     b.add_traction(bar.surface("x+"), (0, 0, -2.5e5))
-    with pytest.raises(wf.ConvergenceError, match=r"float32 can't hold this case: .* after 0 halvings.*take float64"):
+    with pytest.raises(wf.ConvergenceError, match=r"float32 round-off limit reached.* after 0 halvings.*use float64"):
         wf.solve_static(b.finalize(device="cpu", dtype="float32"), load_steps=3)
 
 
@@ -198,17 +198,17 @@ def thin(element, dtype, device="cpu"):
 @pytest.mark.parametrize("preconditioner", ["banded", "two-level"])
 def test_forces_that_drown_in_rounding_are_refused_without_halving(element, preconditioner):
     solver = wf.NewtonPCG(max_pcg=2000, max_newton=50, preconditioner=preconditioner)
-    with pytest.raises(wf.ConvergenceError, match=r"float32 can't hold this case: .* after 0 halvings.*take float64"):
+    with pytest.raises(wf.ConvergenceError, match=r"float32 round-off limit reached.* after 0 halvings.*use float64"):
         wf.solve_static(thin(element, "float32"), load_steps=3, solver=solver)
 
 
 def test_work_that_is_spent_within_rounding_names_the_precision():
     solver = wf.NewtonPCG(max_work=9000, preconditioner="block-jacobi")
-    with pytest.raises(wf.ConvergenceError, match=r"float32 can't hold this case: .*max_work = 9000.*take float64"):
+    with pytest.raises(wf.ConvergenceError, match=r"float32 round-off limit reached: .*max_work = 9000.*use float64"):
         wf.solve_static(thin("T10", "float32"), load_steps=3, solver=solver)
     with pytest.raises(wf.ConvergenceError, match="max_work = 9000") as caught:
         wf.solve_static(thin("T10", "float64"), load_steps=3, solver=solver)
-    assert "can't hold" not in str(caught.value)
+    assert "round-off" not in str(caught.value)
 
 
 def truss(kind, rise, side, E):
@@ -271,7 +271,7 @@ def test_work_ends_within_a_solve(preconditioner, most, device):
         load_steps=1,
         solver=wf.NewtonPCG(max_work=most, max_pcg=20000, preconditioner=preconditioner),
     )
-    with pytest.raises(wf.ConvergenceError, match=f"has taken {most} iterations .* raise max_work = {most}"):
+    with pytest.raises(wf.ConvergenceError, match=f"took {most} CG iterations .* raise max_work = {most}"):
         sim.step()
 
 

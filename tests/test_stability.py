@@ -99,7 +99,7 @@ def test_a_perfect_column_on_a_gpu(factor, dtype):
 def test_a_buckled_column_in_single_precision_is_refused():
     """On 8934ce7 it is accepted 1.4e-3 m off the straight line, floor 3.9e-4; with 1e-4 across float64 finds 0.29 m."""
     model, _ = column(1.01, "float32", across=1e-5)
-    with pytest.raises(wf.ConvergenceError, match="float32 can't hold this case"):
+    with pytest.raises(wf.ConvergenceError, match="float32 round-off limit reached"):
         solve(model)
 
 
@@ -132,7 +132,7 @@ def test_it_can_be_left_out(monkeypatch):
     found = wf.solve_static(model, unstable="ignore")
     assert found.report.stable is None
     assert found.stability is None
-    with pytest.raises(wf.ModelError, match="has looked for no unstable mode"):
+    with pytest.raises(wf.ModelError, match="no stability analysis was done"):
         found.perturbed(1.0)
 
 
@@ -213,9 +213,9 @@ def pressed(where):
     [
         (lambda: block(0.0, True), True, ""),
         (lambda: block(0.3, True), None, "contact 'pad' has friction"),
-        (lambda: block(0.0, False), None, "a motion meets no resistance above rounding"),
+        (lambda: block(0.0, False), None, "zero stiffness within round-off"),
         (lambda: pressed("all"), True, ""),
-        (lambda: pressed("side"), None, "no potential is known of: followers"),
+        (lambda: pressed("side"), None, "non-conservative forces: followers"),
     ],
 )  # fmt: skip
 def test_what_can_be_known(make, stable, reason):

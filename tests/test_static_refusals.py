@@ -27,10 +27,10 @@ def bar(load, **law):
 @pytest.mark.parametrize(
     ("model", "text"),
     [
-        (lambda: bar("traction"), "the traction of 1e+09 Pa on body 'bar' is 100 times its E = 1e+07 Pa"),
-        (lambda: bar("force"), "the point load of 1e+07 N on body 'bar', as a stress, is 100 times its E = 1e+07 Pa"),
-        (lambda: bar("pressure"), "the pressure of 1e+09 Pa on body 'bar' is 100 times its E = 1e+07 Pa"),
-        (lambda: bar("weight", E=1e3), "the weight of 9.81e+03 Pa on body 'bar' is 9.81 times its E = 1e+03 Pa"),
+        (lambda: bar("traction"), "the traction of 1e+09 Pa on body 'bar' is 100 times E = 1e+07 Pa"),
+        (lambda: bar("force"), "the point load of 1e+07 N on body 'bar', as a stress, is 100 times E = 1e+07 Pa"),
+        (lambda: bar("pressure"), "the pressure of 1e+09 Pa on body 'bar' is 100 times E = 1e+07 Pa"),
+        (lambda: bar("weight", E=1e3), "the weight of 9.81e+03 Pa on body 'bar' is 9.81 times E = 1e+03 Pa"),
     ],
 )  # fmt: skip
 def test_an_overload_is_named(model, text):
@@ -50,7 +50,7 @@ def test_a_load_that_it_can_carry_is_not():
     solver = wf.NewtonPCG(max_work=3, max_halvings=0, preconditioner="block-jacobi")
     with pytest.raises(wf.ConvergenceError, match=r"raise max_work = 3 of NewtonPCG, or look for slivers") as caught:
         wf.solve_static(b.finalize(device="cpu"), load_steps=1, solver=solver)
-    assert "times its E" not in str(caught.value)
+    assert "times E" not in str(caught.value)
 
 
 def test_a_loose_piece_is_named_with_its_place():
@@ -77,10 +77,10 @@ def test_newton_iterations_count_as_work():
     body = b.add_solid(ball, material=wf.SVK(E=1e6, nu=0.3, density=1000.0), name="ball")
     b.add_contact(body, b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.0, model="sphere", radius=0.05, name="pad")
     solver = wf.NewtonPCG(max_newton=50, max_pcg=20000, max_work=10_000)
-    text = r"iterations of Newton's method are all that max_work = 10000 allows"
-    with pytest.raises(wf.ConvergenceError, match=rf"contact 'pad' has one place.*model='patch'.*{text}") as caught:
+    text = r"Newton iterations used up max_work = 10000"
+    with pytest.raises(wf.ConvergenceError, match=rf"point of 'pad' jumps.*model='patch'.*{text}") as caught:
         wf.solve_static(b.finalize(device="cpu"), stabilise=True, solver=solver)
-    spent = int(str(caught.value).split("; its ")[1].split(" ")[0])
+    spent = int(str(caught.value).split(" Newton iterations")[0].rsplit(" ", 1)[1])
     assert 100 <= spent <= 100 + 4 * 50
     assert wf.NewtonPCG().most_newton(True) == 2000
     assert wf.NewtonPCG().most_newton(False) == 10_000

@@ -61,10 +61,10 @@ def test_a_solid_that_locks(law):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"drive": (0.1, 0, 0)}, r"drive of 'x\+' on body 'bar': displacement moves nodes by 0.1 m in the first step"),
-        ({"drive": ([0, 1], [(0.01, 0, 0), (0.1, 0, 0)])}, r"displacement moves nodes by 0.01 m .* at t = 0 s"),
-        ({"drive": shake}, r"displacement moves nodes by 0.05 m in the first step"),
-        ({"turn": 0.3}, r"angle moves nodes by 0.0423 m in the first step"),
+        ({"drive": (0.1, 0, 0)}, r"initial jump of 0.1 m: drive of 'x\+' on body 'bar': displacement at t = 0 s"),
+        ({"drive": ([0, 1], [(0.01, 0, 0), (0.1, 0, 0)])}, r"jump of 0.01 m: .*displacement at t = 0 s"),
+        ({"drive": shake}, r"jump of 0.05 m: .*displacement at t = 0 s"),
+        ({"turn": 0.3}, r"jump of 0.0423 m: .*angle at t = 0 s"),
     ],
 )
 def test_a_drive_that_jumps_at_the_start(options, told):
@@ -86,7 +86,7 @@ def test_a_drive_that_begins_where_its_nodes_are():
 def test_a_law_that_ends_before_the_run():
     sim = wf.Simulation(bar(load=([0, 0.01], [(0, 0, 0), (0, 0, -1.0)])), dt=2e-3)
     silent(lambda: sim.run(0.01))
-    told = r"end before the run, at t = 0.014 s.*: traction on 'x\+' of body 'bar' \(t = 0.01 s\);.*two equal samples"
+    told = r"end before t_end = 0.014 s.*: traction on 'x\+' of body 'bar' \(t = 0.01 s\);.*two equal samples"
     with pytest.warns(wf.ModelWarning, match=told):
         sim.run(0.014)
     silent(lambda: sim.run(0.016))  # once
@@ -115,7 +115,7 @@ def test_laws_that_are_over_where_they_end(shape, warned):
     law = (0.01 * S, shape[:, None] * (0.0, 0.0, -1.0))
     sim = wf.Simulation(bar(load=law), dt=1e-2)
     if warned:
-        with pytest.warns(wf.ModelWarning, match="time laws end before the run"):
+        with pytest.warns(wf.ModelWarning, match="time laws end before t_end"):
             sim.run(0.02)
     else:
         silent(lambda: sim.run(0.02))

@@ -79,7 +79,7 @@ def adapt_of(
         )
     least = LEAST[model.dtype]
     if error < least:
-        finer = "; take float64" if model.dtype == "float32" else ""
+        finer = "; use float64" if model.dtype == "float32" else ""
         raise ModelError(f"error = {error!r} is below {model.dtype} round-off ({least:g} of the model size){finer}")
     return Adapt(float(error), interval, horizon)
 

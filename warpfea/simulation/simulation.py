@@ -130,7 +130,7 @@ class Simulation(Digests):
             check_times("dt", dt, model, positive=True)
         if t_end is not None:
             if adapt or scheme.static:
-                raise ModelError(f"t_end = {t_end!r}: t_end per world needs a fixed dt; use run(t_end)")
+                raise ModelError(f"t_end = {t_end!r}: t_end of Simulation needs a fixed dt; use run(t_end)")
             check_times("t_end", t_end, model)
         # initial accelerations are computed on the host
         quiet = on_failure == "freeze" and not record and not (adapt or scheme.accelerated or scheme.static)

@@ -21,7 +21,7 @@ GROUP = "contact"
 SIDE, DENSITY, G = 0.1, 1000.0, 9.81
 MODULI, STEPS = (1e4, 1e6, 1e8, 1e11), (1e-5, 1e-3, 1e-2)
 GRID = tuple((E, h) for E in MODULI for h in STEPS)
-NAMED = {dtype: ["collider", "inside out", "J <= 0"] for dtype in DTYPES}
+NAMED = {dtype: ["collider", "inverted", "J <= 0"] for dtype in DTYPES}
 SINGLE = {"float32": ["float32"]}
 FAST = 100.0
 """Speed of impacts, m/s."""

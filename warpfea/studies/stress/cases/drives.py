@@ -11,7 +11,7 @@ import warpfea as wf
 from ..build import beam, off, solve, step
 from ..case import Answer, Setting, case
 
-NAMED = ["'crank'", "drive", "inside out"]
+NAMED = ["'crank'", "drive", "inverted"]
 JUMP_STEP = 1e-3
 """Step size, s."""
 WITHIN = {"ramp": (2.0, 3.0), "jump": (2.5, 2.500001)}

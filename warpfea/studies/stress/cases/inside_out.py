@@ -17,7 +17,7 @@ PULLED = CELLS | {"T10": (10, 1, 1), "FN18": (10, 1, 1)}
 """Cells of the neo-Hookean bar stretched tenfold, which takes minutes with finer ones."""
 SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 NEO_HOOKEAN = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
-REASONS = ["inside out", "unstable there"]
+REASONS = ["inverted", "unstable equilibrium"]
 """Accepted refusal: a limit point past which a bar snaps into an inverted state."""
 INSIDE_OUT = {"float64": REASONS, "float32": [*REASONS, "float32"]}
 COARSE = {"float32": ["float32"]}

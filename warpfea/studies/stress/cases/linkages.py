@@ -59,7 +59,7 @@ def _pendulum(masses: Any, angle: float, times: np.ndarray) -> np.ndarray:
 
 
 @case("mass-ratio", "Joints", values=("light-heavy", "heavy-light"), quick="both",
-      refusal={"float32": ("float32 can't hold this case",)})  # fmt: skip
+      refusal={"float32": ("float32 round-off limit reached",)})  # fmt: skip
 def mass_ratio(setting: Setting, value: str) -> Answer:
     """Double pendulum with link masses 1 : 1e6, from 45 degrees for 1 s, against rigid links."""
     densities = [LIGHT * (RATIO if word == "heavy" else 1.0) for word in value.split("-")]

@@ -19,7 +19,7 @@ from .contact import Watched, corner_down, edge_down, exact, momentum, total
 
 GROUP = "pairs"
 SIDE, DENSITY, G = 0.1, 1000.0, 9.81
-NAMED = {dtype: ["through body", "inside out", "J <= 0"] for dtype in DTYPES}
+NAMED = {dtype: ["through body", "inverted", "J <= 0"] for dtype in DTYPES}
 NAMED["float32"].append("float32")
 SINGLE = {"float32": ["float32"]}
 FAST = 100.0

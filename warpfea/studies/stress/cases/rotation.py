@@ -114,7 +114,7 @@ SCHEMES = (
     "backward_euler", "bdf2", "generalized_alpha", "generalized_alpha(rho_inf=0)", "energy_momentum",
     "energy_momentum(rho_inf=0.8)",
 )  # fmt: skip
-GROWN = {dtype: ("has added",) for dtype in ("float64", "float32")}
+GROWN = {dtype: ("energy gain",) for dtype in ("float64", "float32")}
 """Error texts for a scheme that adds energy."""
 GROWTH = 0.1
 """Relative energy gain of a rotating body above which the scheme must be refused."""
