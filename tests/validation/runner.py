@@ -154,7 +154,7 @@ def run(table: Table, given: Run, only: Sequence[str] | None = None, words: Sequ
                 content["parts"][name] = part | _origin(words, given, table)
             else:
                 content[name] = given.made[name]
-            if given.out is not None:
+            if given.out is not None and (not given.labels or any(given.made.values())):
                 write_json(str(given.out), plain(content))
     if given.labels and not any(given.made.values()):
         raise UsageError(f"--rows {','.join(given.labels)}: no such row")

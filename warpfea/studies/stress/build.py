@@ -14,21 +14,10 @@ from warpfea.simulation.statics import StaticResult
 
 from .case import Answer, Setting
 
-__all__ = [
-    "BUILT_IN",
-    "DOWN",
-    "REFINED",
-    "SOUND",
-    "STEEL",
-    "Count",
-    "Solved",
-    "bar",
-    "beam",
-    "off",
-    "solve",
-    "step",
-]
+__all__ = ["BUILT_IN", "DOWN", "REFINED", "SOUND", "STEEL", "Count", "Solved", "X", "Y", "Z", "bar", "beam", "finalize",
+           "off", "put", "solve"]  # fmt: skip
 
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 DOWN = (0.0, 0.0, -9.81)
 STEEL = wf.SVK(E=2e11, nu=0.3, density=7800.0)
 SOUND = 1e-12
@@ -73,33 +62,55 @@ def beam(
 
 @dataclass
 class Count(Output):
-    """Iterations and other numbers of all steps so far, the worst world's; an output, or fed by `add`."""
+    """Iterations and other numbers of all steps so far; an output of `run` and `solve_static`, or fed by `step`.
+
+    Attributes:
+        newton, pcg, halvings: sums, of the worst world; worst_newton: of a step.
+        min_J: the smallest, of worlds that have not failed.
+        floor: the largest; last_floor and sum_of_floors: of the last step and of all.
+        violation: the largest of constraints over the model's size; None without constraints.
+        seen: the last report counted.
+    """
 
     newton: int = 0
     pcg: int = 0
     halvings: int = 0
     worst_newton: int = 0
-    violation: float = 0.0
     min_J: float = np.inf
     floor: float = 0.0
     last_floor: float = 0.0
     sum_of_floors: float = 0.0
-    steps: int = 0
+    violation: float | None = None
     seen: Any = field(default=None, repr=False)
 
-    def add(self, report: Any, size: float) -> None:
-        """Take a step's report; `size` of the model, m."""
-        self.steps += 1
+    def add(self, sim: Any) -> None:
+        """Count the last step of a simulation."""
+        report = self.seen = sim.last
         self.newton += int(report.newton.max())
         self.pcg += int(report.pcg.max())
         self.worst_newton = max(self.worst_newton, int(report.newton.max()))
         self.halvings += int(report.halvings.max())
-        self.violation = max(self.violation, float(report.violation.max()) / size)
-        self.min_J = min(self.min_J, float(report.min_J.min()))
-        floor = getattr(report, "floor", None)
-        self.last_floor = 0.0 if floor is None else float(np.max(floor))
+        self.min_J = min(self.min_J, float(report.min_J[report.status == 0].min(initial=np.inf)))
+        self.last_floor = float(np.max(report.floor))
         self.floor = max(self.floor, self.last_floor)
         self.sum_of_floors += self.last_floor
+        if sim.model.constraints is not None:
+            self.violation = max(self.violation or 0.0, float(report.violation.max()) / sim.model.size)
+
+    def step(self, sim: wf.Simulation, steps: int = 1) -> wf.StepReport:
+        """Do steps one by one and count them; the last report."""
+        for _ in range(steps):
+            report = sim.step()
+            self.add(sim)
+        return report
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Those of an Answer."""
+        return {
+            "newton": self.newton, "pcg": self.pcg, "halvings": self.halvings, "floor": self.floor,
+            "min_J": None if self.min_J == np.inf else float(self.min_J), "violation": self.violation,
+        }  # fmt: skip
 
     def answer(
         self, error: float, bound: float, reference: str, *, low: float | None = SOUND, told: float = 0.0, **more: Any
@@ -117,10 +128,7 @@ class Count(Output):
             limits["J short of its least"] = (low - self.min_J, 0.0)
         if told > 0.0:
             limits["error over the floor told"] = (error, 3.0 * told)
-        return Answer(
-            float(error), bound, reference, newton=self.newton, pcg=self.pcg, halvings=self.halvings, limits=limits,
-            violation=self.violation or None, min_J=float(self.min_J), floor=self.floor, **more,
-        )  # fmt: skip
+        return Answer(float(error), bound, reference, limits=limits, **self.fields, **more)
 
     def open(self, sim: Any) -> None:
         """Nothing to prepare."""
@@ -128,8 +136,7 @@ class Count(Output):
     def write(self, sim: Any) -> None:
         """Take the step that was done since the last call."""
         if sim.last is not None and sim.last is not self.seen:
-            self.seen = sim.last
-            self.add(sim.last, sim.model.size)
+            self.add(sim)
 
     def close(self, sim: Any) -> None:
         """Nothing to finish."""
@@ -151,20 +158,21 @@ class Solved:
         return np.asarray(self.result.probe("tip").displacement[0, -1], dtype=float)
 
 
-def solve(b: wf.ModelBuilder, setting: Setting, dtype: str | None = None, **options: Any) -> Solved:
-    """`solve_static` with these options, in the setting's precision or in another."""
-    count = Count()
-    model = b.finalize(device=setting.device, dtype=dtype or setting.dtype)
-    result = wf.solve_static(model, outputs=[count], **options)
-    return Solved(result, count)
+def finalize(b: wf.ModelBuilder, setting: Setting, worlds: int = 1) -> wf.Model:
+    """The model on the setting's device, in its precision."""
+    return b.finalize(device=setting.device, dtype=setting.dtype, worlds=worlds)
 
 
-def step(sim: wf.Simulation, steps: int, count: Count | None = None) -> Count:
-    """Do steps one by one, counted."""
+def solve(b: wf.ModelBuilder, setting: Setting, count: Count | None = None, **options: Any) -> Solved:
+    """`solve_static` with these options, counted; `count` goes on from earlier solutions."""
     count = count or Count()
-    for _ in range(steps):
-        count.add(sim.step(), sim.model.size)
-    return count
+    return Solved(wf.solve_static(finalize(b, setting), outputs=[count], **options), count)
+
+
+def put(state: Any, values: np.ndarray, name: str = "displacement") -> None:
+    """Set an array of a state in all worlds, values (slots, 3)."""
+    array = getattr(state, name)
+    array.assign(np.broadcast_to(values, (*array.shape, 3)).astype(array.numpy().dtype))
 
 
 def off(value: Any, reference: Any, scale: float | None = None) -> float:

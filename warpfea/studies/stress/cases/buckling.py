@@ -8,8 +8,8 @@ import numpy as np
 
 import warpfea as wf
 
+from ..build import Count, Z, finalize
 from ..case import Answer, Setting, case
-from ._common import Effort, Z, finalize
 
 GROUP = "Stability"
 MODULUS, LENGTH, SIDE, THICKNESS = 2e11, 1.0, 0.02, 0.01
@@ -19,15 +19,15 @@ PUSH = 1e-5
 
 def _judged(b: wf.ModelBuilder, setting: Setting, stable: bool, reference: str) -> Answer:
     """Error 0 where statics says so, 1 where it says the other and 0.5 where it does not know."""
-    effort = Effort()
+    count = Count()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", wf.StabilityWarning)
-        found = wf.solve_static(finalize(b, setting), outputs=[effort])
+        found = wf.solve_static(finalize(b, setting), outputs=[count])
     assert found.stability is not None
     said = found.stability.stable[0]
     error = 0.5 if said is None else float(said is not stable)
     note = f"{found.stability.text} {found.stability.reasons[0]}, {int(found.stability.iterations[0])} products"
-    return Answer(error, 0.1, reference, **effort.told, note=note)
+    return Answer(error, 0.1, reference, **count.fields, note=note)
 
 
 @case("buckling-column", GROUP, values=(0.9, 1.1, 10.0), quick="both")
@@ -53,14 +53,14 @@ def pushed(setting: Setting, factor: float) -> Answer:
     b.clamp(body.start, slots="position+section")
     b.add_point_load(body.end, (-load, 0.0, PUSH * load))
     b.add_probe("tip", body.end)
-    effort = Effort()
+    count = Count()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", wf.StabilityWarning)
-        found = wf.solve_static(finalize(b, setting), outputs=[effort])
+        found = wf.solve_static(finalize(b, setting), outputs=[count])
     side = abs(float(found.probe("tip").displacement[0, -1, 2])) / LENGTH
     told = any(issubclass(w.category, wf.StabilityWarning) for w in said)
     note = f"{side:.2g} L to the side, {'un' if told else ''}stable"
-    return Answer(0.0 if told or side > 0.1 else 1.0, 0.1, "Euler", **effort.told, note=note)
+    return Answer(0.0 if told or side > 0.1 else 1.0, 0.1, "Euler", **count.fields, note=note)
 
 
 @case("buckling-plate", GROUP, values=(0.9, 1.1, 1.5), quick="both")
