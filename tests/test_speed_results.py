@@ -197,10 +197,7 @@ def test_piles_beside_the_peer(pairs, label):
     assert pairs[label]["times_faster"] >= pairs[label]["wanted"]
 
 
-@pytest.mark.parametrize(
-    "label",
-    [f"pile-{cells}-{kind}" for cells in (4, 10, 20) for kind in ("tight", "loose")],
-)
+@pytest.mark.parametrize("label", [f"pile-{cells}-{kind}" for cells in (4, 10, 20) for kind in ("tight", "loose")])
 def test_piles_are_what_was_asked(pairs, label):
     row = pairs[label]
     assert row["deepest"] <= 2e-3
