@@ -9,12 +9,15 @@ here and from 1 in the paper. Conventions:
   the positions at the centroids of faces 123, 124, 234, 134: the order of `ancf_solid.FACES`.
 - Cartesian slots: at corner i r, r_x, r_y, r_z, then the same centroids: the library's order already.
 
-The appendix leaves out the definition of the volume gradients, the g_k of A.1 and the matrix T of S* = S T. They are
-derived here: g_k from the pattern of A.1, the gradients and T from A.1 against A.3.
+The appendix leaves out the definition of the volume gradients, the g_k of A.1, the matrix T of S* = S T and the
+coefficients of A.15. They are derived here: g_k from the pattern of A.1, the gradients and T from A.1 against A.3,
+A.15 by re-expansion.
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -22,7 +25,7 @@ import numpy as np
 from warpfea.elements.ancf_solid import CORNERS, FACES
 
 PRINTED = 2.0 / 81.0
-"""The face-centroid coefficient c of A.2, A.4 and A.5; 1/18 in its place holds all quadratics (FN18)."""
+"""Face-centroid coefficient c of A.2, A.4 and A.5; 1/18 in its place reproduces all quadratics (FN18)."""
 
 # A.1 as printed, counting from 1: the slots along edges are g_a/3 - (g_b + g_c)/6 with (a, b, c) of this table, row by
 # corner. A.2 adds c (s_b + s_c) to the same slots.
@@ -54,7 +57,7 @@ POWERS = np.array(
 
 
 def _others(i: int) -> tuple[int, int, int]:
-    """The corners that i's edges lead to, in the order of the slots."""
+    """Corners at the ends of i's edges, in the order of the slots."""
     return (i + 1) % 4, (i + 2) % 4, (i + 3) % 4
 
 
@@ -119,7 +122,7 @@ def bernstein(lam: np.ndarray) -> np.ndarray:
 def bezier_map(c: float | None = None) -> np.ndarray:
     """Control points from nodal coordinates in volume slots, M of S = B M: (20, 20) of ENMC, or (20, 16) of FN with c.
 
-    Not read off A.1 but derived from what control points mean: r_i at corners, r_i + r_(i -> j) / 3 on edges, and on
+    Derived from the meaning of control points, not from A.1: r_i at corners, r_i + r_(i -> j) / 3 on edges, and on
     faces the point that puts the cubic's centroid at r_c; for FN, r_c = sum r_i / 3 + c sum r_(i -> j) over the face.
     """
     M = np.zeros((20, 20 if c is None else 16))
@@ -240,6 +243,56 @@ def library_transformation(slots: int = 20) -> np.ndarray:
     return transformation(CORNERS, slots)
 
 
+# --- incomplete polynomials ---------------------------------------------------------------------------------------
+
+
+def incomplete_basis(lam: np.ndarray) -> np.ndarray:
+    """h_1 .. h_16 of A.14, a basis of FN's functions with c = 2/81: (Q, 4) -> (Q, 16)."""
+    out = []
+    for i in range(4):
+        p, (q, r, s) = lam[:, i], (lam[:, n] for n in _others(i))
+        out.append(p * (p**2 + 4.0 * (q * r + s * (q + r))))
+    for i, j in PAIRS:
+        p, q = lam[:, i], lam[:, j]
+        out.append(p * q * (3.0 * p - sum(lam[:, n] for n in range(4) if n not in (i, j))))
+    return np.stack(out, axis=1)
+
+
+def fn_in_incomplete_basis() -> np.ndarray:
+    """(16, 16) R of S = h R, FN's volume functions (c = 2/81) in the basis A.14, by least squares over all cubics.
+
+    Not printed. In closed form s_i = h_i + sum over i's edges of h_(i -> j), and s_(i -> j) = h_(i -> j) / 3.
+    """
+    return np.linalg.lstsq(bezier_coefficients(incomplete_basis), bezier_coefficients(fn_volume), rcond=None)[0]
+
+
 def power_basis(points: np.ndarray) -> np.ndarray:
     """b_1 .. b_20 of A.15, monomials of x, y, z: (Q, 3) -> (Q, 20)."""
     return np.prod(points[:, None, :] ** POWERS, axis=2)
+
+
+@functools.cache
+def _products() -> np.ndarray:
+    """(4, 4, 4) place in A.15's order of the product of three terms, each one of 1, x, y, z."""
+    place = {tuple(p): n for n, p in enumerate(POWERS.tolist())}
+    entries = [place[t.count(1), t.count(2), t.count(3)] for t in itertools.product(range(4), repeat=3)]
+    return np.array(entries).reshape(4, 4, 4)
+
+
+def power_map(corners: np.ndarray) -> np.ndarray:
+    """(20, 20) P of B = b P, Bernstein polynomials of a tetrahedron (4, 3) in monomials, by multiplying A.13 out."""
+    forms = _linear_forms(corners)
+    P = np.zeros((20, 20))
+    for k, exponents in enumerate(LATTICE):
+        u, v, w = forms[np.repeat(np.arange(4), exponents)]
+        np.add.at(P[:, k], _products(), _MULTIPLICITY[k] * np.einsum("a,b,c->abc", u, v, w))
+    return P
+
+
+def incomplete_coefficients(corners: np.ndarray) -> np.ndarray:
+    """(16, 20) a of A.15, h_i = sum_j a_(i,j) b_j, for a tetrahedron (4, 3); units length^-degree of each b_j.
+
+    Not printed ("can be systematically defined"), and not A.11's a_(i,j), whose letter it shares: h re-expanded through
+    Bernstein polynomials, which is better conditioned than a fit of monomials.
+    """
+    return (power_map(corners) @ bezier_coefficients(incomplete_basis)).T

@@ -186,8 +186,45 @@ def test_library_functions(corners, c, data):
     assert data.error(gradient(functions, points) @ frame, ds) < TOLERANCE
 
 
+def test_incomplete_basis(ref, data):
+    h = T.bezier_coefficients(T.incomplete_basis)
+    fn, fn18 = (T.bezier_coefficients(functools.partial(T.fn_volume, c=c)) for c in FACTORS)
+    assert {"rank_h": rank(h), "rank_FN": rank(fn), "rank_union": rank(h, fn)} == ref["A14"]
+    assert rank(fn18) == 16
+    assert rank(h, fn18) == 20  # A.14 is the basis of the printed factor only
+
+    R = T.fn_in_incomplete_basis()
+    assert data.error(T.incomplete_basis(LAMBDA) @ R, T.fn_volume(LAMBDA)) < TOLERANCE
+    closed = np.zeros((16, 16))
+    closed[range(4), range(0, 16, 4)] = 1.0
+    for k, (i, j) in enumerate(T.PAIRS, start=4):
+        closed[k, 4 * i] = 1.0
+        closed[k, 4 * i + (j - i) % 4] = 1.0 / 3.0
+    assert data.error(R, closed) < TOLERANCE
+
+
+def test_incomplete_coefficients(corners, data):
+    points = LAMBDA @ corners
+    b = T.power_basis(points)
+    x, y, z = points.T
+    assert (
+        data.error(b[:, [13, 14, 15, 16, 17, 18]].T, [x * x * y, y * y * x, y * y * z, z * z * y, x * x * z, z * z * x])
+        < TOLERANCE
+    )
+    assert data.error(b[:, [0, 4, 7, 8, 9, 12, 19]].T, [x**0, x * x, x * y, y * z, x * z, z**3, x * y * z]) < TOLERANCE
+    assert data.error(b @ T.power_map(corners), T.bernstein(LAMBDA)) < TOLERANCE
+    a = T.incomplete_coefficients(corners)
+    assert data.error(b @ a.T, T.incomplete_basis(LAMBDA)) < TOLERANCE
+    # from there to FN with Cartesian slots
+    fn = b @ a.T @ T.fn_in_incomplete_basis() @ T.transformation(corners, 16)
+    assert data.error(fn, T.fn_cartesian(LAMBDA, corners)) < TOLERANCE
+    # what the paper says of it: 1, x, y, z are there
+    assert rank(a.T, np.eye(20)[:, :4]) == 16
+
+
 @pytest.mark.parametrize(
-    ("c", "key"), [(None, "ENMC_space"), (FACTORS[0], "FN_space"), (FACTORS[1], "FN_space_with_1_18_instead_of_2_81")]
+    ("c", "key"),
+    [(None, "ENMC_space"), (FACTORS[0], "FN_space"), (FACTORS[1], "FN_space_with_1_18_instead_of_2_81")],
 )
 def test_dimensions_of_the_spaces(c, key, ref):
     functions = T.enmc_volume if c is None else functools.partial(T.fn_volume, c=c)
