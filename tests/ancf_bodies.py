@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from element_meshes import rotation
 
 import warpfea as wf
 from warpfea.model.discretisation import element_functions
@@ -15,13 +16,6 @@ E_MODULUS, NU, RHO = 1e6, 0.3, 7.0
 SVK = wf.SVK(E=E_MODULUS, nu=NU, density=RHO)
 SECTION = wf.Rectangle(0.15, 0.1)
 A = np.array([[1.1, 0.3, -0.1], [0.05, 0.9, 0.1], [-0.1, 0.2, 1.2]])
-
-
-def rotation(angle, axis=(1.0, -2.0, 0.5)):
-    """Rotation matrix (Rodrigues), angle in degrees."""
-    a, (x, y, z) = math.radians(angle), np.array(axis) / np.linalg.norm(axis)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(a) * K + (1 - math.cos(a)) * K @ K
 
 
 TURN = rotation(50.0, (1.0, 2.0, -0.7))

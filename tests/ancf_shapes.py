@@ -7,23 +7,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from ancf_bodies import SHIFT, SVK, TURN, ball, placed, rolled
 
 import warpfea as wf
 from warpfea import elements
-
-RHO, E_MODULUS = 7.0, 1e6
-SVK = wf.SVK(E=E_MODULUS, nu=0.3, density=RHO)
-
-
-def rotation(angle, axis=(1.0, -2.0, 0.5)):
-    """Rotation matrix (Rodrigues), angle in degrees."""
-    a, (x, y, z) = math.radians(angle), np.array(axis) / np.linalg.norm(axis)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(a) * K + (1 - math.cos(a)) * K @ K
-
-
-TURN = rotation(50.0, (1.0, 2.0, -0.7))
-SHIFT = np.array([2.0, -1.0, 0.5])
 
 
 def lifted(mesh, amount=0.2, plane=False, seed=0):
@@ -71,16 +58,8 @@ def shell(map=None, distort=False, normals=None):
     return make
 
 
-def placed(X):
-    return X @ TURN.T + SHIFT
-
-
 def skew(X):
     return X @ np.array([[1.3, 0.2, 0.0], [0.5, 0.8, 0.0], [0.0, 0.0, 1.0]])
-
-
-def rolled(X):
-    return np.column_stack([np.sin(X[:, 0]), X[:, 1], np.cos(X[:, 0])])
 
 
 def corner_moved(X):
@@ -102,10 +81,6 @@ def solid(element, map=None, source=None):
         return b.add_solid(mesh, material=SVK, element=element, **options)
 
     return make
-
-
-def ball():
-    return wf.mesh.sphere(0.7, cells=2, center=(3, -2, 1))
 
 
 SHAPES = {
@@ -135,12 +110,6 @@ def build(name, integration=None, n=3, dtype="float64", t=None):
     options = {"integration": integration} if integration else {}
     body = SHAPES[name](b, n, **options, **({"t": t} if t else {}))
     return body, b.finalize(device="cpu", dtype=dtype)
-
-
-def state_of(model, u):
-    state = model.state()
-    state.displacement.assign(np.asarray(u)[None])
-    return state
 
 
 def affine(body, A, shift=(0, 0, 0)):

@@ -9,16 +9,7 @@ import numpy as np
 
 from warpfea.mesh import Mesh
 
-GMSH = {
-    "line": 1,
-    "triangle": 2,
-    "tetra": 4,
-    "hexahedron": 5,
-    "wedge": 6,
-    "pyramid": 7,
-    "triangle6": 9,
-    "tetra10": 11,
-}
+GMSH = {"line": 1, "triangle": 2, "tetra": 4, "hexahedron": 5, "wedge": 6, "pyramid": 7, "triangle6": 9, "tetra10": 11}
 VTK = {
     "line": 3,
     "triangle": 5,
@@ -130,12 +121,7 @@ def _msh41(parts, form):
         for k in [k for k, dim in enumerate(dims) if dim == d]:
             physical = [parts.tag(k)] if parts.tag(k) else []
             out += put(
-                "i" + 6 * "d" + "Q" + len(physical) * "i" + "Q",
-                k + 1,
-                *(6 * [0.0]),
-                len(physical),
-                *physical,
-                0,
+                "i" + 6 * "d" + "Q" + len(physical) * "i" + "Q", k + 1, *(6 * [0.0]), len(physical), *physical, 0
             )
     n, total = len(parts.points), sum(len(c) for _, c, _ in parts.blocks)
     out += b"$EndEntities\n$Nodes\n" + put("QQQQ", 1, n, 1, n) + put("iiiQ", 3, (body or [0])[0] + 1, 0, n)

@@ -24,30 +24,6 @@ import numpy as np
 
 from warpfea.elements.ancf_solid import CORNERS, FACES
 
-__all__ = [
-    "LATTICE",
-    "PAIRS",
-    "POWERS",
-    "PRINTED",
-    "bernstein",
-    "bezier_coefficients",
-    "bezier_map",
-    "enmc_cartesian",
-    "enmc_volume",
-    "fn_cartesian",
-    "fn_from_enmc_cartesian",
-    "fn_in_incomplete_basis",
-    "fn_volume",
-    "incomplete_basis",
-    "incomplete_coefficients",
-    "library_transformation",
-    "power_basis",
-    "power_map",
-    "signed_volume",
-    "transformation",
-    "volume_coordinates",
-]
-
 PRINTED = 2.0 / 81.0
 """Face-centroid coefficient c of A.2, A.4 and A.5; 1/18 in its place reproduces all quadratics (FN18)."""
 

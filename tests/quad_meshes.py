@@ -7,11 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpfea.mesh import (
-    Mesh,
-    box,
-    grid,
-)
+from warpfea.mesh import Mesh, box, grid
 
 
 def _load(name):

@@ -7,19 +7,8 @@ import itertools
 import numpy as np
 import pytest
 import scipy.linalg
-from ancf_shapes import (
-    E_MODULUS,
-    RHO,
-    SHAPES,
-    SPLIT,
-    TURN,
-    affine,
-    ball,
-    build,
-    difference,
-    rotation,
-    state_of,
-)
+from ancf_bodies import E_MODULUS, RHO, TURN, ball, parent_points, rotation, state_of
+from ancf_shapes import SHAPES, SPLIT, affine, build, difference
 
 import warpfea as wf
 from warpfea import elements
@@ -28,13 +17,6 @@ from warpfea.model import assembly
 from warpfea.model.discretisation import element_functions
 
 WITH_RULES = SPLIT + [(name, None) for name in SHAPES if (name, "split") not in SPLIT]
-
-
-def parent_points(family, count=20, seed=0):
-    rng = np.random.default_rng(seed)
-    if family.parent.low is None:
-        return rng.dirichlet(np.ones(4), count)[:, 1:]
-    return rng.uniform(family.parent.low, family.parent.high, (count, 3))
 
 
 def tables(body, xi):
@@ -51,7 +33,7 @@ def test_functions(name):
     """Partition of unity, derivatives, and slot values that are position and gradient at the node."""
     body, _ = build(name)
     family = body.family
-    xi = parent_points(family)
+    xi = parent_points(family, 20)
     every = np.arange(len(body.mesh.cells))
     s, ds = element_functions(body, every, xi)
     position = family.slot_kind == 0
@@ -77,7 +59,7 @@ def test_linear_fields(name):
     """e = A E + b gives r = A X + b and F = A everywhere."""
     body, _ = build(name)
     A, b = np.random.default_rng(1).uniform(-1, 1, (3, 3)), np.array([1.0, 2.0, 3.0])
-    s, h, _ = tables(body, parent_points(body.family))
+    s, h, _ = tables(body, parent_points(body.family, 20))
     e = (body.reference + affine(body, A, b))[body.connectivity]
     X = np.einsum("eqs,esk->eqk", s, body.reference[body.connectivity])
     assert np.abs(np.einsum("eqs,esk->eqk", s, e) - X @ A.T - b).max() < 1e-13
@@ -111,7 +93,7 @@ def polynomials(degree, dimension=3):
 def reproduced(body, degree, dimension, turn):
     """Error of interpolating monomials of X in turned axes, largest at random points per monomial."""
     family = body.family
-    s, _, _ = tables(body, parent_points(family) * np.repeat([1.0, 0.0], [dimension, 3 - dimension]))
+    s, _, _ = tables(body, parent_points(family, 20) * np.repeat([1.0, 0.0], [dimension, 3 - dimension]))
     Y = body.reference @ turn
     X = np.einsum("eqs,esk->eqk", s, Y[body.connectivity])
     node = Y[np.flatnonzero(body.slot_kind == 0)][np.cumsum(body.slot_kind == 0) - 1]  # position of each slot's node
@@ -149,7 +131,7 @@ def test_polynomials(name, degree, dimension):
 def test_reference_geometry_is_the_mesh(name):
     """Curved T10, trilinear hexahedra, bilinear quads: the interpolated reference is the mesh's own."""
     body, _ = build(name)
-    xi = parent_points(body.family)
+    xi = parent_points(body.family, 20)
     s, _, _ = tables(body, xi)
     X = np.einsum("eqs,esk->eqk", s, body.reference[body.connectivity]) + body.origin
     if "curved" in name:

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from ancf_shapes import RHO, SHAPES, SHIFT, SVK, TURN, ball, build, skew
+from ancf_bodies import RHO, SHIFT, SVK, TURN, ball
+from ancf_shapes import SHAPES, build, skew
 
 import warpfea as wf
 from warpfea.elements.quadrature import box_rule, conical_tet

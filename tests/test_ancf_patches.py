@@ -7,23 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from ancf_shapes import (
-    INTEGRATIONS,
-    SHAPES,
-    SPLIT,
-    SVK,
-    TURN,
-    affine,
-    beam,
-    build,
-    difference,
-    lifted,
-    placed,
-    rotation,
-    shell,
-    skew,
-    state_of,
-)
+from ancf_bodies import SVK, TURN, placed, rotation, state_of
+from ancf_shapes import INTEGRATIONS, SHAPES, SPLIT, affine, beam, build, difference, lifted, shell, skew
 
 import warpfea as wf
 

@@ -67,8 +67,7 @@ def test_the_interface(hook_file, tmp_path, monkeypatch):
     b.clamp(hook.nodes("fixed"))
     b.drive(box.nodes("x+"), displacement=([0, 1], [(0, 0, 0), (0.1, 0, 0)]))
     b.drive(
-        box.nodes("x-"),
-        rotation=wf.Rotation(anchor=(0, 0.05, 0.05), axis=(1, 0, 0), angle=([0, 1], [0, np.pi / 2])),
+        box.nodes("x-"), rotation=wf.Rotation(anchor=(0, 0.05, 0.05), axis=(1, 0, 0), angle=([0, 1], [0, np.pi / 2]))
     )
     b.add_point_load(box.at((0.5, 0.1, 0.05)), force=(0, 0, -100))
     b.add_traction(hook.surface("pull"), (0, 0, -1e3))

@@ -149,9 +149,7 @@ def test_bad_input(case, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-LATER = {
-    "add_contact": lambda b, s: b.add_contact(s),
-}
+LATER = {"add_contact": lambda b, s: b.add_contact(s)}
 
 
 @pytest.mark.parametrize("name", LATER)

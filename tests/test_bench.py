@@ -6,7 +6,6 @@ import pathlib
 import numpy as np
 import pytest
 from validation import cpu as bench_cpu
-from validation import growth as bench_growth
 from validation import runner
 
 from warpfea.cli import main
@@ -23,7 +22,8 @@ def bench(tmp_path, capfd):
     def run(*words):
         target = tmp_path / "out.json"
         todo = (main, "bench") if not words or words[0].startswith("-") else (runner.main,)
-        code = todo[0]([*todo[1:], *words, "--device", "cpu", "--out", str(target)])
+        device = () if "--device" in words else ("--device", "cpu")
+        code = todo[0]([*todo[1:], *words, *device, "--out", str(target)])
         out, err = capfd.readouterr()
         return code, out + err, json.loads(target.read_text()) if target.exists() else None
 
@@ -112,38 +112,6 @@ def test_unstructured_meshes_are_as_large_as_the_peers(case):
     assert np.all(mesh.points[end.nodes][:, :, 0] == 3.0)
 
 
-def test_growth_covers_the_product(bench):
-    code, text, content = bench("growth", "--set", "problems=beam", "--set", "sizes=24,96")
-    assert code == 0, text
-    rows = content["rows"]
-    assert {(r["E"], r["dt"], r["nu"]) for r in rows} == {
-        (E, dt, nu) for E in (1e5, 1e8, 1e11) for dt in (1e-4, 1e-3, 1e-2) for nu in (0.3, 0.49)
-    }
-    assert len(rows) == 18
-    for row in rows:
-        assert row["unknowns"] == [24, 96]
-        assert row["outcome"] == ["converged"] * 2
-        assert row["growth"] == row["pcg"][1] / row["pcg"][0]
-    assert content["worst"] == {"beam": {"growth": max(r["growth"] for r in rows), "failures": 0}}
-
-
-@pytest.mark.parametrize(
-    ("limits", "tol", "words"),
-    [({"max_pcg": 1}, bench_growth.TOL, "1 iterations were not enough"), ({}, 1e-14, "ConvergenceError: ")],
-)
-def test_growth_shows_failures(bench, monkeypatch, limits, tol, words):
-    monkeypatch.setattr(bench_growth, "LIMITS", bench_growth.LIMITS | limits)
-    monkeypatch.setattr(bench_growth, "TOL", tol)
-    monkeypatch.setattr(bench_growth, "MODULI", (1e8,))
-    code, text, content = bench("growth", "--set", "problems=beam", "--set", "sizes=24,96")
-    assert code == 0, text
-    for row in content["rows"]:
-        assert all(outcome.startswith(words) for outcome in row["outcome"])
-        assert (row["pcg"], row["growth"]) == ([None, None], None)
-    assert content["worst"] == {"beam": {"growth": None, "failures": 12}}
-    assert "failures" in text
-
-
 def test_cpu_steps_with_three_solvers(bench, monkeypatch):
     sizes = {"a": (1, 1, 1), "b": (3, 2, 1)}
     cases = [bench_cpu.CpuCase(f"bar-{k}", "bar", size, (1.0, 2.0)) for k, size in sizes.items()]
@@ -199,34 +167,17 @@ def test_contact_stands_beside_a_step_without(bench):
     assert {"schema", "command", "commit", "machine", "versions"} <= set(content)
 
 
-@pytest.mark.slow
-def test_pairs_measure_rows_of_each_kind(bench):
-    rows = "pile-4-loose,pile-4-T10-tight,search-1e3,core-1e4,worlds-blocks-1,worlds-finger-16"
-    code, text, content = bench("pair_cost", "--rows", rows, "--set", "steps=2")
-    assert code == 0, text
-    found = {row["label"]: row for row in content["rows"]}
-    assert list(found) == rows.split(",")
-    assert found["pile-4-loose"]["nodes"] == found["pile-4-T10-tight"]["nodes"] == 1250
-    assert found["pile-4-loose"]["times_faster"] == pytest.approx(10.0 / found["pile-4-loose"]["ms_per_step"])
-    assert found["pile-4-T10-tight"]["peer_ms"] is None
-    assert found["pile-4-T10-tight"]["residual"] <= 1e-6
-    assert 0.03 * found["core-1e4"]["points"] < found["core-1e4"]["touching"] < 0.1 * found["core-1e4"]["points"]
-    assert found["core-1e4"]["goal"] == 6.0
-    assert found["search-1e3"]["goal"] is None
-    assert found["worlds-finger-16"]["worlds"] == 16
-    assert all(label in text for label in found)
-
-
 BAD = {
     "unknown row": (["--peer", "--rows", "bar-1"], ["'bar-1'", "bar-3x2x1"]),
     "no such folder": (["--peer", "--meshes", "nowhere"], ["nowhere"]),
     "both": (["--peer", "--worlds"], ["--worlds", "--peer"]),
-    "a kind that moved": (["--growth", "--steps", "3"], ["--growth", "tests.validation growth"]),
+    "a kind that moved": (["--cpu", "--steps", "3"], ["--cpu", "tests.validation cpu"]),
+    "a kind that is gone": (["--growth", "--steps", "3"], ["--growth", "tests/results"]),
     "rows alone": (["--rows", "bar-3x2x1"], ["--rows", "--peer"]),
     "sizes of the peer": (["--peer", "--unknowns", "1000"], ["--unknowns", "--peer"]),
     "steps of worlds": (["--worlds", "--steps", "3"], ["--steps", "--worlds"]),
     "unknown row of the CPU": (["cpu", "--rows", "bar"], ["bar"]),
-    "too small": (["growth", "--set", "sizes=5"], ["5", "270"]),
+    "another device": (["cpu", "--device", "cuda:0"], ["cpu"]),
 }
 
 

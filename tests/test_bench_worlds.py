@@ -1,15 +1,13 @@
 """`warpfea bench --worlds`: its mesh and its rows; tests/results/worlds_h200.json, made by it."""
 
 import json
-import pathlib
 
 import numpy as np
 import pytest
+from result_files import rows_of
 
 from warpfea.cli import main
 from warpfea.studies.bench.worlds import GOALS, five_tets
-
-FILE = pathlib.Path(__file__).resolve().parent / "results" / "worlds_h200.json"
 
 
 @pytest.mark.parametrize("cells", [(1, 1, 1), (3, 2, 2)])
@@ -40,10 +38,7 @@ def test_rows_are_made(tmp_path, capfd):
 
 @pytest.fixture(scope="module")
 def rows():
-    assert FILE.exists(), f"{FILE} is missing: warpfea bench --worlds --device cuda:0 --out {FILE}"
-    found = json.loads(FILE.read_text())
-    assert found["machine"]["gpu"] == "NVIDIA H200"
-    return {(row["label"], row["dtype"]): row for row in found["rows"]}
+    return {(row["label"], row["dtype"]): row for row in rows_of("worlds_h200.json", device="cuda")}
 
 
 def miss(value, reason):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
-from validation import product as bench_product
+from product_state import DT, apply, prepare
 from warpfea.kernels.elements.cluster import cluster_size, slot_capacity, table_layout
 
 import warpfea as wf
@@ -72,11 +72,11 @@ def test_product_of_elements_in_any_order(element, dtype, tol):
     body = b.add_solid(shuffled, material=wf.SVK(E=1e6, nu=0.3, density=1e3))
     b.clamp(body.nodes(lambda X: X[:, 0] < 1e-9))
     model = b.finalize(device="cpu", dtype=dtype)
-    sim, residual = bench_product.prepare(model, "elements")
+    sim, residual = prepare(model, "elements")
     ((_, clusters),) = residual.clusters.blocks
     assert (clusters > 1 + len(mesh.cells) // model.blocks[0].cluster) == (element == "T10")  # some were halved
-    _, direction, out = bench_product.apply(model, residual)
-    p, dt = direction.numpy()[0].astype(float), bench_product.DT
+    direction, out = apply(model, residual)
+    p, dt = direction.numpy()[0].astype(float), DT
     exact = b.finalize(device="cpu") if dtype == "float32" else model
     state = exact.state()
     state.displacement.assign(sim.stepper.work.u.numpy().astype(float))

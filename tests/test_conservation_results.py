@@ -1,19 +1,16 @@
 """tests/results/conservation_cpu.json, by `python -m tests.validation conservation`, and README."""
 
-import json
-import pathlib
-
 import pytest
+from result_files import RESULTS, content_of
 from validation.conservation import CASES, FREE, MECHANISMS, STEPS
 
-HERE = pathlib.Path(__file__).resolve().parent
 BOUND = {"svk": 1e-9, "mooney_rivlin": 1e-8, "neo_hookean": 1e-8}
 """Relative errors of energy and both momenta that are asked for, over 1e4 steps with a tolerance of 1e-12."""
 
 
 @pytest.fixture(scope="module")
 def parts():
-    return json.loads((HERE / "results" / "conservation_cpu.json").read_text())["parts"]
+    return content_of("conservation_cpu.json")["parts"]
 
 
 @pytest.mark.parametrize("family", FREE)
@@ -49,7 +46,12 @@ def test_ten_thousand_revolutions(parts):
 
 
 def test_the_table_is_of_the_file(parts):
-    text = (HERE / "README.md").read_text().partition("<!-- conservation -->")[2].partition("<!-- /conservation -->")[0]
+    text = (
+        (RESULTS.parent / "README.md")
+        .read_text()
+        .partition("<!-- conservation -->")[2]
+        .partition("<!-- /conservation -->")[0]
+    )
     assert text.strip() == table(parts)
 
 

@@ -1,23 +1,16 @@
 """The result of `python -m tests.validation contact`, and a coarse run: Hertz, Mindlin, an elastic ball's rebound."""
 
-import json
-import pathlib
-
 import pytest
+from result_files import content_of
 from validation.contact import hertz_case, rebound_case
 
-RESULT = pathlib.Path(__file__).resolve().parent / "results" / "contact_hertz_cpu.json"
 MOST_NEWTON = 50
 """Iterations of a load step in which points begin to slip."""
 
 
 @pytest.fixture(scope="module")
 def result():
-    content = json.loads(RESULT.read_text())
-    assert content["command"].startswith("warpfea study contact")
-    assert len(content["commit"]) >= 40
-    assert content["machine"]["device"] == "cpu"
-    assert content["versions"]["warp"]
+    content = content_of("contact_hertz_cpu.json", "warpfea study contact", "cpu")
     assert content["settings"]["block"]["contact_radius"] <= 0.03 * content["settings"]["block"]["sphere_radius"]
     return content
 

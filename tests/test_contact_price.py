@@ -1,33 +1,19 @@
 """The committed tables `contact_cost`: what contact costs beside a step without it."""
 
-import json
-import pathlib
-
 import numpy as np
 import pytest
+from result_files import content_of
 from validation.contact_cost import BESIDE, SOLVES, solve_rows, start
 
-RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 FILES = {"contact_cpu.json": ("cpu", 8000, 1.3), "contact_h200.json": ("cuda", 100_000, 1.1)}
 """Device, unknowns at least, and most that a step may take over one without contact where the bodies are apart."""
 
 
-def content_of(name):
-    path = RESULTS / name
-    assert path.exists(), f"{path} is missing: make it with `python -m tests.validation contact_cost`"
-    content = json.loads(path.read_text())
-    device, _, _ = FILES[name]
-    assert content["command"].startswith("warpfea bench --contact --device")
-    assert content["machine"]["device"].startswith(device)
-    assert len(content["commit"]) >= 40
-    assert content["versions"]["warp"]
-    return content
-
-
 def rows_of(name):
     """Of the smallest size that counts, by scene."""
-    _, unknowns, _ = FILES[name]
-    rows = {row["scene"]: row for row in reversed(content_of(name)["rows"]) if row["unknowns"] >= unknowns}
+    device, unknowns, _ = FILES[name]
+    found = content_of(name, "warpfea bench --contact --device", device)["rows"]
+    rows = {row["scene"]: row for row in reversed(found) if row["unknowns"] >= unknowns}
     assert set(rows) == {"none", "clamped", "apart", "resting", "sliding"}
     assert all(row["halvings"] == 0 for row in rows.values())
     return rows

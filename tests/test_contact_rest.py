@@ -1,23 +1,13 @@
 """The result of `python -m tests.validation contact` on a wall and a turntable, short runs: friction holds bodies."""
 
-import json
-import pathlib
-
 import pytest
+from result_files import content_of
 from validation.contact import turntable_case, wall_case
-
-RESULT = pathlib.Path(__file__).resolve().parent / "results" / "contact_rest_cpu.json"
 
 
 @pytest.fixture(scope="module")
 def result():
-    content = json.loads(RESULT.read_text())
-    assert content["command"] == "warpfea study contact --only wall --only turntable --out " + "/".join(
-        RESULT.parts[-3:]
-    )
-    assert len(content["commit"]) >= 40
-    assert content["machine"]["device"] == "cpu"
-    assert content["versions"]["warp"]
+    content = content_of("contact_rest_cpu.json", "warpfea study contact --only wall --only turntable --out ", "cpu")
     assert content["settings"]["cube"] == {"edge": 0.1, "mass": 1.0, "nu": 0.3, "tol": 1e-10}
     return content
 

@@ -1,14 +1,11 @@
 """What `StepReport.floor` tells of float32, beside the true error; tests/results/floor_cpu.json, made by
 `python -m tests.validation floor`."""
 
-import json
-import pathlib
-
 import numpy as np
 import pytest
+from result_files import content_of
 from validation.floor import CASES, SEED, draw, tried
 
-FILE = pathlib.Path(__file__).resolve().parent / "results" / "floor_cpu.json"
 GIVEN = tuple(draw(np.random.default_rng(0)))
 WORST = (0, 20, 43, 51)
 """Rows whose errors were 9.4, 6.6, 10 and 9.2 times what was told on 8934ce7, up to 1.5 %."""
@@ -25,9 +22,7 @@ def assert_honest(row):
 
 @pytest.fixture(scope="module")
 def rows():
-    assert FILE.exists(), f"{FILE} is missing: python -m tests.validation floor --out {FILE}"
-    content = json.loads(FILE.read_text())
-    assert len(content["commit"]) >= 40
+    content = content_of("floor_cpu.json")
     assert content["settings"]["seed"] == SEED
     return content["rows"]
 

@@ -1,21 +1,15 @@
 """`warpfea study identify`: stiffness and damping from a noisy record; tests/results/identify_cpu.json, made by it."""
 
-import json
-import pathlib
-
 import numpy as np
 import pytest
+from result_files import content_of
 
 from warpfea.studies.identify import NOISE, TRUTH, identify, record
-
-FOLDER = pathlib.Path(__file__).resolve().parent / "results"
 
 
 @pytest.mark.parametrize(("device", "worlds"), [("cpu", 64), ("h200", 4096)])
 def test_the_committed_search_finds_both(device, worlds):
-    file = FOLDER / f"identify_{device}.json"
-    assert file.exists(), f"{file} is missing: warpfea study identify --worlds {worlds} --out {file}"
-    found = json.loads(file.read_text())
+    found = content_of(f"identify_{device}.json")
     (row,) = found["rows"]
     assert row["worlds"] == worlds
     assert found["settings"]["truth"] == TRUTH

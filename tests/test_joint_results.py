@@ -1,23 +1,13 @@
 """The tables of `python -m tests.validation joints`: cost with m joints on both devices, stability of extreme cases."""
 
-import json
-import pathlib
-
 import pytest
-
-RESULTS = pathlib.Path(__file__).resolve().parent / "results"
-FILES = {"cpu": "joints_cpu.json", "h200": "joints_h200.json"}
+from result_files import content_of
 
 
-@pytest.fixture(params=FILES)
+@pytest.fixture(params=[("joints_cpu.json", "cpu"), ("joints_h200.json", "cuda")])
 def result(request):
-    content = json.loads((RESULTS / FILES[request.param]).read_text())
-    device = content["machine"]["device"]
-    assert device.startswith({"cpu": "cpu", "h200": "cuda"}[request.param])
-    assert content["machine"].get("gpu", "H200").endswith("H200")
-    assert len(content["commit"]) >= 40
-    assert content["versions"]["warp"].startswith("1.19")
-    return content
+    name, device = request.param
+    return content_of(name, device=device)
 
 
 def test_cost_of_joints_is_told(result):

@@ -9,11 +9,11 @@ import re
 
 import numpy as np
 import pytest
+from cli_runs import run
 from scene_runs import scene_simulation
 
 import warpfea as wf
 from warpfea.builder.scene import find
-from warpfea.cli import main
 from warpfea.cli.summary import KEYS, MANY
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
@@ -137,14 +137,6 @@ def torn() -> wf.ModelBuilder:
     b.add_constraint("DIST", points=(tip, (3, .1, .1)), value=([0, .01], [2.0, 2.2]), name="rod B")
     return b
 """
-
-
-def run(capfd, *words):
-    """Exit code, stdout and stderr of a command."""
-    capfd.readouterr()
-    code = main([str(word) for word in words])
-    out, err = capfd.readouterr()
-    return code, out, err
 
 
 def crank(*words):

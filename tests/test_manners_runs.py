@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cli_runs import run as command
 
 import warpfea as wf
 from warpfea.base.errors import OutputError, UsageError
-from warpfea.cli import main
 from warpfea.cli.part import _load
 from warpfea.cli.summary import human, summarize
 from warpfea.outputs import reel, usd
@@ -309,14 +309,6 @@ def test_reprs_are_one_informative_line():
 # what is refused, and what a summary says
 
 LITTLE = ["cantilever", "--device", "cpu", "--set", "cells=2", "--dt", "0.002"]
-
-
-def command(capfd, *words):
-    """Exit code, stdout and stderr of a command."""
-    capfd.readouterr()
-    code = main([str(word) for word in words])
-    out, err = capfd.readouterr()
-    return code, out, err
 
 
 def sheet(path):

@@ -13,15 +13,7 @@ from mesh_writers import FORMATS, Parts, write
 
 import warpfea
 from warpfea.base.errors import MeshError
-from warpfea.mesh import (
-    CELL_TYPES,
-    Mesh,
-    box,
-    check,
-    cylinder,
-    read,
-    sphere,
-)
+from warpfea.mesh import CELL_TYPES, Mesh, box, check, cylinder, read, sphere
 
 HERE = Path(__file__).parent
 SCENES = Path(warpfea.__file__).parent.parent / "scenes"
@@ -129,10 +121,7 @@ def test_groups(small, form, tmp_path):
 def test_unnamed_groups_of_gmsh(small, form, tmp_path):
     path = write(Parts.of(small), tmp_path / "unnamed", form)
     data = path.read_bytes()
-    start, end = (
-        data.index(b"$PhysicalNames"),
-        data.index(b"$EndPhysicalNames\n") + len(b"$EndPhysicalNames\n"),
-    )
+    start, end = (data.index(b"$PhysicalNames"), data.index(b"$EndPhysicalNames\n") + len(b"$EndPhysicalNames\n"))
     path.write_bytes(data[:start] + data[end:])
     mesh = read(path)
     assert list(mesh.element_sets) == ["physical_3_1"]
@@ -147,11 +136,7 @@ def test_vtu_arrays(tmp_path):
         small.points,
         [("tetra", small.cells)],
         cell_data={"material": [material], "gmsh:physical": [material], "temperature": [material * 0.5]},
-        point_data={
-            "held": (small.points[:, 0] == 0).astype(np.int8),
-            "id": np.arange(8),
-            "u": np.zeros((8, 3)),
-        },
+        point_data={"held": (small.points[:, 0] == 0).astype(np.int8), "id": np.arange(8), "u": np.zeros((8, 3))},
     )
     meshio.vtu.write(tmp_path / "a.vtu", mesh)
     got = read(tmp_path / "a.vtu")

@@ -7,13 +7,7 @@ import pytest
 from quad_meshes import Q, brick, shell_parts, write
 
 from warpfea.base.errors import MeshError
-from warpfea.mesh import (
-    Mesh,
-    box,
-    check,
-    grid,
-    read,
-)
+from warpfea.mesh import Mesh, box, check, grid, read
 
 
 def _changed(mesh: Mesh, *, move=None, cells=None, name="part") -> Mesh:
@@ -65,10 +59,7 @@ BAD = {
         lambda: _flat_plate(cells=[*Q, [3, 4, 1, 0]]),
         r"elements 0 and 4 have the same corners \[0, 1, 4, 3\] \(1 duplicate element\)",
     ),
-    "quad coincident": (
-        lambda: _flat_plate(move={8: (2, 1, 0)}),
-        r"nodes 5 and 8 coincide at \(2, 1, 0\), 0 m apart",
-    ),
+    "quad coincident": (lambda: _flat_plate(move={8: (2, 1, 0)}), r"nodes 5 and 8 coincide at \(2, 1, 0\), 0 m apart"),
     "quad without area": (
         lambda: _flat_plate(move={0: (0.2, 1, 0), 1: (0.7, 1, 0)}),
         r"quad 0 has zero area \(0 m\^2, longest edge 1 m; 1 such quad\)",

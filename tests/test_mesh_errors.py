@@ -9,14 +9,7 @@ import pytest
 from mesh_writers import FORMATS, Parts, write
 
 from warpfea.base.errors import MeshError, MeshWarning
-from warpfea.mesh import (
-    Mesh,
-    box,
-    check,
-    cylinder,
-    read,
-    sphere,
-)
+from warpfea.mesh import Mesh, box, check, cylinder, read, sphere
 
 # the defects: each takes the parts of a 6-element T10 box and returns a pattern for the message
 
@@ -229,29 +222,20 @@ def _edited(tmp_path, form, old, new):
     [
         (lambda t: t / "nowhere.msh", "no such mesh file"),
         (lambda t: t, "unknown mesh format"),
-        (
-            lambda t: write(base(), t / "a", "vtu").rename(t / "a.stl"),
-            r"unknown mesh format '\.stl', known are \.msh",
-        ),
+        (lambda t: write(base(), t / "a", "vtu").rename(t / "a.stl"), r"unknown mesh format '\.stl', known are \.msh"),
         (lambda t: write(base(), t / "a", "vtu").rename(t / "a.msh"), r"not a Gmsh file"),
         (lambda t: _edited(t, "msh22", b"2.2 0 8", b"4.0 0 8"), r"Gmsh format 4\.0 is not supported"),
         (lambda t: _edited(t, "msh22", b"2.2 0 8", b"1.0 0 8"), r"Gmsh format 1\.0 is not supported"),
         (lambda t: _edited(t, "msh22", b"\n1 11 2", b"\n1 140 2"), r"unknown Gmsh element type 140"),
         (lambda t: _edited(t, "msh41", b"$Entities", b"$PartitionedEntities"), r"partitioned"),
-        (
-            lambda t: _edited(t, "msh22", b"$EndPhysicalNames", b"$Other"),
-            r"section \$PhysicalNames is not closed",
-        ),
+        (lambda t: _edited(t, "msh22", b"$EndPhysicalNames", b"$Other"), r"section \$PhysicalNames is not closed"),
         (lambda t: _edited(t, "vtu", b"<Piece", b"<!-- <Piece --><Piece"), r"several pieces"),
         (
             lambda t: _edited(t, "vtu", b'"types" format="ascii">24', b'"types" format="ascii">11'),
             r"unknown VTK cell type 11",
         ),
         (lambda t: _edited(t, "vtu", b"UnstructuredGrid", b"PolyData"), r"damaged"),
-        (
-            lambda t: _edited(t, "inp", b"C3D10", b"C3D10XYZ7"),
-            r"unknown element type 'C3D10XYZ7' \(12 lines\)",
-        ),
+        (lambda t: _edited(t, "inp", b"C3D10", b"C3D10XYZ7"), r"unknown element type 'C3D10XYZ7' \(12 lines\)"),
         (lambda t: _edited(t, "inp", b"C3D10", b"MASS"), r"unknown element type 'MASS'"),
         (lambda t: _edited(t, "inp", b"*NODE\n1,", b"*NODE\n2,"), r"node id 2 is defined twice"),
         (lambda t: _edited(t, "inp", b"*NODE\n1,", b"*NODE\none,"), r"bad line .*'one'"),
@@ -265,10 +249,7 @@ def _edited(tmp_path, form, old, new):
             lambda t: _edited(t, "inp", b"*ELEMENT", b"*ELSET, ELSET=e\nother\n*ELEMENT"),
             r"\*ELSET, e: unknown set 'other'",
         ),
-        (
-            lambda t: _edited(t, "inp", b"*ELEMENT", b"*SURFACE, NAME=s\n1, S9\n*ELEMENT"),
-            r"unknown face label 'S9'",
-        ),
+        (lambda t: _edited(t, "inp", b"*ELEMENT", b"*SURFACE, NAME=s\n1, S9\n*ELEMENT"), r"unknown face label 'S9'"),
         (
             lambda t: _edited(t, "inp", b"*ELEMENT", b"*SURFACE, NAME=s\n7, S1\n*ELEMENT"),
             r"surface 's' holds faces of cells",
@@ -350,13 +331,7 @@ def test_bad_generator_argument(make, pattern):
 )
 def test_bad_mesh_object(change, pattern):
     good = box((1, 1, 1), cells=(1, 1, 1))
-    arguments = {
-        "points": good.points,
-        "cells": good.cells,
-        "cell_type": good.cell_type,
-        "name": "body",
-        **change,
-    }
+    arguments = {"points": good.points, "cells": good.cells, "cell_type": good.cell_type, "name": "body", **change}
     with pytest.raises(MeshError, match=pattern):
         Mesh(**arguments)
 
@@ -370,10 +345,7 @@ def test_bad_mesh_object(change, pattern):
         (lambda m: m.nodes([0, 99]), r"box: nodes: 99 is out of range 0 \.\. 26"),
         (lambda m: m.nodes([0.5]), r"1D array of integers"),
         (lambda m: m.nodes(np.ones(3, dtype=bool)), r"mask for nodes has 3 entries, expected 27"),
-        (
-            lambda m: m.nodes(lambda X: X[:, 0]),
-            r"predicate for nodes must return a bool array of shape \(27,\)",
-        ),
+        (lambda m: m.nodes(lambda X: X[:, 0]), r"predicate for nodes must return a bool array of shape \(27,\)"),
         (lambda m: m.surface([0, 1]), r"a surface is an integer array \(K, 2\)"),
         (lambda m: m.surface([[6, 0]]), r"surface, element: 6 is out of range"),
     ],

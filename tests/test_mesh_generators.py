@@ -7,16 +7,7 @@ import pytest
 from quad_meshes import area_vectors, plate
 
 from warpfea.base.errors import MeshError
-from warpfea.mesh import (
-    CELL_TYPES,
-    Mesh,
-    box,
-    check,
-    cylinder,
-    grid,
-    linear,
-    sphere,
-)
+from warpfea.mesh import CELL_TYPES, Mesh, box, check, cylinder, grid, linear, sphere
 from warpfea.mesh.cells import ELEMENT_CELLS
 from warpfea.mesh.convert import with_face_nodes
 

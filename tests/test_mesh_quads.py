@@ -7,13 +7,7 @@ import pytest
 from quad_meshes import FORMATS, Parts, Q, area_vectors, brick, plate, shell_parts, write, writers
 
 from warpfea.base.errors import MeshError
-from warpfea.mesh import (
-    CELL_TYPES,
-    Mesh,
-    box,
-    check,
-    read,
-)
+from warpfea.mesh import CELL_TYPES, Mesh, box, check, read
 from warpfea.mesh.cells import det_j0
 
 SOLIDS = ("tetra", "tetra10", "hexahedron", "tetra_faces")

@@ -112,11 +112,7 @@ def test_bad_targets(tmp_path):
     for writer in all_writers(tmp_path / "file"):
         with pytest.raises(OutputError, match="file"):
             writer.open(StubSim(worlds=1))
-    for writer in (
-        USDWriter(tmp_path / "o.obj"),
-        PNGWriter(tmp_path / "o.gif"),
-        GIFWriter(tmp_path / "o.png"),
-    ):
+    for writer in (USDWriter(tmp_path / "o.obj"), PNGWriter(tmp_path / "o.gif"), GIFWriter(tmp_path / "o.png")):
         with pytest.raises(OutputError, match=r"must end in \."):
             writer.open(StubSim(worlds=1))
     with pytest.raises(OutputError, match="color_range"):

@@ -235,6 +235,18 @@ def test_text_speaks_of_the_project_alone():
         assert not words.search(path.read_text()), path
 
 
+def test_folders_keep_to_their_lines(record_property):
+    def lines(*folders, skip="/oracle.py"):
+        files = {path for folder in folders for path in (ROOT / folder).rglob("*.py")}
+        return sum(len(path.read_text().splitlines()) for path in files if skip not in path.as_posix())
+
+    validation = lines("tests/validation")
+    assert validation <= 4000
+    assert lines("warpfea/studies") <= 6800
+    assert lines("tests") - validation <= 30_864  # as many as at 51a4e5d
+    record_property("lines outside tests", lines(*PROJECT["tool"]["setuptools"]["package-dir"].values()))
+
+
 # floors
 
 

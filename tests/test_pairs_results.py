@@ -1,20 +1,12 @@
-"""The result of `python -m tests.validation contact` on pairs: balls and cylinders beside Hertz, a stack that rests."""
-
-import json
-import pathlib
+"""tests/results/contact_pairs_cpu.json: balls and cylinders beside Hertz, a stack that rests."""
 
 import pytest
-
-RESULT = pathlib.Path(__file__).resolve().parent / "results" / "contact_pairs_cpu.json"
+from result_files import content_of
 
 
 @pytest.fixture(scope="module")
 def result():
-    content = json.loads(RESULT.read_text())
-    assert content["command"].startswith("warpfea study contact")
-    assert len(content["commit"]) >= 40
-    assert content["machine"]["device"] == "cpu"
-    return content
+    return content_of("contact_pairs_cpu.json", "warpfea study contact", "cpu")
 
 
 @pytest.mark.parametrize(("part", "numbers"), [("balls", ("a_error", "p0_error", "approach_error")),

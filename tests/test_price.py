@@ -1,15 +1,14 @@
 """The committed table `price`: what features that a scene does not use would cost it."""
 
 import json
-import pathlib
 
 import pytest
+from result_files import content_of
 from validation.price import measure
 from validation.runner import main
 
 from warpfea.builder.scene import find, names
 
-RESULT = pathlib.Path(__file__).resolve().parent / "results" / "price_cpu.json"
 TRACES = {
     "contact": "contact", "contact between bodies": "pair", "constraints": "constraints",
     "follower pressure": "pressure", "moments": "moment",
@@ -38,10 +37,7 @@ def assert_priced(row):
 
 
 def test_no_scene_pays_for_what_it_does_not_use():
-    content = json.loads(RESULT.read_text())
-    assert content["command"] == "warpfea bench --price --device cpu --out tests/results/price_cpu.json"
-    assert len(content["commit"]) >= 40
-    assert content["versions"]["warp"]
+    content = content_of("price_cpu.json", "warpfea bench --price --device cpu --out tests/results/price_cpu.json")
     assert content["settings"]["repeat"] >= 3
     assert [row["scene"] for row in content["rows"]] == list(names())
     for row in content["rows"]:

@@ -15,30 +15,10 @@ from warpfea.builder.scene import Scene, find, load_file, names
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 BUILTIN = [
-    "arch",
-    "ball_on_plate",
-    "beam_over_cylinders",
-    "belt",
-    "block_stack",
-    "bouncing_ball",
-    "cantilever",
-    "chain",
-    "double_pendulum",
-    "finger_beam_shell",
-    "four_bar",
-    "gears",
-    "gripper",
-    "hook",
-    "hung_plate",
-    "mixed",
-    "pendulum",
-    "plate_pendulum",
-    "rollup",
-    "slider_crank",
-    "spin",
-    "tilting_table",
-    "twist",
-]
+    "arch", "ball_on_plate", "beam_over_cylinders", "belt", "block_stack", "bouncing_ball", "cantilever",
+    "chain", "double_pendulum", "finger_beam_shell", "four_bar", "gears", "gripper", "hook", "hung_plate",
+    "mixed", "pendulum", "plate_pendulum", "rollup", "slider_crank", "spin", "tilting_table", "twist",
+]  # fmt: skip
 
 
 @wf.scene(dt=1e-3, t_end=0.01)

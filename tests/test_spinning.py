@@ -1,20 +1,17 @@
 """Generalized-alpha in bodies that turn: the default rho_inf adds no energy; what larger ones add is as recorded."""
 
-import json
-import pathlib
-
 import pytest
+from result_files import rows_of
 from validation.spinning import BODIES, MODULI, RADII, STEPS, TURNS, spin_energies, spinning_body
 
 import warpfea as wf
 
-RESULT = pathlib.Path(__file__).resolve().parent / "results" / "spinning_cpu.json"
 DEFAULT = wf.GeneralizedAlpha().rho_inf
 
 
 @pytest.fixture(scope="module")
 def rows():
-    return json.loads(RESULT.read_text())["rows"]
+    return rows_of("spinning_cpu.json")
 
 
 def test_every_setting_was_run(rows):

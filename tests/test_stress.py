@@ -262,20 +262,18 @@ def test_skipped_is_no_named_error():
 
 def test_counts_hold_errors_to_the_floors_that_reports_told():
     def report(floor, newton=3, min_J=0.9):
-        one = {"newton": newton, "pcg": 5, "halvings": 0, "violation": 0.0, "min_J": min_J, "floor": floor}
-        return types.SimpleNamespace(**{name: np.array([value]) for name, value in one.items()})
+        one = {"newton": newton, "pcg": 5, "halvings": 0, "violation": 0.0, "status": 0, "min_J": min_J, "floor": floor}
+        last = types.SimpleNamespace(**{name: np.array([value]) for name, value in one.items()})
+        return types.SimpleNamespace(last=last, model=types.SimpleNamespace(constraints=None))
 
     count = Count()
-    count.add(report(1e-3), 1.0)
-    count.add(report(2e-3, newton=7), 1.0)
+    count.add(report(1e-3))
+    count.add(report(2e-3, newton=7))
     assert (count.newton, count.worst_newton, count.pcg, count.floor) == (10, 7, 10, 2e-3)
     assert count.answer(5e-3, 1e-2, "", told=count.last_floor).passed
     assert not count.answer(7e-3, 1e-2, "", told=count.last_floor).passed
     assert count.answer(7e-3, 1e-2, "", told=count.sum_of_floors).passed
     assert count.answer(7e-3, 1e-2, "").passed
-    count.add(report(0.0, min_J=-0.1), 1.0)
+    count.add(report(0.0, min_J=-0.1))
     assert not count.answer(0.0, 1e-2, "", told=count.last_floor).passed
     assert count.answer(0.0, 1e-2, "", low=None, told=count.last_floor).passed
-    del (old := report(0.0)).floor  # a report without an estimate
-    count.add(old, 1.0)
-    assert count.last_floor == 0.0

@@ -7,15 +7,12 @@ The table of the H200 was made case by case, in parallel processes on one GPU, a
 cases that were stopped.
 """
 
-import json
-import pathlib
-
 import pytest
+from result_files import content_of, rows_of
 
 from warpfea.studies.stress.misses import MISSES, reason_for
 from warpfea.studies.stress.suite import choose, load_cases
 
-RESULTS = pathlib.Path(__file__).resolve().parent / "results"
 FILES = {"stress_cpu.json": "cpu", "stress_h200.json": "cuda:0"}
 SPEED = {"hard_steps_h200.json": ("--peer", 1.05, 13), "hard_steps_cpu.json": ("--cpu", 1.10, 12)}
 BEAMS = (("beam-30", 372), ("beam-300", 3612), ("beam-1000", 12012))
@@ -23,19 +20,9 @@ SLOWER = {("hard_steps_h200.json", f"{beam} beam float64 {n}") for beam, n in BE
 """Rows beyond the bar, by 1.2, 0.8 and 0.02 %: the first round was slow; the fastest rounds are 1.6 to 2.3 % apart."""
 
 
-def content(name):
-    path = RESULTS / name
-    assert path.exists(), f"{path} is missing: make it with the command in this file"
-    return json.loads(path.read_text())
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_every_row_meets_its_criterion_or_is_a_known_miss(name):
-    found = content(name)
-    assert len(found["commit"]) >= 40
-    assert found["machine"]["cpu"]
-    assert found["versions"]["warp"].startswith("1.19")
-    for row in found["rows"]:
+    for row in rows_of(name):
         if row["passed"] is False or row["outcome"] == "missed":
             assert reason_for(row["case"], row["precision"], FILES[name]), row
         elif row["outcome"] == "done":
@@ -45,7 +32,7 @@ def test_every_row_meets_its_criterion_or_is_a_known_miss(name):
 
 @pytest.mark.parametrize("name", FILES)
 def test_every_row_was_run(name):
-    found = content(name)
+    found = content_of(name)
     ran = {(row["case"], row["precision"]) for row in found["rows"]}
     stopped = {case for case, _ in found.get("unfinished", [])}
     assert stopped <= {"rest-1e6"}
@@ -61,14 +48,14 @@ def test_misses_are_rows_of_the_suite():
 @pytest.mark.parametrize("name", ["elastica/10", "elastica/1000", "elastica/100000", "annular/3"])
 def test_goals_of_slender_bodies_on_the_cpu(name):
     """Elastica at most 10 Newton iterations per load step, the slit annular plate at most 150 in all."""
-    (row,) = [r for r in content("stress_cpu.json")["rows"] if (r["case"], r["precision"]) == (name, "float64")]
+    (row,) = [r for r in rows_of("stress_cpu.json") if (r["case"], r["precision"]) == (name, "float64")]
     assert row["outcome"] == "done"
     assert row["newton"] <= (150 if name == "annular/3" else 50)
 
 
 @pytest.mark.parametrize("name", ["soft-mat", "soft-dolphin"])
 def test_goals_of_soft_solids(name):
-    (row,) = [r for r in content("stress_cpu.json")["rows"] if (r["case"], r["precision"]) == (name, "float64")]
+    (row,) = [r for r in rows_of("stress_cpu.json") if (r["case"], r["precision"]) == (name, "float64")]
     assert row["outcome"] == "done"
     assert row["newton"] <= 80
 
@@ -77,7 +64,7 @@ def test_goals_of_soft_solids(name):
 def test_normal_steps_are_as_fast_as_before(name):
     """Alternated runs with the version before: no more iterations, and times within the bar."""
     bench, bar, least = SPEED[name]
-    found = content(name)
+    found = content_of(name)
     settings = found["settings"]
     assert settings["bench"].split()[0] == bench
     assert settings["rounds"] >= 3

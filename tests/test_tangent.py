@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
+from element_meshes import rotation
 from warpfea.kernels.elements.with_mass import with_mass_kernel
 
 import warpfea as wf
@@ -37,13 +38,6 @@ def make(name, material, **options):
     rule = "tet14" if name == "sphere" else None
     body = b.add_solid(MESHES[name](), material=material, quadrature=rule)
     return b, body, b.finalize(device="cpu", **options)
-
-
-def rotation(angle, axis=(1.0, -2.0, 0.5)):
-    """Rotation matrix (Rodrigues), angle in degrees."""
-    a, (x, y, z) = math.radians(angle), np.array(axis) / np.linalg.norm(axis)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(a) * K + (1 - math.cos(a)) * K @ K
 
 
 def state_of(model, u, v=None):

@@ -54,7 +54,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def names() -> list[str]:
-    """Names of the tables: modules and packages of this folder with a TABLE."""
+    """Names of the tables: modules and packages of this folder that hold a TABLE."""
     files = [*HERE.glob("*.py"), *HERE.glob("*/__init__.py")]
     found = [path for path in files if re.search(r"^TABLE\b", path.read_text(), re.MULTILINE)]
     return sorted(path.parent.name if path.name == "__init__.py" else path.stem for path in found)
@@ -99,7 +99,7 @@ def parse(words: Sequence[str]) -> tuple[Table | None, argparse.Namespace]:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run a command line; the exit code."""
+    """Do a command line; the exit code."""
     words = list(sys.argv[1:] if words is None else words)
     try:
         table, options = parse(words)
@@ -126,7 +126,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def run(table: Table, given: Run, only: Sequence[str] | None = None, words: Sequence[str] = ()) -> dict[str, Any]:
-    """Run the parts one after another, print their rows, write the file after each; returns its contents."""
+    """Run the parts one after another, print their rows, write the file after each; what the file holds."""
     find_device(given.device)
     if given.out is not None:
         check_target(given.out, (".json",))
@@ -154,7 +154,7 @@ def run(table: Table, given: Run, only: Sequence[str] | None = None, words: Sequ
                 content["parts"][name] = part | _origin(words, given, table)
             else:
                 content[name] = given.made[name]
-            if given.out is not None and (given.made[name] or not given.labels):
+            if given.out is not None and (not given.labels or any(given.made.values())):
                 write_json(str(given.out), plain(content))
     if given.labels and not any(given.made.values()):
         raise UsageError(f"--rows {','.join(given.labels)}: no such row")
@@ -168,7 +168,7 @@ def show(row: Mapping[str, Any], columns: Sequence[str] = ()) -> None:
 
 
 def _collect(found: Iterable[Row] | Mapping[str, Any], columns: Sequence[str]) -> Any:
-    """The rows, each printed on arrival."""
+    """The rows, each printed as it comes."""
     if isinstance(found, Mapping):
         show(found)
         return dict(found)

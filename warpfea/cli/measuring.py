@@ -131,26 +131,13 @@ STUDIES: dict[str, tuple[str, tuple[str, ...], str]] = {
         "record of its tip, a generation of candidates at a time, each a world of one model. An example of parameters "
         "per world, written for reading. Minutes on two cores.",
     ),
-    "ancf-tets": (
-        "error against run time of T4, T10, ENMC, FN, FN18 and the brick H3843",
-        ("--device", "--sizes", "--repeat", "--quick", "--out"),
-        "Paper T's comparison repeated: the elements on a rigid pendulum and on a soft bar with large deflection, "
-        "static and in motion. Error against unknowns and run time, as a table, JSON, CSV and a plot in the folder.",
-    ),
-    "peer-meshes": (
-        "make the unstructured meshes of `warpfea bench --peer` with Gmsh",
-        ("--out",),
-        "Writes bar_*.npz into the folder of --out, by default tests/data of the checkout; needs gmsh.",
-    ),
 }
 """Studies other than those of scenes: name -> help, options, description; executed by `run` of cli/study.py."""
 _OPTIONS: dict[str, dict[str, Any]] = {
     "--device": {"help": "cpu, cuda:0, ..."},
     "--quick": {"action": "store_true", "help": "a trial: few and small rows, no result"},
     "--worlds": {"type": count, "metavar": "N", "help": "candidates at a time (default 64)"},
-    "--sizes": {"type": counts, "metavar": "N,N,...", "help": "unknowns (default 100,300,1000,3000,10000)"},
-    "--repeat": {"type": count, "default": 3, "metavar": "N", "help": "runs; the median counts (default 3)"},
-    "--out": {"metavar": "PATH", "help": "JSON with command, machine, settings and rows, or the folder of files"},
+    "--out": {"metavar": "PATH", "help": "JSON with command, machine, settings and rows"},
 }
 
 

@@ -56,7 +56,7 @@ def profile(options: argparse.Namespace) -> int:
     """Run `warpfea profile SCENE`."""
     check_targets(options)
     if options.png:  # before any work
-        from ..studies.plots import require_matplotlib
+        from ..studies.files import require_matplotlib
 
         require_matplotlib()
     from tqdm import tqdm

@@ -21,10 +21,7 @@ SAME = ("reference", "mesh", "measure", "target", "split", "repeat", "limit", "o
 def study(options: argparse.Namespace) -> int:
     """Run `warpfea study STUDY`."""
     with contextlib.redirect_stdout(None) if options.quiet else contextlib.nullcontext():
-        module = {"ancf-tets": "ancf_tets.command", "peer-meshes": "bench.peer_meshes"}.get(
-            options.study, options.study
-        )
-        importlib.import_module(f"warpfea.studies.{module}").run(options)
+        importlib.import_module(f"warpfea.studies.{options.study}").run(options)
     return DONE
 
 

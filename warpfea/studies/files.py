@@ -1,4 +1,4 @@
-"""The folder and the CSV of a study."""
+"""The folder and the CSV of a study, and what pictures need."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..base.errors import OutputError
 from ..base.writer import check_folder, write_whole
 
-__all__ = ["prepare", "write_csv"]
+__all__ = ["prepare", "require_matplotlib", "write_csv"]
 
 
 def prepare(folder: str | pathlib.Path) -> pathlib.Path:
@@ -38,3 +39,12 @@ def write_csv(path: pathlib.Path, columns: Sequence[str], rows: Sequence[Mapping
                 writer.writerow([text(row.get(name)) for name in columns])
 
     write_whole(path, write)
+
+
+def require_matplotlib() -> Any:
+    """matplotlib's Figure class. OutputError where it is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise OutputError(f"the plot needs matplotlib: pip install 'warpfea[plots]' ({error})") from error
+    return Figure

@@ -8,7 +8,7 @@ import textwrap
 from typing import Any
 
 from ...base.console import number
-from ..plots import require_matplotlib
+from ..files import require_matplotlib
 from .measure import DONE, REFUSED
 from .motion import RESOLVED
 

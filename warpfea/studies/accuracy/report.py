@@ -17,7 +17,7 @@ from ...base.console import number, plain, size, table, write_json
 from ...base.errors import OutputError
 from ...base.provenance import machine, origin, versions
 from ...base.writer import write_whole
-from ..files import prepare, write_csv
+from ..files import prepare, require_matplotlib, write_csv
 from .measure import DONE
 from .motion import RESOLVED
 from .settings import Axes, Setting, word
@@ -339,7 +339,6 @@ class Study(Sequence[Row]):
         Raises:
             OutputError: a folder that can't be created or written.
         """
-        from ..plots import require_matplotlib
         from .plot import draw
 
         out = prepare(folder)

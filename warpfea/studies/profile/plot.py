@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 
-from ..plots import require_matplotlib
+from ..files import require_matplotlib
 from .profiling import Profile
 
 __all__ = ["BETWEEN", "draw"]

@@ -1,4 +1,4 @@
-"""Common parts of the cases: bars and beams, static solutions with their counts, differences."""
+"""What the cases share: bars and beams, static solutions with their counts, differences."""
 
 from __future__ import annotations
 
@@ -14,27 +14,16 @@ from warpfea.simulation.statics import StaticResult
 
 from .case import Answer, Setting
 
-__all__ = [
-    "BUILT_IN",
-    "DOWN",
-    "REFINED",
-    "SOUND",
-    "STEEL",
-    "Count",
-    "Solved",
-    "bar",
-    "beam",
-    "off",
-    "solve",
-    "step",
-]
+__all__ = ["BUILT_IN", "DOWN", "REFINED", "SOUND", "STEEL", "Count", "Solved", "X", "Y", "Z", "bar", "beam", "finalize",
+           "off", "put", "solve"]  # fmt: skip
 
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 DOWN = (0.0, 0.0, -9.81)
 STEEL = wf.SVK(E=2e11, nu=0.3, density=7800.0)
 SOUND = 1e-12
-"""Smallest J that counts as positive."""
+"""J that counts as positive."""
 REFINED = 1e-10
-"""Relative residual of float64 references."""
+"""Relative residual of references that are solved in float64."""
 BUILT_IN = {
     "T4": "all",
     "T10": "all",
@@ -43,13 +32,13 @@ BUILT_IN = {
     "3243": "position+section",
     "3443": "position+director",
 }
-"""Slots constrained by a wall x = const."""
+"""Slots that a wall x = const holds."""
 
 
 def bar(
     element: str, cells: Sequence[int], size: Sequence[float], law: Any, gravity: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[wf.ModelBuilder, wf.Body]:
-    """A solid bar from x = 0 on, clamped at its side x-, with the probe "tip" at x+; `size` in m."""
+    """A solid bar from x = 0 on, built in at its side x-, with the probe "tip" at x+; `size` in m."""
     b = wf.ModelBuilder(gravity=tuple(gravity))
     mesh = wf.mesh.box(tuple(size), cells=tuple(cells), element=element)
     body = b.add_solid(mesh, material=law, element=element, name="bar")
@@ -61,7 +50,7 @@ def bar(
 def beam(
     elements: int, side: float, law: Any, length: float = 1.0, gravity: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[wf.ModelBuilder, wf.Body]:
-    """A 3243 beam along x with a square section, clamped at its start, with the probe "tip" at its end; m."""
+    """A 3243 beam along x with a square section, built in at its start, with the probe "tip" at its end; m."""
     b = wf.ModelBuilder(gravity=tuple(gravity))
     section = wf.Rectangle(side, side)
     line = [(0, 0, 0), (length, 0, 0)]
@@ -73,33 +62,55 @@ def beam(
 
 @dataclass
 class Count(Output):
-    """Iterations and other numbers of all steps so far, the worst world's; an output, or fed by `add`."""
+    """Iterations and other numbers of all steps so far; an output of `run` and `solve_static`, or fed by `step`.
+
+    Attributes:
+        newton, pcg, halvings: sums, of the worst world; worst_newton: of a step.
+        min_J: the smallest, of worlds that have not failed.
+        floor: the largest; last_floor and sum_of_floors: of the last step and of all.
+        violation: the largest of constraints over the model's size; None without constraints.
+        seen: the last report counted.
+    """
 
     newton: int = 0
     pcg: int = 0
     halvings: int = 0
     worst_newton: int = 0
-    violation: float = 0.0
     min_J: float = np.inf
     floor: float = 0.0
     last_floor: float = 0.0
     sum_of_floors: float = 0.0
-    steps: int = 0
+    violation: float | None = None
     seen: Any = field(default=None, repr=False)
 
-    def add(self, report: Any, size: float) -> None:
-        """Add a step's report; `size` of the model, m."""
-        self.steps += 1
+    def add(self, sim: Any) -> None:
+        """Count the last step of a simulation."""
+        report = self.seen = sim.last
         self.newton += int(report.newton.max())
         self.pcg += int(report.pcg.max())
         self.worst_newton = max(self.worst_newton, int(report.newton.max()))
         self.halvings += int(report.halvings.max())
-        self.violation = max(self.violation, float(report.violation.max()) / size)
-        self.min_J = min(self.min_J, float(report.min_J.min()))
-        floor = getattr(report, "floor", None)
-        self.last_floor = 0.0 if floor is None else float(np.max(floor))
+        self.min_J = min(self.min_J, float(report.min_J[report.status == 0].min(initial=np.inf)))
+        self.last_floor = float(np.max(report.floor))
         self.floor = max(self.floor, self.last_floor)
         self.sum_of_floors += self.last_floor
+        if sim.model.constraints is not None:
+            self.violation = max(self.violation or 0.0, float(report.violation.max()) / sim.model.size)
+
+    def step(self, sim: wf.Simulation, steps: int = 1) -> wf.StepReport:
+        """Do steps one by one and count them; the last report."""
+        for _ in range(steps):
+            report = sim.step()
+            self.add(sim)
+        return report
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Those of an Answer."""
+        return {
+            "newton": self.newton, "pcg": self.pcg, "halvings": self.halvings, "floor": self.floor,
+            "min_J": None if self.min_J == np.inf else float(self.min_J), "violation": self.violation,
+        }  # fmt: skip
 
     def answer(
         self, error: float, bound: float, reference: str, *, low: float | None = SOUND, told: float = 0.0, **more: Any
@@ -107,9 +118,9 @@ class Count(Output):
         """An answer with these counts.
 
         Args:
-            low: minimum J at a point of accepted steps; None: any J.
-            told: reported estimate of the relative error, which the error may exceed threefold; 0: none. Only for a
-                reference on the same mesh: `last_floor` of a static solution, `sum_of_floors` of a
+            low: no step may have been accepted with J below it at a point; None: whatever J.
+            told: estimate of the relative error that the reports gave, which the error may exceed threefold; 0: none.
+                Only where the reference is of the same mesh: `last_floor` of a static solution, `sum_of_floors` of a
                 motion.
         """
         limits = dict(more.pop("limits", {}))
@@ -117,25 +128,21 @@ class Count(Output):
             limits["J short of its least"] = (low - self.min_J, 0.0)
         if told > 0.0:
             limits["error over the floor told"] = (error, 3.0 * told)
-        return Answer(
-            float(error), bound, reference, newton=self.newton, pcg=self.pcg, halvings=self.halvings, limits=limits,
-            violation=self.violation or None, min_J=float(self.min_J), floor=self.floor, **more,
-        )  # fmt: skip
+        return Answer(float(error), bound, reference, limits=limits, **self.fields, **more)
 
     def open(self, sim: Any) -> None:
-        """No preparation."""
+        """Nothing to prepare."""
 
     def write(self, sim: Any) -> None:
-        """Add the step done since the last call."""
+        """Take the step that was done since the last call."""
         if sim.last is not None and sim.last is not self.seen:
-            self.seen = sim.last
-            self.add(sim.last, sim.model.size)
+            self.add(sim)
 
     def close(self, sim: Any) -> None:
-        """No action."""
+        """Nothing to finish."""
 
     def abort(self) -> None:
-        """No action."""
+        """Nothing to drop."""
 
 
 @dataclass
@@ -151,20 +158,21 @@ class Solved:
         return np.asarray(self.result.probe("tip").displacement[0, -1], dtype=float)
 
 
-def solve(b: wf.ModelBuilder, setting: Setting, dtype: str | None = None, **options: Any) -> Solved:
-    """`solve_static` with these options, in the setting's or another precision."""
-    count = Count()
-    model = b.finalize(device=setting.device, dtype=dtype or setting.dtype)
-    result = wf.solve_static(model, outputs=[count], **options)
-    return Solved(result, count)
+def finalize(b: wf.ModelBuilder, setting: Setting, worlds: int = 1) -> wf.Model:
+    """The model on the setting's device, in its precision."""
+    return b.finalize(device=setting.device, dtype=setting.dtype, worlds=worlds)
 
 
-def step(sim: wf.Simulation, steps: int, count: Count | None = None) -> Count:
-    """Do steps one by one, counted."""
+def solve(b: wf.ModelBuilder, setting: Setting, count: Count | None = None, **options: Any) -> Solved:
+    """`solve_static` with these options, counted; `count` goes on from earlier solutions."""
     count = count or Count()
-    for _ in range(steps):
-        count.add(sim.step(), sim.model.size)
-    return count
+    return Solved(wf.solve_static(finalize(b, setting), outputs=[count], **options), count)
+
+
+def put(state: Any, values: np.ndarray, name: str = "displacement") -> None:
+    """Set an array of a state in all worlds, values (slots, 3)."""
+    array = getattr(state, name)
+    array.assign(np.broadcast_to(values, (*array.shape, 3)).astype(array.numpy().dtype))
 
 
 def off(value: Any, reference: Any, scale: float | None = None) -> float:

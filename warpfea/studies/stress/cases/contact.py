@@ -128,7 +128,7 @@ def watch(sim: wf.Simulation, s: Scene, steps: int, *, mu: float = 0.0, moves: b
     scale = float(np.linalg.norm(p))
     first, most = total(sim), float(np.linalg.norm(weight)) * SIDE
     for _ in range(steps):
-        out.count.add(sim.step(), sim.model.size)
+        out.count.step(sim)
         forces = np.array([sim.contact_record(pad).force[0, -1] for pad in s.pads])
         normal = float(sum(sim.contact_record(pad).normal_force[0, -1] for pad in s.pads))
         impulse = sim.dt * (forces.sum(axis=0) + weight)

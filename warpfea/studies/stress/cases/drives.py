@@ -8,7 +8,7 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import beam, off, solve, step
+from ..build import Count, beam, off, solve
 from ..case import Answer, Setting, case
 
 NAMED = ["'crank'", "drive", "inverted"]
@@ -49,7 +49,8 @@ def drive_jump(setting: Setting, value: tuple[str, float, str]) -> Answer:
     child = arm.start if kind == "beam" else arm.surface("x-")
     joint = b.add_joint("revolute", parent=wf.GROUND, child=child, axis=(0, -1, 0), drive=jump, name="crank")
     sim = wf.Simulation(b.finalize(device=setting.device, dtype=setting.dtype), dt=JUMP_STEP)
-    count = step(sim, 6)
+    count = Count()
+    count.step(sim, 6)
     error = abs(float(sim.joint_value(joint)[0]) / angle - 1.0)
     told = "the angle of the drive"
     return count.answer(error, 1e-3 if setting.single else 1e-6, told, note=f"min J {count.min_J:.3g}")

@@ -9,8 +9,8 @@ import warp as wp
 
 import warpfea as wf
 
+from ..build import Count, finalize
 from ..case import Answer, Setting, case
-from ._common import Effort, finalize
 
 LAW = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 SOFT = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
@@ -32,15 +32,15 @@ def rest(setting: Setting, element: str) -> Answer:
         body = b.add_solid(wf.mesh.box((0.3, 0.3, 0.3), cells=(1, 1, 1), element="T4"), material=LAW)
         b.clamp(body.nodes("x-"))
     model = finalize(b, setting)
-    effort = Effort()
-    static = wf.solve_static(model, load_steps=1, tol=None if setting.single else 1e-13, outputs=[effort])
+    count = Count()
+    static = wf.solve_static(model, load_steps=1, tol=None if setting.single else 1e-13, outputs=[count])
     start = static.state.displacement.numpy().copy()
     sim = wf.Simulation(model, static.state, dt=1e-2, record=False)
     first: dict[str, Any] | None = None
     drift = 0.0
     for _ in range(steps // 1000):
         sim.step(1000)
-        effort.add(sim)
+        count.add(sim)
         e = sim.energies()
         if setting.single and first is None:
             start = sim.state.displacement.numpy().copy()
@@ -49,7 +49,7 @@ def rest(setting: Setting, element: str) -> Answer:
         drift = max(drift, abs(total - first["total"]) / first["strain"])
     moved = float(np.abs(sim.state.displacement.numpy() - start).max() / np.abs(start).max())
     limits = {"energy": (drift, 1e-5 if setting.single else 1e-10)}
-    told = effort.told | {name: int(sim.totals[name].max()) for name in ("newton", "pcg")}
+    told = count.fields | {name: int(sim.totals[name].max()) for name in ("newton", "pcg")}
     return Answer(moved, 1e-5 if setting.single else 1e-12, "it stays", **told, limits=limits, drift=drift,
                   note=f"{steps:.0e} steps of 10 ms")  # fmt: skip
 
@@ -64,7 +64,7 @@ def one_of_many(setting: Setting, value: str) -> Answer:
     b.clamp(body.nodes("x-"))
     model = finalize(b, setting, worlds=worlds)
     model.set_gravity(np.linspace(1.0, 20.0, worlds)[:, None] * (0.0, 0.0, -1.0))
-    effort = Effort()
+    count = Count()
     ends = []
     for harm in (False, True):
         state = model.state()
@@ -77,7 +77,7 @@ def one_of_many(setting: Setting, value: str) -> Answer:
             array.assign(values)
         before = {k: v[bad].tobytes() for k, v in state.numpy().items()}
         sim = wf.Simulation(model, state, dt=5e-3, on_failure="freeze")
-        effort.step(sim, steps)
+        count.step(sim, steps)
         ends.append((sim.status, sim.state.numpy(), before))
     others = np.arange(worlds) != bad
     (_, sound, _), (status, harmed, before) = ends
@@ -85,7 +85,7 @@ def one_of_many(setting: Setting, value: str) -> Answer:
     kept = all(harmed[k][bad].tobytes() == before[k] for k in ("displacement", "velocity", "time"))
     told = status[bad] == 1 and not status[others].any()
     error = float(not same) + float(not told) + float(not kept)
-    return Answer(error, 0.0, "a run without the failure, bit for bit", **effort.told, note=f"{worlds} worlds")
+    return Answer(error, 0.0, "a run without the failure, bit for bit", **count.fields, note=f"{worlds} worlds")
 
 
 @wp.func
@@ -115,13 +115,13 @@ def nan_load(setting: Setting, value: str) -> Answer:
     else:
         b.add_point_load(body.nodes("x+"), _law_ends_in_nan)
     sim = wf.Simulation(finalize(b, setting), dt=1e-2)
-    effort = Effort()
-    wrong = Answer(float("nan"), 0.0, "a refusal that leaves the state", **effort.told)
+    count = Count()
+    wrong = Answer(float("nan"), 0.0, "a refusal that leaves the state", **count.fields)
     before: dict[str, bytes] = {}
     try:
         for _ in range(5):
             before = {k: v.tobytes() for k, v in sim.state.numpy().items()}
-            effort.step(sim)
+            count.step(sim)
     except wf.ConvergenceError as error:
         after = sim.state.numpy()
         intact = all(v.tobytes() == before[k] for k, v in after.items() if k != "status")

@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 
 import warpfea as wf
 
+from ..build import Count, X, Y, Z, finalize
 from ..case import Answer, Setting, case
-from ._common import Effort, X, Y, Z, finalize
 
 G = 9.81
 SIDE, LINK = 0.05, 0.5
@@ -71,16 +71,16 @@ def mass_ratio(setting: Setting, value: str) -> Answer:
         b.add_probe(name, body.end)
     model = finalize(b, setting)
     sim = wf.Simulation(model, dt=h, integrator="bdf2")
-    effort = Effort()
-    sim.run(1.0, outputs=[effort], progress=False)
+    count = Count()
+    sim.run(1.0, outputs=[count], progress=False)
     times = sim.probe("tip").time
     angles = _pendulum([d * SIDE**2 * LINK for d in densities], angle, np.append(0.0, times))[1:]
     ways = np.stack([np.sin(angles), 0.0 * angles, -np.cos(angles)], axis=-1)
     exact = LINK * np.cumsum(ways, axis=1)
     got = np.stack([sim.probe(name).position[0] for name in ("elbow", "tip")], axis=1)
     error = float(np.linalg.norm(got - exact, axis=2).max() / (2.0 * LINK))
-    return Answer(error, 5e-3 if setting.single else 1e-3, "rigid double pendulum by scipy", **effort.told,
-                  limits={"violation": (effort.violation or 0.0, _tol(setting))})  # fmt: skip
+    return Answer(error, 5e-3 if setting.single else 1e-3, "rigid double pendulum by scipy", **count.fields,
+                  limits={"violation": (count.violation or 0.0, _tol(setting))})  # fmt: skip
 
 
 @case("mass-ratio-chain", "Joints", values=("fixed", "revolute"), quick="both")
@@ -106,18 +106,18 @@ def _hanging(setting: Setting, kind: str, densities: list[float], load: float) -
     weights = np.array(densities) * SIDE**2 * LINK * G
     if load:
         b.add_point_load(bodies[-1].end, (0, 0, -load * weights[0]))
-    effort = Effort()
+    count = Count()
     model = finalize(b, setting)
     if kind == "fixed":
-        sim = wf.solve_static(model, load_steps=1, outputs=[effort]).simulation
+        sim = wf.solve_static(model, load_steps=1, outputs=[count]).simulation
     else:
         sim = wf.Simulation(model, dt=1e-2)
-        effort.step(sim, 100)
+        count.step(sim, 100)
     below = np.cumsum(weights[::-1])[::-1] + load * weights[0]
     got = np.array([sim.joint_force(joint)[0, :3] for joint in joints])
     error = float((np.linalg.norm(got - below[:, None] * np.array(Z), axis=1) / below).max())
-    return Answer(error, 1e-3 if setting.single else 1e-6, "weight below", **effort.told,
-                  limits={"violation": (effort.violation or 0.0, _tol(setting))})  # fmt: skip
+    return Answer(error, 1e-3 if setting.single else 1e-6, "weight below", **count.fields,
+                  limits={"violation": (count.violation or 0.0, _tol(setting))})  # fmt: skip
 
 
 @case("joints", "Joints", values=("redundant", "dead-point"), quick="both")
@@ -134,13 +134,13 @@ def _redundant(setting: Setting) -> Answer:
     hinges = [b.add_joint("revolute", parent=wf.GROUND, child=door.surface("z+"), axis=Y) for _ in range(2)]
     model = finalize(b, setting)
     sim = wf.Simulation(model, dt=1e-2)
-    effort = Effort()
-    effort.step(sim, 40)
+    count = Count()
+    count.step(sim, 40)
     weight = 600.0 * 0.4 * 0.04 * 0.8 * G
     total = sum(sim.joint_force(hinge)[0] for hinge in hinges)
     error = float(np.linalg.norm(total[:3] - weight * np.array(Z)) / weight)
-    return Answer(error, 1e-3 if setting.single else 1e-6, "weight of the door", **effort.told,
-                  limits={"violation": (effort.violation or 0.0, _tol(setting))})  # fmt: skip
+    return Answer(error, 1e-3 if setting.single else 1e-6, "weight of the door", **count.fields,
+                  limits={"violation": (count.violation or 0.0, _tol(setting))})  # fmt: skip
 
 
 def _dead_point(setting: Setting) -> Answer:
@@ -173,16 +173,16 @@ def _dead_point(setting: Setting) -> Answer:
     for name, body in (("pin", first), ("far", second)):
         b.add_probe(name, body.end)
     sim = wf.Simulation(finalize(b, setting), dt=h, integrator="bdf2")
-    effort = Effort()
-    sim.run(1.0, outputs=[effort], progress=False)
+    count = Count()
+    sim.run(1.0, outputs=[count], progress=False)
     pin, far = (sim.probe(name).position[0] for name in ("pin", "far"))
     lengths = np.stack([np.linalg.norm(far - pin, axis=1) / coupler, np.linalg.norm(far - span, axis=1) / crank])
     angle = start + 2.0 * np.pi * sim.probe("pin").time
     exact = crank * np.stack([np.cos(angle), 0.0 * angle, np.sin(angle)], axis=1)
     error = max(float(np.abs(lengths - 1.0).max()), float(np.linalg.norm(pin - exact, axis=1).max() / crank))
     away = float(np.linalg.norm(far - pin - span, axis=1).max())
-    return Answer(error, 1e-3, "rigid bars", **effort.told,
-                  limits={"violation": (effort.violation or 0.0, _tol(setting))},
+    return Answer(error, 1e-3, "rigid bars", **count.fields,
+                  limits={"violation": (count.violation or 0.0, _tol(setting))},
                   note="stays a parallelogram" if away < 1e-2 * coupler else "crosses over")  # fmt: skip
 
 
@@ -196,9 +196,9 @@ def joints_conflicting(setting: Setting) -> Answer:
     body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(1, 1, 1)), material=wf.SVK(E=1e7, nu=0.3, density=1000.0))
     b.clamp(body.nodes("x-"))
     tip = body.at((1, 0.1, 0.1))
-    effort = Effort()
+    count = Count()
     for k, way in enumerate((0.1, 0.2)):
         b.add_constraint("PIN", points=(tip, (1, 0.1, 0.1)), value=([0, 1e-2], [(0, 0, 0), (0, 0, way)]),
                          name=f"pin {k}")  # fmt: skip
-    effort.step(wf.Simulation(finalize(b, setting), dt=1e-3), 10)
-    return Answer(float("nan"), 0.0, "no place satisfies both", **effort.told)
+    count.step(wf.Simulation(finalize(b, setting), dt=1e-3), 10)
+    return Answer(float("nan"), 0.0, "no place satisfies both", **count.fields)

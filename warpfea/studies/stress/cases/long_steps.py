@@ -9,7 +9,7 @@ import scipy.sparse.linalg
 
 import warpfea as wf
 
-from ..build import DOWN, REFINED, STEEL, Count, bar, off, solve, step
+from ..build import DOWN, REFINED, STEEL, Count, bar, off, solve
 from ..case import Answer, Setting, case
 
 SIZE, CELLS = (1.0, 0.1, 0.1), (10, 1, 1)
@@ -65,7 +65,8 @@ def moved(law: wf.SVK, h: float, setting: Setting, tol: float | None = None) -> 
         clamped(law)[0].finalize(device=setting.device, dtype=setting.dtype), dt=h,
         solver=wf.NewtonPCG(tol=tol, max_pcg=20000),
     )  # fmt: skip
-    count = step(sim, 3)
+    count = Count()
+    count.step(sim, 3)
     return sim.probe("tip").displacement[0, -1], count
 
 
@@ -89,7 +90,8 @@ def long_stay(setting: Setting, h: float) -> Answer:
     state = wf.solve_static(model, load_steps=1).state
     before = tip_of(model, state)
     sim = wf.Simulation(model, state, dt=h, solver=wf.NewtonPCG(max_pcg=20000))
-    count = step(sim, 3)
+    count = Count()
+    count.step(sim, 3)
     error = float(np.abs(tip_of(model, sim.state) - before).max() / np.abs(before).max())
     limits = {"Newton of a step": (count.worst_newton, NEWTON), "halvings": (count.halvings, 0)}
     return count.answer(error, BOUNDS[setting.dtype], "the sag stays", limits=limits, largest_step=h)
@@ -129,7 +131,8 @@ def free_fall(setting: Setting, value: tuple[str, float]) -> Answer:
     mesh = wf.mesh.box((EDGE,) * 3, cells=(2, 2, 2))
     body = b.add_solid(mesh, material=FALLING[law], name="cube")
     sim = wf.Simulation(b.finalize(device=setting.device, dtype=setting.dtype), dt=h)
-    count = step(sim, 3)
+    count = Count()
+    count.step(sim, 3)
     velocity = np.array(DOWN) * 3.0 * h
     error = float(np.abs(sim.velocities(body)[0] - velocity).max() / np.abs(velocity).max())
     bound = 1e-5 if setting.single else 1e-10

@@ -107,7 +107,7 @@ def watch(sim: wf.Simulation, s: Pair, steps: int, *, mu: float | None = None) -
     scale = max(float(np.linalg.norm(x)) for x in p)
     first, most = total(sim), mass[0] * G * SIDE
     for _ in range(steps):
-        out.count.add(sim.step(), sim.model.size)
+        out.count.step(sim)
         record = sim.contact_record(s.pad)
         force, normal = record.force[0, -1], float(record.normal_force[0, -1])
         for k, (body, sign) in enumerate(bodies):
@@ -234,7 +234,7 @@ def spinning_stack(setting: Setting, rate: float) -> Answer:
     count = Count()
     start = float(sim.energies()["kinetic"][0])
     for _ in range(40):
-        count.add(sim.step(), sim.model.size)
+        count.step(sim)
     e = sim.energies()
     gained = float(e["kinetic"][0] + e["strain"][0] + e["contact"][0] + e["contact_pairs"][0] - e["work"][0]) / start
     apart = float(np.linalg.norm((center(sim, s.upper) - center(sim, s.lower))[:2])) / SIDE

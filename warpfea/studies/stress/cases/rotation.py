@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation as Turn
 
 import warpfea as wf
 
+from ..build import Count, finalize
 from ..case import Answer, Setting, case
-from ._common import Effort, finalize
 
 BOX = np.array([0.3, 0.2, 0.1])
 
@@ -37,8 +37,8 @@ def dzhanibekov(setting: Setting) -> Answer:
     seconds, h = 3.0, 1e-3
     model, _ = _box(setting, spin, 1e8)
     sim = wf.Simulation(model, dt=h, integrator="bdf2")
-    effort = Effort()
-    sim.run(seconds, outputs=[effort], progress=False)
+    count = Count()
+    sim.run(seconds, outputs=[count], progress=False)
     got = sim.probe("y+").position[0] - sim.probe("y-").position[0]
     got /= np.linalg.norm(got, axis=1, keepdims=True)
     inertia = np.array([BOX[1] ** 2 + BOX[2] ** 2, BOX[0] ** 2 + BOX[2] ** 2, BOX[0] ** 2 + BOX[1] ** 2])
@@ -52,8 +52,8 @@ def dzhanibekov(setting: Setting) -> Answer:
     exact = solve_ivp(rates, (0.0, times[-1]), [*spin, 0.0, 0.0, 0.0, 1.0], t_eval=times, rtol=1e-11, atol=1e-12)
     axis = Turn.from_quat(exact.y[3:].T).apply((0.0, 1.0, 0.0))
     error = float(np.linalg.norm(got - axis, axis=1).max())
-    return Answer(error, 0.02, "Euler's equations by scipy", **effort.told,
-                  limits={"halvings": (effort.halvings, 0.01 * sim.steps)},
+    return Answer(error, 0.02, "Euler's equations by scipy", **count.fields,
+                  limits={"halvings": (count.halvings, 0.01 * sim.steps)},
                   note=f"the axis points to {axis[:, 1].min():.3f} of its first direction")  # fmt: skip
 
 
@@ -76,8 +76,8 @@ def spin(setting: Setting, integrator: str) -> Answer:
 
     start = momenta()[1][2]
     kinetic = 0.5 * omega * start
-    effort = Effort()
-    effort.step(sim, steps)
+    count = Count()
+    count.step(sim, steps)
     linear, angular = momenta()
     L, T = _rotor(omega, h, steps, integrator == "bdf2")
     # criterion: the loss, of which the box's own stretch, rho (omega L)^2 / E, is a part
@@ -91,7 +91,7 @@ def spin(setting: Setting, integrator: str) -> Answer:
         "tilt": (float(np.linalg.norm(angular[:2])) / start, small),
     }
     bound = 0.05 if setting.single else 1e-3
-    return Answer(max(lost, energy), bound, "the scheme for a rigid rotor", **effort.told, limits=limits,
+    return Answer(max(lost, energy), bound, "the scheme for a rigid rotor", **count.fields, limits=limits,
                   drift=e["kinetic"] / kinetic - 1.0, note=f"keeps {L:.4f} of L, {T:.4f} of T")  # fmt: skip
 
 
@@ -153,9 +153,9 @@ def _energy(setting: Setting, body: str, scheme: str, turn: float, E: float, ste
         p = M @ v
         return p[solid.slot_kind == 0].sum(axis=0), np.cross(solid.reference + u, p).sum(axis=0)
 
-    first, (p, L), effort, most = energy(), momenta(), Effort(), 0.0
+    first, (p, L), count, most = energy(), momenta(), Count(), 0.0
     for _ in range(steps):
-        effort.step(sim)
+        count.step(sim)
         most = max(most, energy() / first - 1.0)
     limits = {}
     bound = GROWTH
@@ -168,7 +168,7 @@ def _energy(setting: Setting, body: str, scheme: str, turn: float, E: float, ste
                 "momentum": (float(np.linalg.norm(now[0] - p)) / size, 1e-10),
                 "angular momentum": (float(np.linalg.norm(now[1] - L)) / size, 1e-6),
             }
-    return Answer(most, bound, "its energy at the start", **effort.told, limits=limits, drift=energy() / first - 1.0,
+    return Answer(most, bound, "its energy at the start", **count.fields, limits=limits, drift=energy() / first - 1.0,
                   note=f"keeps {energy() / first:.6f} of its energy")  # fmt: skip
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import warpfea as wf
 from warpfea.mesh.cells import CELL_TYPES
 
+from ..build import Count, finalize, off
 from ..case import Answer, Setting, case
-from ._common import Effort, finalize, off
 
 ASPECT = 1e4
 SLIVER = 1.0 / (3.0 * ASPECT)
@@ -56,8 +56,8 @@ def slivers(setting: Setting, element: str) -> Answer:
     noise = height * np.random.default_rng(1).uniform(-1.0, 1.0, exact.shape)
     start = exact + noise * model.free_slots.reshape(exact.shape)
     state.displacement.assign(start[None].astype(state.displacement.numpy().dtype))
-    effort = Effort()
-    result = wf.solve_static(model, load_steps=1, state=state, tol=None if setting.single else 1e-11, outputs=[effort])
+    count = Count()
+    result = wf.solve_static(model, load_steps=1, state=state, tol=None if setting.single else 1e-11, outputs=[count])
     got = result.state.displacement.numpy()[0]
     F = np.eye(3) + STRAIN
     lam, mu = LAW.lame
@@ -66,6 +66,6 @@ def slivers(setting: Setting, element: str) -> Answer:
     sigma = sigma[[0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]]
     stress = max(off(s, np.broadcast_to(sigma, s.shape)) for _, s in model.evaluation.stresses(result.state))
     places = body.slot_kind == 0
-    return Answer(off(got[places], exact[places]), 1e-5 if setting.single else 1e-8, "affine motion", **effort.told,
+    return Answer(off(got[places], exact[places]), 1e-5 if setting.single else 1e-8, "affine motion", **count.fields,
                   limits={"stress": (stress, 0.05 if setting.single else 1e-6)},
                   note=f"{len(P)} nodes, {len(P) - len(outer)} of them free")  # fmt: skip

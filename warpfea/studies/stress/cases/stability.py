@@ -9,8 +9,8 @@ from scipy.optimize import brentq
 
 import warpfea as wf
 
+from ..build import Count, Y, Z, finalize
 from ..case import Answer, Setting, case
-from ._common import Effort, Y, Z, finalize
 
 SPAN, RISE, SIDE, E = 1.0, 0.1, 0.1, 1e7
 """Half span, rise and side of the bars of the two-bar truss, m; modulus, Pa."""
@@ -64,15 +64,15 @@ def snap_through(setting: Setting, value: str) -> Answer:
     load = 1.2 * _load(RISE / np.sqrt(3.0))
     height = brentq(lambda z: _load(z) - load, -2.0 * RISE, -RISE, xtol=1e-15)
     model = _truss(setting, element, load)
-    effort = Effort()
+    count = Count()
     if way == "static":
-        probe: Any = wf.solve_static(model, load_steps=6, outputs=[effort]).probe("apex")
+        probe: Any = wf.solve_static(model, load_steps=6, outputs=[count]).probe("apex")
     else:
         sim = wf.Simulation(model, dt=2e-2)
-        effort.step(sim, 500)
+        count.step(sim, 500)
         probe = sim.probe("apex")
     got = probe.position[0, -1, 2]
-    return Answer(abs(got / height - 1.0), 1e-3 if setting.single else 1e-6, "closed form", **effort.told,
+    return Answer(abs(got / height - 1.0), 1e-3 if setting.single else 1e-6, "closed form", **count.fields,
                   note=f"apex from {RISE:g} to {got:.5f} m")  # fmt: skip
 
 
@@ -94,9 +94,9 @@ def lateral_buckling(setting: Setting, value: str) -> Answer:
     b.clamp(strip.start, slots="position+section")
     b.add_point_load(strip.end, (0.0, 1e-4 * load, -load))
     b.add_probe("tip", strip.end)
-    effort = Effort()
-    result = wf.solve_static(finalize(b, setting), load_steps=8, outputs=[effort])
+    count = Count()
+    result = wf.solve_static(finalize(b, setting), load_steps=8, outputs=[count])
     side = abs(float(result.probe("tip").displacement[0, -1, 1])) / L
     error = side / 0.01 if float(value) < 1.0 else 0.1 / side
     note = f"{side:.4f} L to the side; error: over 0.01 L below, 0.1 L over it above"
-    return Answer(error, 1.0, "Timoshenko", **effort.told, note=note)
+    return Answer(error, 1.0, "Timoshenko", **count.fields, note=note)

@@ -8,8 +8,8 @@ import numpy as np
 
 import warpfea as wf
 
+from ..build import Count, Z, finalize
 from ..case import Answer, Setting, case
-from ._common import Effort, Z, finalize
 
 MODULUS = 1e6
 SOLIDS = ("T4", "T10", "ENMC", "FN18", "H3843")
@@ -59,7 +59,7 @@ def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
     state = model.state()
     u = (_starts(kind, body) - body.reference) * model.free_slots[body.slots]
     state.displacement.assign(u[None].astype(state.displacement.numpy().dtype))
-    effort = Effort()
+    count = Count()
     bound = 1e-4 if setting.single else 1e-6
     # the rest state is stress-free: the force scale is round-off of the forces at a strain of 1
     area = {"3243": 0.01, "3443": 0.025}.get(body.family.name, 0.16)
@@ -67,13 +67,13 @@ def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
     if damped:  # omega h > 6 for the slowest mode: a step of backward Euler leaves less than a sixth of any mode
         h = 4.0 if body.family.name in ("3243", "3443") else 0.5
         sim = wf.Simulation(model, state, dt=h, solver=solver)
-        effort.step(sim, 30)
+        count.step(sim, 30)
     else:
-        sim = wf.solve_static(model, load_steps=1, state=state, solver=solver, outputs=[effort]).simulation
+        sim = wf.solve_static(model, load_steps=1, state=state, solver=solver, outputs=[count]).simulation
     assert sim.last is not None
     low = float(sim.last.min_J[0])
     away = float(np.abs(sim.displacements(body)).max())
-    told = effort.told | {"min_J": low}
+    told = count.fields | {"min_J": low}
     if low <= 0.0:
         return Answer(0.0, bound, "min_J <= 0 is reported", **told, note=f"stays so, {away:.2g} m off; reported")
     return Answer(away, bound, "rest", **told, note="recovered" if away <= bound else "another equilibrium")

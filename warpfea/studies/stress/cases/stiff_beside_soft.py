@@ -65,8 +65,7 @@ def bends(kind: str, motion: bool, device: str, dtype: str, tol: float | None) -
     model, count = pair(kind).finalize(device=device, dtype=dtype), Count()
     if motion:
         sim = wf.Simulation(model, dt=H, solver=wf.NewtonPCG(tol=tol))
-        for _ in range(STEPS):
-            count.add(sim.step(), model.size)
+        count.step(sim, STEPS)
     else:
         sim = wf.solve_static(model, load_steps=4, tol=tol, outputs=[count]).simulation
     return sim.probe("tip").displacement[0] - sim.probe("root").displacement[0], count

@@ -7,8 +7,8 @@ from scipy.optimize import brentq
 
 import warpfea as wf
 
+from ..build import Count, off, solve
 from ..case import Answer, Setting, case
-from ._common import Effort, off, solve
 
 MU, K = 4e5, 2e6
 
@@ -57,10 +57,10 @@ def stretch(setting: Setting, value: str) -> Answer:
             b.clamp(body.nodes(axis + "+"), slots=slots, components=axis)
         elif axis == "x":
             b.drive(end, displacement=(float(factor) - 1.0, 0.0, 0.0), components="x", slots=slots)
-    effort = Effort()
-    result = solve(b, setting, effort, load_steps=10)
+    count = Count()
+    result = solve(b, setting, count, load_steps=10).result
     moved = body.mesh.points * (exact - 1.0)
     error = max(off(result.displacements(body)[0], moved), off(result.reaction(end)[0, 0], _stress(exact)[0]))
     J = float(result.report.min_J[0])
-    return Answer(error, 1e-4 if setting.single else 1e-8, "closed form of the law", **effort.told,
+    return Answer(error, 1e-4 if setting.single else 1e-8, "closed form of the law", **count.fields,
                   limits={"min J": (abs(J / np.prod(exact) - 1.0), 1e-4 if setting.single else 1e-8)})  # fmt: skip

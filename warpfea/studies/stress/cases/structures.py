@@ -6,8 +6,8 @@ import numpy as np
 
 import warpfea as wf
 
+from ..build import Count, Z, off, solve
 from ..case import Answer, Setting, case
-from ._common import Effort, Z, off, solve
 
 HARD = ("float32 round-off limit reached",)
 
@@ -28,13 +28,13 @@ def bend45(setting: Setting, elements: int) -> Answer:
     b.clamp(beam.start, slots="position+section")
     b.add_point_load(beam.end, (0, 0, 600.0))
     b.add_probe("tip", beam.end)
-    effort = Effort()
-    result = solve(b, setting, effort, load_steps=6)
+    count = Count()
+    result = solve(b, setting, count, load_steps=6).result
     tip = result.probe("tip").position[0, -1]
     start = np.array([R * (1.0 - np.cos(angle)), R * np.sin(angle), 0.0])
     exact = np.array([15.558, 46.892, 53.608])
     error = float(np.linalg.norm(tip - exact) / np.linalg.norm(exact - start))
-    return Answer(error, 1e-3, "Reissner's beam, 15.558, 46.892, 53.608", **effort.told,
+    return Answer(error, 1e-3, "Reissner's beam, 15.558, 46.892, 53.608", **count.fields,
                   note="end at " + ", ".join(f"{x:.3f}" for x in tip))  # fmt: skip
 
 
@@ -46,10 +46,10 @@ def sze_cantilever(setting: Setting) -> Answer:
     b.clamp(strip.edge("x-"), slots="position+director")
     b.add_traction(strip.surface("x+"), (0, 0, 4.0 / 0.1))
     b.add_probe("tip", strip.edge("x+"))
-    effort = Effort()
-    moved = solve(b, setting, effort, load_steps=8).probe("tip").displacement[0, -1]
+    count = Count()
+    moved = solve(b, setting, count, load_steps=8).result.probe("tip").displacement[0, -1]
     error = off((-moved[0], moved[2]), (3.286, 6.698))
-    return Answer(error, 0.01, "Sze, Liu and Lo 2004: 3.286, 6.698", **effort.told,
+    return Answer(error, 0.01, "Sze, Liu and Lo 2004: 3.286, 6.698", **count.fields,
                   note=f"{-moved[0]:.3f}, {moved[2]:.3f}")  # fmt: skip
 
 
@@ -68,9 +68,9 @@ def scordelis_lo(setting: Setting, cells: int) -> Answer:
     middle = roof.nodes(lambda X: (np.abs(X[:, 0] - length / 2) < 1e-6) & (np.abs(X[:, 1]) < 1e-6))
     b.clamp(middle, slots="position", components="x")
     b.add_probe("edge", roof.at((length / 2, R * np.sin(half), R * np.cos(half))))
-    effort = Effort()
-    sag = -solve(b, setting, effort, load_steps=1).probe("edge").displacement[0, -1, 2] / part
-    return Answer(abs(sag / 0.3006 - 1.0), 0.01, "deep shell theory, 0.3006", **effort.told,
+    count = Count()
+    sag = -solve(b, setting, count, load_steps=1).result.probe("edge").displacement[0, -1, 2] / part
+    return Answer(abs(sag / 0.3006 - 1.0), 0.01, "deep shell theory, 0.3006", **count.fields,
                   note=f"{sag:.4f}; MacNeal and Harder give 0.3024")  # fmt: skip
 
 
@@ -103,17 +103,17 @@ def hemisphere(setting: Setting) -> Answer:
             b.clamp(node, slots="position", components="x")
         if k == 0:
             b.add_probe("load", node)
-    effort = Effort()
-    got = solve(b, setting, effort, load_steps=1).probe("load").displacement[0, -1, 0] / part
+    count = Count()
+    got = solve(b, setting, count, load_steps=1).result.probe("load").displacement[0, -1, 0] / part
     source = "0.0935; the literature has 0.0930 to 0.0940"
-    return Answer(abs(got / 0.0935 - 1.0), 0.01, source, **effort.told, note=f"{got:.4f}")
+    return Answer(abs(got / 0.0935 - 1.0), 0.01, source, **count.fields, note=f"{got:.4f}")
 
 
 @case("slender", "Beams and shells", values=("beam", "plate"), quick="both", refusal={"float32": HARD})
 def slender(setting: Setting, value: str) -> Answer:
     """A cantilever 1e5 times as long as it is high, a clamped plate 1e4 times as wide as it is thick; linear theory."""
     E, nu = 1e9, 0.3
-    effort = Effort()
+    count = Count()
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     if value == "beam":
         h = 1e-5
@@ -131,5 +131,5 @@ def slender(setting: Setting, value: str) -> Answer:
         D = E * h**3 / 12.0 / (1.0 - nu**2)
         b.add_traction(plate.surface("top"), (0, 0, exact * D / 1.26532e-3))
         b.add_probe("p", plate.at((0.5, 0.5, 0.0)))
-    got = solve(b, setting, effort, load_steps=1).probe("p").displacement[0, -1, 2]
-    return Answer(abs(got / exact - 1.0), bound, "Euler and Kirchhoff", **effort.told, note=f"{got:.6g} m")
+    got = solve(b, setting, count, load_steps=1).result.probe("p").displacement[0, -1, 2]
+    return Answer(abs(got / exact - 1.0), bound, "Euler and Kirchhoff", **count.fields, note=f"{got:.6g} m")

@@ -77,8 +77,7 @@ def falling(value: str, device: str, dtype: str, tol: float | None) -> tuple[np.
     solver = wf.NewtonPCG(tol=tol, max_pcg=20000, max_halvings=0)
     sim = wf.Simulation(b.finalize(device=device, dtype=dtype), dt=5e-3, solver=solver)
     count = Count()
-    for _ in range(STEPS):
-        count.add(sim.step(), sim.model.size)
+    count.step(sim, STEPS)
     return sim.probe("tip").displacement[0], count
 
 
