@@ -265,6 +265,8 @@ def test_trusses_snap_through_in_few_iterations(kind, rise, side, steps, most):
 @pytest.mark.parametrize("preconditioner", ["block-jacobi", "two-level", "banded"])
 def test_work_ends_within_a_solve(preconditioner, most, device):
     """Fails on 8934ce7: with max_work = 1 block-jacobi takes 20000 iterations, two-level 2263, with 7 a band 9."""
+    if preconditioner == "banded" and device != "cpu":
+        pytest.skip("bands of this size are for the CPU")
     most = 7 if preconditioner == "banded" and most == 200 else most
     sim = begin_static(
         thin("T10", "float64", device),

@@ -34,7 +34,7 @@ def point_meshes():
         "nan": (nan, triangles, r"point 4 = \[.*nan.*\] is not finite"),
         "degenerate": (points, [(0, 1, 2), (0, 1, 0)], r"triangle 1 = \[0, 1, 0\] has no area"),
         "in a line": ([(0, 0, 0), (1, 0, 0), (3, 0, 0)], [(0, 1, 2)], "triangle 0 .* has no area"),
-        "orientation": (points, turned, r"points \d and \d is run through in one direction by triangles"),
+        "orientation": (points, turned, r"inconsistent orientation of triangles \d and \d at the edge between points"),
         "three": (third, [(0, 1, 2), (1, 0, 5), (0, 1, 6)], "points 0 and 1 has more than two triangles"),
         "inside out": (points, triangles[:, ::-1], r"closed and inside out, its volume is -1\.33 m\^3"),
         "folded": ([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 2, 0)], [(0, 1, 2), (1, 0, 3)], "folds back on itself"),
