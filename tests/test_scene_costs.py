@@ -33,6 +33,9 @@ DEARER = {"ball_on_plate": 1.04, "finger_beam_shell": 1.06} | dict.fromkeys(
 slide take less than half of the iterations."""
 NEWER = {"gears": 1}
 """Modules more: dense inverses of each gear by itself."""
+APART = 1
+"""Modules more of each scene: the vectors of Newton's method, so that its other kernels, of one thread per world,
+compile without optimisation: 1.8 s in place of 2.9 s of CPU time."""
 
 
 def content():
@@ -49,7 +52,7 @@ def tables():
 
 def test_the_table_is_whole_and_says_where_it_comes_from():
     found = content()
-    assert found["command"].startswith("warpfea bench --scenes --device cpu --before")
+    assert found["command"].startswith("python -m tests.validation scene_costs --set beside=")
     assert found["machine"]["device"] == "cpu"
     assert len(found["commit"]) >= 40
     assert len(found["before"]["commit"]) >= 40
@@ -64,7 +67,7 @@ def test_costs_no_more_than_before(tables, label):
     now, before = (table[label] for table in tables)
     for name in COSTS:
         assert (now[name] is None) == (before[name] is None), name
-        most = (before[name] or 0) + (NEWER.get(label, 0) if name == "modules" else 0)
+        most = (before[name] or 0) + (NEWER.get(label, 0) + APART if name == "modules" else 0)
         assert now[name] is None or now[name] <= most, (name, now[name], before[name])
     assert now["bytes"] <= DEARER.get(label, BYTES) * before["bytes"]
 
