@@ -129,7 +129,7 @@ def check_columns(term: Term, *, own: bool) -> None:
         if column.kind in (STORED, WORK, LOSS) and not column.name:
             raise ModelError(f"{where}: {KINDS[column.kind]} needs a name, the column of energies()")
         if column.kind == STORED and kind.measure is Term.measure:
-            raise ModelError(f"{where}: override stored_energy: the ledger restarts from it after a reset")
+            raise ModelError(f"{where}: override measure, its stored energy: the ledger restarts from it after a reset")
         if own:
             continue
         if column.kind == HELD_VISCOUS:
