@@ -5,20 +5,21 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import precision
 from .control import FLOOR_LANES, GROUP_ROWS, LANES, control_struct
+from .pcg import pcg_kernels
 
 __all__ = ["vector_kernels"]
 
 
 @functools.cache
-def vector_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels in one precision of the vectors."""
+def vector_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
+    """Kernels in one precision of the vectors, in the module of `pcg_kernels`, which every solver loads."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
-    module = kernel_module(f"vectors_{dtype}")
+    module = pcg_kernels(dtype, gated).module
 
     @wp.kernel(module=module)
     def norm_partial(

@@ -169,7 +169,7 @@ class NewtonLoop:
         self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
         self.constraint_tol = constraint_tol
         traits = at.traits
-        self.kernels, self.vectors = newton_kernels(traits), vector_kernels(model.dtype)
+        self.kernels, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.gated)
         self.limited = traits.limited
         self.classical = traits.gated and options.multipliers == "outer"
         self.max_outer = options.max_outer

@@ -82,7 +82,7 @@ class Residual:
         self.reduce = Reducer(launch, work, model.worlds)
         traits = at.traits
         self.gather = gather_kernels(model.dtype, traits)
-        self.newton, self.vectors = newton_kernels(traits), vector_kernels(model.dtype)
+        self.newton, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.gated)
         self.stage = stage_kernels(model.dtype)
         self.con = model.constraints.data if traits.ties else constraint_struct()()
         self.dim = (model.worlds, model.slots)
